@@ -12,6 +12,7 @@ from torch import Tensor
 
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
+from augment.utils import progress
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
@@ -173,7 +174,7 @@ def build_scene(
     basis, lights = with_local_lights(environment * shown.exposure, local)
     fov = None if shown.fov is None else math.radians(shown.fov)
     return Scene.grid(
-        [on_ground(_object(member, shown.vertices), shown.ground) for member in meshes],
+        [on_ground(_object(member, shown.vertices), shown.ground) for member in progress(meshes, "reading meshes")],
         orbit_cameras(views, shown.width, math.radians(shown.polar), math.radians(shown.azimuth), fov),
         load_backgrounds(shown.backgrounds, size),
         lights.to(as_device(device)),

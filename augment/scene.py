@@ -14,7 +14,7 @@ from torch import Tensor
 from augment.objects import SceneObject
 from augment.relighting import InPlace, Layer, OperatorStack, Relighting
 from augment.reshading import Reshading
-from augment.utils import require_memory
+from augment.utils import progress, require_memory
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
@@ -215,7 +215,8 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        for image, (row, view) in enumerate(product(range(len(examples)), range(self.views))):
+        views = product(range(len(examples)), range(self.views))
+        for image, (row, view) in enumerate(progress(views, "rendering views", len(examples) * self.views)):
             index = int(examples[row])
             example, mesh = self.examples[index], self.mesh(index)
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from threading import Timer
+from threading import Event, Thread
 from typing import TypeVar
 
 import numpy as np
@@ -96,28 +96,41 @@ def _free(device: torch.device) -> int | None:
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
-    """The items; after 5 seconds, with a bar on a terminal, or else a line, by the first process.
+    """The items; after 5 seconds, with a bar on a terminal, or else a line, which comes again with the number of items
+    that are done, each time after twice as long; by the first process.
 
     total: their number, where they have no length. done: how many came before.
     """
     terminal, first = sys.stderr.isatty(), rank() == 0
     bar = tqdm(items, description, total, leave=False, delay=PATIENCE, disable=not (terminal and first), initial=done)
+    ended, wait = Event(), PATIENCE
 
     def show() -> None:  # also before the first item is done
-        if terminal:
-            bar.delay = 0
-            bar.refresh()
-        else:
-            print(f"{description} ...", file=sys.stderr, flush=True)
+        nonlocal wait
+        while not ended.wait(wait):
+            if terminal:
+                bar.delay = 0
+                bar.refresh()
+                return
+            counted = f" {done} of {bar.total}" if done and bar.total else ""
+            print(f"{description} ...{counted}", file=sys.stderr, flush=True)
+            wait *= 2
 
-    timer = Timer(PATIENCE, show)
-    timer.daemon = True
     if first:
-        timer.start()
+        Thread(target=show, daemon=True).start()
     try:
-        yield from bar
+        for item in bar:
+            yield item
+            done += 1
     finally:
-        timer.cancel()
+        ended.set()
+
+
+@contextmanager
+def announced(description: str) -> Iterator[None]:
+    """`progress` of a block that is no loop."""
+    for _ in progress([None], description):
+        yield
 
 
 class Phases:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from augment.objects import another_instance
 from augment.scene import Example, Scene
+from augment.utils import progress
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
@@ -117,7 +118,10 @@ def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Gen
         views = dict.fromkeys((row.object, row.cameras) for row in scene.examples)
         numbers = {view: index for index, view in enumerate(views)}
         instances = zip(views, torch.randint(2**31, (len(views),), generator=draws).tolist(), strict=True)
-        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in instances]
+        changed["objects"] = [
+            another_instance(scene.objects[index], seed)
+            for (index, _), seed in progress(instances, "new instances", len(views))
+        ]
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     if settings.moves:  # views that never come again are not kept on the disk
@@ -162,7 +166,7 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
     if not files:
         raise InputError(f"backgrounds={folder} holds no image: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
-    return torch.stack([read_image(files[index], size) for index in chosen])
+    return torch.stack([read_image(files[index], size) for index in progress(chosen, "reading backgrounds")])
 
 
 def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:

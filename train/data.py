@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import class_index
-from augment.utils import generator
+from augment.utils import generator, progress
 from renderer.errors import InputError, in_one_line
 from train import checkpoint, console
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
@@ -106,7 +106,7 @@ def load_npz(path: str) -> DataSet:
             classes = archive["classes"]
             splits = [
                 _npz_split(archive[f"{part}_images"], archive[f"{part}_labels"], classes.size)
-                for part in ("train", "test")
+                for part in progress(("train", "test"), "reading the data")
             ]
         if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
             raise ValueError("classes must be distinct strings, one per class")

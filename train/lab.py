@@ -363,7 +363,7 @@ def write_laboratory(settings: LabSettings) -> int:
     other; Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
-    subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
+    subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
     environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
     positives = [subject for subject in subjects if subject[0] == settings.label]
     negatives = [subject for subject in subjects if subject[0] != settings.label]

@@ -18,7 +18,7 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings, lighting
 from augment.classifiers.adapter import Classifier
 from augment.scene import Conditions, Scene
-from augment.utils import BatchSize, Phases, generator
+from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
 
 LEAST_LIKELY = "least_likely"  # in place of a target class
@@ -230,7 +230,8 @@ def final_images(problem: AttackProblem, values: Tensor, examples: Tensor, image
         return images
     rows = zip(examples.tolist(), images, strict=True)
     adversaries = (Adversary.of(scene, example, after, image, image, row) for row, (example, image) in enumerate(rows))
-    return torch.stack([adversary.render(scene.rasterizer) for adversary in adversaries]).to(images)
+    renders = progress((adversary.render(scene.rasterizer) for adversary in adversaries), "final images", len(images))
+    return torch.stack([*renders]).to(images)
 
 
 @torch.no_grad()
@@ -238,7 +239,7 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     """(E, V, C) of images (E, V, 3, H, W)."""
     flat = images.flatten(0, 1)
     logits = BatchSize(batch_size).map(lambda part: model(flat[part]), len(flat))
-    return torch.cat(list(logits)).unflatten(0, images.shape[:2])
+    return torch.cat([*progress(logits, "predictions")]).unflatten(0, images.shape[:2])
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from augment.attacks.attack import AttackResult, logits_of, predictions
 from augment.attacks.eot import as_jpeg
 from augment.attacks.evaluate import warnings
 from augment.scene import Conditions
+from augment.utils import progress
 from renderer.errors import require_choice
 from renderer.image import background_term, clamp, to_bytes, to_unit, tonemap_composite
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
@@ -53,7 +54,7 @@ def save(
     folder.mkdir(parents=True, exist_ok=True)
     after, lines = result.conditions, []
     stems = [folder / f"example_{example:03d}" for example in range(len(result.images))]
-    for example, stem in enumerate(stems):
+    for example, stem in enumerate(progress(stems, "saving")):
         figure(result, example).save(stem.with_suffix(".png"))
         images = result.images_before[example], result.images[example]
         light = write_adversary(Adversary.of(result.problem.scene, example, after, *images), stem)
@@ -113,7 +114,8 @@ def _versions(result: AttackResult, folders: Sequence[Path], verify: Sequence[st
         "8 bits": to_unit(to_bytes(images)),
         f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
     }
-    again = [render_again(folder, verify, result.problem.scene.rasterizer) for folder in folders if verify]
+    to_verify = progress(folders if verify else [], "rendering the saved files")
+    again = [render_again(folder, verify, result.problem.scene.rasterizer) for folder in to_verify]
     versions |= {name: torch.stack([views[name] for views in again]) for name in verify}
     return {name: _version(result, version.to(result.images)) for name, version in versions.items()}
 

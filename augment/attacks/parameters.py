@@ -12,6 +12,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.scene import Conditions, Scene
+from augment.utils import progress
 from renderer.errors import InputError
 from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
@@ -233,7 +234,7 @@ class AttackProblem:
         """(E, V, 3, size, size) of values (E, D), rendered by parts, so that little memory beside theirs is used."""
         size = self.scene.settings.size
         images = values.new_empty(len(values), self.scene.views, 3, size, size)
-        for part in self.everything.split(self.scene.at_once):
+        for part in progress(self.everything.split(self.scene.at_once), "images"):
             images[part] = self.render(values[part], part)
         return images
 

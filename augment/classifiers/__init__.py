@@ -14,6 +14,7 @@ from augment.classifiers.imagenet import (
     load_squeezenet_caffe,
     load_torchvision,
 )
+from augment.utils import announced
 from renderer.errors import InputError
 
 __all__ = ["SOURCES", "Classifier", "load_classifier"]
@@ -46,4 +47,5 @@ def load_classifier(
         raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
     load = sources[source + colon]
     path = None if weights is None else Path(weights)
-    return load(model, path) if colon else load(path)
+    with announced(f"loading {name}"):
+        return load(model, path) if colon else load(path)

@@ -38,7 +38,8 @@ def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(monk
             break
     assert done == [(item, seconds > 0) for item in ([1, 2] if ends else [1])]
     if stream is io.StringIO:
-        assert sys.stderr.getvalue() == ("attack ...\n" if seconds else "")
+        lines = sys.stderr.getvalue().splitlines()
+        assert lines[:1] == (["attack ..."] if seconds else []) and len(lines) < 5  # at 0.1, 0.3, 0.7 seconds ...
     else:
         assert sys.stderr.getvalue().rpartition("\r")[2].strip() == ""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from augment.utils import progress
 from train.photographs.folder import find_photographs, left_out, load_photographs, require_outside
 from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by_source
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
@@ -55,6 +56,7 @@ def evaluate_photographs(
     logits = compute_logits(model, images, len(classes), device)
     predictions = predict(photographs, logits, classes, label)
     pools = pool_by_source(predictions, label)
+    metrics = {source: pool.metrics for source, pool in progress(pools.items(), "intervals")}
     others = [str(path) for path in left_out(folder)]
     images_hash = hashlib.sha256(label.encode())
     for photograph in photographs:
@@ -67,7 +69,7 @@ def evaluate_photographs(
         "label": label,
         "size": size,
         "images": images_hash.hexdigest(),
-        **whole.metrics,
+        **metrics[OVERALL],
         "n": {
             "photographs": len(predictions),
             "positives": len(whole.positives),
@@ -77,7 +79,7 @@ def evaluate_photographs(
         },
         "most_common_wrong": _most_common_wrong(whole.positives),
         "by_source": {
-            source: {"n": len(group.positives) + len(group.negatives), **group.metrics}
+            source: {"n": len(group.positives) + len(group.negatives), **metrics[source]}
             for source, group in pools.items()
         },
         "by_class": {name: _class_metrics(group, label) for name, group in by_class.items()},

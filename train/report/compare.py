@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from augment.utils import progress
 from renderer.errors import InputError
 from train.photographs import metrics
 from train.photographs.metrics import METRICS, OVERALL, Pool, find_metric, metric_title
@@ -61,7 +62,7 @@ def source_table(arms: Evaluations, pooled: str | None = None) -> Table:
     if pooled is None:
         del sources[OVERALL]
     rows: list[list[str]] = []
-    for source in sources:
+    for source in progress(sources, "intervals"):
         for arm, group in arms.items():
             means = (format_interval(mean_metric(group, source, name)) for name in METRICS)
             rows.append([source or str(pooled), arm, *means])
@@ -101,7 +102,7 @@ def difference_tables(arms: Evaluations, pooled: str, sources: Sequence[str] | N
     """A table for each pair of `pairs_of`: the difference by source and metric. pooled: OVERALL's name. sources: None
     for all."""
     tables = []
-    for arm, base in pairs_of(arms):
+    for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]

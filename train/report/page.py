@@ -14,6 +14,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from PIL import Image, ImageDraw
 
+from augment.utils import announced
 from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
@@ -81,7 +82,8 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 def report_of(folders: Sequence[Path], out: Path) -> str:
     """The last line of a training: the path of its report, or why there is none, since a report never fails a run."""
     try:
-        return f"report: {write_report(folders, out)}"
+        with announced("report"):
+            return f"report: {write_report(folders, out)}"
     except Exception as error:  # the run is finished and saved
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
 
