@@ -112,8 +112,8 @@ def progress(items: Iterable[Item], description: str, total: int | None = None, 
                 bar.delay = 0
                 bar.refresh()
                 return
-            counted = f" {done} of {bar.total}" if done and bar.total else ""
-            print(f"{description} ...{counted}", file=sys.stderr, flush=True)
+            counted = f": {done} of {bar.total}" if done and bar.total else ""
+            print(f"{description}{counted} ...", file=sys.stderr, flush=True)
             wait *= 2
 
     if first:

@@ -36,7 +36,7 @@ logging.raiseExceptions = False  # on a full disk train.log lacks lines, and onl
 
 # Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
 CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "command", "hardware", "versions", "inputs"),
+    *("run", "sweep", "launcher", "compare", "command", "working_folder", "hardware", "versions", "inputs"),
     *("renderer.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
@@ -121,11 +121,18 @@ def read_config(path: Path) -> DictConfig:
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
     """Write config.yaml: a command's settings, a dataclass; facts found at the start; hashes of inputs; versions.
 
-    Facts with an interpolation, which `read_config` refuses, are left out.
+    With a command, also the folder that it was first given in, to which its paths may be relative. Facts with an
+    interpolation, which `read_config` refuses, are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
     packages = {name: version(name) for name in ("torchvision", "numpy")}
     versions = {"python": platform.python_version(), "torch": str(torch.__version__), **packages}
+    if "command" in facts:
+        facts["working_folder"] = os.getcwd()
+        with suppress(InputError):  # of a run that goes on, perhaps from another folder
+            before = read_config(folder / CONFIG)
+            if str(facts["command"]).startswith(str(before.get("command"))):
+                facts["working_folder"] = before.get("working_folder") or os.getcwd()
     facts = {name: fact for name, fact in facts.items() if "${" not in str(fact)}
     content = {**asdict(settings), **facts, "inputs": fingerprints(settings), "versions": versions}
     write_whole(folder / CONFIG, yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())

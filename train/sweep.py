@@ -26,7 +26,7 @@ from train.report.page import report_of
 from train.report.summary import is_finished, summarize
 from train.run import load_data, run
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
-from train.settings import ExperimentSettings, compose, given_command, read_settings
+from train.settings import ExperimentSettings, compose, given_command, quoted, read_settings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 HYDRAS_OWN = re.compile(r"\+*hydra[./]")  # overrides that do not concern the run
@@ -110,13 +110,21 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
         try:
             settings = read_settings(ExperimentSettings, config)
             settings.train.resume = checkpoint.exists(folder)
-            run(settings, load_data(settings), folder, given_command(HydraConfig.get().overrides.task))
+            command = given_command([*map(_unescaped, HydraConfig.get().overrides.task)])
+            run(settings, load_data(settings), folder, command)
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
             console.error("failed: %s", reason, exc_info=None if sentence else error)
             with suppress(OSError):  # on a full disk only the console has it
                 (folder / FAILURE).write_text(f"{reason}\n", encoding="utf-8", errors="backslashreplace")
+
+
+def _unescaped(override: str) -> str:
+    r"""An override as Hydra's sweeper writes it, but with a text in quotes: path='a b' rather than path=a\ b."""
+    value = OverridesParser.create().parse_override(override).value()
+    escaped = "\\" in override and type(value) is str
+    return f"{override.partition('=')[0]}={quoted(value)}" if escaped else override
 
 
 def format_sweep(folders: Sequence[Path]) -> str:

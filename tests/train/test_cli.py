@@ -52,6 +52,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_
     assert (tmp_path / "here" / "train.log").read_text() == printed.out
     config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
     assert shlex.split(config["command"]) == ["python", "-m", "train", *overrides[1:], *SMALL]
+    assert config["working_folder"] == str(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
 
 

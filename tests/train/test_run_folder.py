@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import os
 import time
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny,
     write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
     config = read_config(tmp_path / CONFIG)
     assert "command" not in config  # which would be refused, as every interpolation is
-    assert config.pop("precision") == "bfloat16"
+    assert config.pop("precision") == "bfloat16" and config.pop("working_folder") == os.getcwd()
     assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {settings.data.path}
     assert read_settings(ExperimentSettings, config) == settings
 

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -55,7 +56,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
     options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
-    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml}
+    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
         title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
@@ -73,7 +74,9 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         attacks=attacks,
         shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
-    page = re.sub(rf"(?<![\w./-]){re.escape(os.getcwd())}/", "", page)  # paths are relative, as in commands
+    here = rf"(?<![\w./-]){re.escape(os.getcwd())}/"  # paths are relative, except in commands, which work anywhere
+    parts = re.split(r"(<summary>command.*?</pre>)", page, flags=re.DOTALL)
+    page = "".join(part if index % 2 else re.sub(here, "", part) for index, part in enumerate(parts))
     out.mkdir(parents=True, exist_ok=True)
     (out / PAGE).write_text(page, encoding="utf-8", errors="replace")
     return out / PAGE
@@ -86,6 +89,12 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
             return f"report: {write_report(folders, out)}"
     except Exception as error:  # the run is finished and saved
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
+
+
+def _command(config: Mapping[str, Any]) -> str:
+    """The command of a run or an attack, in the folder that it was given in; "" where that is not recorded."""
+    folder, command = config.get("working_folder"), config.get("command") or ""
+    return f"cd {shlex.quote(folder)}\n{command}" if folder and command else command
 
 
 def _curves(arms: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> list[Picture]:

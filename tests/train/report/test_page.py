@@ -1,6 +1,8 @@
 """The report, of runs in every state, as a file and in a browser."""
 
 import json
+import os
+import shlex
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
@@ -95,7 +97,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
     assert f"{sentence} renders succeeds on 50%." in text
     outcomes = [cells[-1] for cells in parsed.rows if cells[1:2] == [HOSTILE]]
     assert outcomes == ["success in 3 steps", "wrong before any step", "no success in 3 steps"]
-    assert text.count(f"<pre>{COMMAND}</pre>") == 1
+    assert text.count(f"<pre>cd {shlex.quote(os.getcwd())}\n{COMMAND}</pre>") == 1
 
 
 def test_a_line_is_drawn_where_it_has_points_that_differ():
