@@ -234,7 +234,8 @@ class AttackProblem:
         """(E, V, 3, size, size) of values (E, D), rendered by parts, so that little memory beside theirs is used."""
         size = self.scene.settings.size
         images = values.new_empty(len(values), self.scene.views, 3, size, size)
-        for part in progress(self.everything.split(self.scene.at_once), "images"):
+        parts = self.everything.split(self.scene.at_once)
+        for part in progress(parts, "images") if len(parts) > 1 else parts:
             images[part] = self.render(values[part], part)
         return images
 
