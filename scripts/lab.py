@@ -1,4 +1,4 @@
-"""Path-trace photographs of oranges and hard negatives under a projector: pnb-lab out=lab"""
+"""Path-trace renders of oranges and hard negatives under a projector: pnb-lab out=lab"""
 
 import sys
 
@@ -11,7 +11,7 @@ from train.lab import LabSettings, write_laboratory
 @cli.command()
 def main(settings: LabSettings) -> None:
     count = write_laboratory(settings)
-    print(f"{settings.out}: {count} photographs under {settings.setups} setups")
+    print(f"{settings.out}: {count} renders under {settings.setups} setups")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The laboratory: path-traced photographs of objects on a dark table under a projector, to score networks on.
+"""The laboratory: path-traced renders of objects on a dark table under a projector, to score networks on.
 
 World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
 RGB; a radiance of 1 is white at an exposure of 1.
@@ -266,7 +266,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
     return parts
 
 
-def photograph(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
+def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
     """(size, size, 3) float32 linear radiance by Mitsuba 3, from `spp` samples per pixel and light.
 
     Projector and surroundings are rendered one by one and added: with both in one scene each path would choose one of
@@ -328,7 +328,7 @@ class LabSettings:
     out: str = MISSING  # a new folder, for photos= of pnb-evaluate
     label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
     meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
-    setups: int = 180  # draws of light, camera and pose; two photographs each
+    setups: int = 180  # draws of light, camera and pose; two renders each
     patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # of the projector, for as many setups each
     environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
     brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
@@ -347,7 +347,7 @@ class LabSettings:
                 f"setups={self.setups} must be a positive multiple of the {len(sources)} patterns and environments"
             )
         if len(set(sources)) < len(sources):
-            raise InputError("patterns and environments must have different names, which are the photographs' sources")
+            raise InputError("patterns and environments must have different names, which are the renders' sources")
         require_limits("brightness", self.brightness, 1 / FACTOR, FACTOR)
         require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("seed", self.seed, 0, LARGEST_SEED)
@@ -356,7 +356,7 @@ class LabSettings:
 
 
 def write_laboratory(settings: LabSettings) -> int:
-    """Write the folder `settings.out` and return its number of photographs; the settings decide their bytes.
+    """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
 
     The folder has class folders of PNG files, photos.csv and lab.json, as `train.photographs` reads them. InputError: a
     folder that is not empty; meshes that cannot be read or have no label; no mesh of the label under study, or no
@@ -378,7 +378,7 @@ def write_laboratory(settings: LabSettings) -> int:
             seed = stream_seed(settings.seed, "samples", number) % 2**32
             for subjects in (positives, negatives):
                 label, mesh, parts = subjects[number % len(subjects)]
-                radiance = photograph(parts, shot, settings.size, settings.spp, settings.bounces, seed)
+                radiance = path_traced(parts, shot, settings.size, settings.spp, settings.bounces, seed)
                 image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
                 path = Path(label) / f"{number:04d}_{shot.family}.png"
                 (out / path).parent.mkdir(parents=True, exist_ok=True)
@@ -413,5 +413,5 @@ def read_subject(item: str | dict[str, Any], index: int) -> tuple[str, str, list
     if not label:
         raise InputError(f"meshes[{index}] has no label: give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}")
     if Path(label).name != label or label == "..":
-        raise InputError(f"meshes[{index}]: the label {label!r} names the photographs' folder: leave out slashes")
+        raise InputError(f"meshes[{index}]: the label {label!r} names the renders' folder: leave out slashes")
     return label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale)

@@ -15,7 +15,7 @@ from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 from train import lab
-from train.lab import FAMILIES, FOV, LabSettings, Shot, draw_pattern, draw_shots, lab_parts, photograph
+from train.lab import FAMILIES, FOV, LabSettings, Shot, draw_pattern, draw_shots, lab_parts, path_traced
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -201,7 +201,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
     [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed, {})
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
-    image = photograph(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)
+    image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)
 
     rays = directions(shot, 8)
     positions = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
@@ -217,7 +217,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
 def test_a_texture_lies_upright_on_its_faces():
     red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
     texture = np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
-    image = photograph(lab_parts(card(texture), 1.0), frontal(), 16, 16, bounces=1, seed=0)
+    image = path_traced(lab_parts(card(texture), 1.0), frontal(), 16, 16, bounces=1, seed=0)
     strong = image > image.max() / 2
     for row, column, expected in [(5, 5, red), (5, 10, green), (10, 5, blue), (10, 10, white)]:
         np.testing.assert_array_equal(strong[row, column], np.array(expected) > 0)
@@ -229,7 +229,7 @@ def test_a_card_reflects_its_linear_albedo_times_the_albedo_scale_and_the_bright
     gloss = 0.04 / (4 * lab.ROUGHNESS**4)  # α is the roughness's square
     for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
-        image = photograph(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
+        image = path_traced(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
         assert image[3:5, 3:5].mean() == pytest.approx((0.216 * albedo_scale + gloss) * brightness, rel=0.05)
 
 
@@ -237,7 +237,7 @@ def test_an_object_stands_on_the_table():
     """A cube's front, lit by its surroundings, reaches from the table up to its height."""
     cube = trimesh.creation.box((2, 2, 2))
     shot = frontal(ambient=np.ones(3), brightness=1e-9)
-    image = photograph(lab_parts(Mesh.plain(cube.vertices, cube.faces), 1), shot, 32, 64, bounces=1, seed=0)
+    image = path_traced(lab_parts(Mesh.plain(cube.vertices, cube.faces), 1), shot, 32, 64, bounces=1, seed=0)
     ray = directions(shot, 32)[:, 15]
     height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
     clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
@@ -251,7 +251,7 @@ def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_e
     for seed in range(2):
         [shot] = draw_shots(1, [], (0.7, 0.7), seed, {"lamp": sky})
         shot = replace(shot, scale=1e-4)
-        image = photograph(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)
+        image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)
         assert shot.family == "lamp"
         # The map is sampled by bilinear interpolation, which spreads the lamp over two texels.
         np.testing.assert_allclose(image, np.broadcast_to(0.7 * shot.table, image.shape), rtol=0.02)
