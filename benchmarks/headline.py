@@ -1,6 +1,6 @@
-"""The picture of README.md: an orange, a projector's pattern, the orange under it, and bars of a run before and after.
+"""The picture of README.md: an orange, a projector's pattern, the orange under it, and bars of runs before and after.
 
-    python -m benchmarks.headline --attack FOLDER --mesh orange_sketchfab.glb --run runs/demo --out docs/headline.png
+    python -m benchmarks.headline --attack FOLDER --mesh orange_sketchfab.glb --runs runs/demo/0 runs/demo/1 runs/demo/2
 
 FOLDER gets before.png, pattern.png and after.png; where it has them, nothing is attacked. The pattern is rounded to 8
 bits before the orange is rendered under it, and the predictions are those for the PNG files, read again.
@@ -8,7 +8,9 @@ bits before the orange is rendered under it, and the predictions are those for t
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from matplotlib.figure import Figure
@@ -64,16 +66,16 @@ def draw_attack(card: Figure, classifier: augment.Classifier, folder: Path) -> N
         axes.text(0.5, -0.055, text, color=color, fontweight="normal" if color == GRAY else "bold", **place)
 
 
-def draw_bars(card: Figure, run: Path) -> None:
-    """AUC and recall at three false-positive rates, of the network that a run began with and of its own."""
-    paths = (run / part / "laboratory" / "summary.json" for part in ("before", ""))
-    before, after = (json.loads(path.read_text(encoding="utf-8")) for path in paths)
-    if before["images"] != after["images"]:
-        raise SystemExit(f"{run}: before and after are of different images")
+def draw_bars(card: Figure, runs: Sequence[Path]) -> None:
+    """AUC and recall at three false-positive rates, of the network that all runs began with, with its 95 % interval,
+    and of their own: mean and range."""
+    folders = [runs[0] / "before", *runs]
+    before, *after = (json.loads((folder / "laboratory" / "summary.json").read_text()) for folder in folders)
     axes, metrics = card.add_axes((0.785, 0.15, 0.2, 0.64)), (*RANKED[1:], RANKED[0])
     for row, metric in enumerate(metrics):
-        for offset, summary, color in ((-0.19, before, "#b1bac4"), (0.19, after, BLUE)):
-            value, low, high = (find_metric(summary, metric)[key] for key in ("value", "low", "high"))
+        begun, seeds = find_metric(before, metric), [find_metric(summary, metric)["value"] for summary in after]
+        bars = [(begun["value"], begun["low"], begun["high"]), (fmean(seeds), min(seeds), max(seeds))]
+        for (value, low, high), offset, color in zip(bars, (-0.19, 0.19), ("#b1bac4", BLUE), strict=True):
             axes.barh(row + offset, value, 0.36, color=color)
             axes.plot([low, high], [row + offset] * 2, color=INK, linewidth=1.6)
             axes.text(max(value, high) + 0.02, row + offset, f"{value:.2f}", va="center", fontsize=15, color=INK)
@@ -83,8 +85,10 @@ def draw_bars(card: Figure, run: Path) -> None:
     axes.spines[["top", "right", "bottom"]].set_visible(False)
     small = {"transform": axes.transAxes, "va": "bottom", "fontsize": 13.5, "color": GRAY}
     axes.text(-0.4, 1.13, "Another network, hardened", **small | {"fontsize": 17, "color": INK})
-    axes.text(-0.4, 1.035, "on {positives} path-traced oranges, {negatives} other things".format(**after["n"]), **small)
-    for x, text, color in ((-0.4, "■ before", GRAY), (0.05, "■ after", BLUE), (0.42, "— 95 % interval", INK)):
+    axes.text(
+        -0.4, 1.035, "on {positives} path-traced oranges, {negatives} other things".format(**before["n"]), **small
+    )
+    for x, text, color in ((-0.4, "■ before, 95 %", GRAY), (0.2, f"■ after, {len(after)} seeds", BLUE)):
         axes.text(x, -0.13, text, **small | {"color": color})
 
 
@@ -92,7 +96,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/headline.png"))
     parser.add_argument("--attack", type=Path, required=True, help="the folder of the three files")
-    parser.add_argument("--run", type=Path, required=True, help="a run of pnb-train")
+    parser.add_argument("--runs", type=Path, nargs="+", required=True, help="of the demonstration")
     parser.add_argument("--mesh", help="of an orange", default="orange_sketchfab.glb")
     options = parser.parse_args()
     classifier = augment.load_classifier("efficientnet_lite0")
@@ -102,7 +106,7 @@ def main() -> None:
     style = {"fc": "white", "ec": "#d0d7de", "zorder": -1, "transform": card.dpi_scale_trans}
     card.add_artist(FancyBboxPatch((0.1, 0.1), 15.8, 4.8, "round,pad=0,rounding_size=0.25", **style))
     draw_attack(card, classifier, options.attack)
-    draw_bars(card, options.run)
+    draw_bars(card, options.runs)
     card.savefig(options.out, facecolor="none")
 
 
