@@ -41,13 +41,6 @@ def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str 
     return {key: statistics.median(values) for key, values in times.items()}
 
 
-def seconds(call: Callable[[], object]) -> float:
-    """Processor time of one call, over all threads."""
-    start = time.process_time()
-    call()
-    return time.process_time() - start
-
-
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:
     """Root mean square of the difference, over the root mean square of the reference."""
     value, reference = (tensor.cpu().double() for tensor in (value, reference))

@@ -14,12 +14,14 @@ Errors are root mean squares of the difference over the reference's.
 """
 
 import argparse
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from timeit import repeat
 from typing import Any
 from unittest.mock import patch
 
@@ -28,7 +30,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from benchmarks.common import Row, machine, medians, relative_error, seconds, write_csv
+from benchmarks.common import Row, machine, medians, relative_error, write_csv
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
@@ -85,7 +87,7 @@ def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int]
         row["of_direct"] = times[name, size] / times[next(iter(cases)), size]
         row["megabytes"] = sum(part.nbytes for part in (operator.transfer, *(operator.sparse or ()))) / 1e6
         build = partial(operators, cup, size, samples, cases[name], orbit_cameras(VIEWS, 2.2))
-        row["build_s"] = min(seconds(build) for _ in range(2)) / VIEWS
+        row["build_s"] = min(repeat(build, timer=time.process_time, number=1, repeat=2)) / VIEWS
         if size == sizes[0]:
             light, exact = lights[name].detach(), converged(cup, size, finest, cases[name])
             pairs = zip(image_and_gradient(operator, light), image_and_gradient(exact, light), strict=True)

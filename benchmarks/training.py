@@ -6,7 +6,7 @@
 `speed` lets three contestants take turns, so that a busy machine slows all alike: `python -m train` without renders and
 with adversarial ones, each a process whose second epoch counts, and the loop that one writes with torchvision: a
 DataLoader over PIL images, torch's own dropout, eager float32. `renders` measures one round of attacks over the number
-of renders, image sizes and meshes, each in a process of its own, whose peak memory is then its own.
+of renders and of meshes, at 32 pixels per side, each in a process of its own, whose peak memory is then its own.
 """
 
 import argparse
@@ -129,7 +129,7 @@ def peak_memory() -> int:
     return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")))
 
 
-def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
+def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     """Seconds of one core that one round of attacks takes, against a WideResNet-10-1 that is sure of the class."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
@@ -139,24 +139,22 @@ def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
     solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps))
     scene = {"views": views, "backgrounds": GRAYS, "samples": 2, "rasterizer": "numpy"}
-    service = AugmentationService.from_meshes(solids, size, settings, **scene)
+    service = AugmentationService.from_meshes(solids, 32, settings, **scene)
     assert service.scene is not None
     _ = service.scene.stacks  # what is precomputed of each view
     built = time.process_time()
     service.regenerate(network, 0)
     attack = time.process_time() - built
-    row = {"renders": renders, "size": size, "meshes": meshes, "views": views * meshes, "steps": steps}
+    row = {"renders": renders, "meshes": meshes, "views": views * meshes, "steps": steps}
     row |= {"precompute_seconds": built - start, "attack_seconds": attack}
     row["ms_per_render_and_pass"] = 1e3 * attack / (renders * (steps + 1))
     return row | {"memory_mb": (peak_memory() - before) / 1e6}
 
 
 def renders(options: argparse.Namespace) -> list[Row]:
-    """A row per number of renders, per image size and per number of meshes, the others at their first value."""
-    few, size, meshes = options.numbers[0], options.sizes[0], options.meshes[0]
-    loads = [(number, size, meshes) for number in options.numbers]
-    loads += [(few, side, meshes) for side in options.sizes]
-    loads += [(few * count, size, count) for count in options.meshes]
+    """A row per number of renders, and per number of meshes with the first number of renders of each."""
+    few, meshes = options.numbers[0], options.meshes[0]
+    loads = [(number, meshes) for number in options.numbers] + [(few * count, count) for count in options.meshes]
     rows = []
     for load in dict.fromkeys(loads):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
@@ -183,7 +181,6 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     command = commands.add_parser("renders", help="the cost of attacks over the number of renders")
     command.set_defaults(measure=renders, device="cpu")
     command.add_argument("--numbers", nargs="+", type=int, default=[100, 1000, 10_000], help="multiples of 5 × meshes")
-    command.add_argument("--sizes", nargs="+", type=int, default=[32, 64, 128, 224], help="pixels per side")
     command.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
     command.add_argument("--steps", type=int, default=1)
     command.add_argument("--csv", type=Path)

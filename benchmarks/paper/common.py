@@ -46,10 +46,7 @@ def parser(study: str | None, description: str | None) -> argparse.ArgumentParse
     mesh = "files, solid:NAME:SEED or {mesh, label, albedo_scale}"
     options.add_argument("--out", type=Path, required=True, help="JSON lines are appended to this file")
     options.add_argument("--meshes", nargs="+", required=True, help=mesh)
-    options.add_argument("--label", default="orange", help="class that meshes without a label show")
-    options.add_argument("--classifier", default="efficientnet_lite0", help="the attacked network, also run:FOLDER")
-    options.add_argument("--weights", help="its file of weights, where it brings none")
-    options.add_argument("--light", default="grace", help="where attacks begin")
+    options.add_argument("--classifier", default="efficientnet_lite0", help="attacked: NAME[=WEIGHTS] or run:FOLDER")
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--threads", type=int, default=1, help="of the CPU")
     return options
@@ -64,17 +61,17 @@ def prepare(
     """
     arguments = options.parse_args(argv)
     torch.set_num_threads(arguments.threads)
-    classifier = load_classifier(arguments.classifier, arguments.weights)
-    items = [read_item(mesh, arguments.label) for mesh in arguments.meshes]
+    classifier = load_classifier(*arguments.classifier.split("=", 1))
+    items = [read_item(mesh) for mesh in arguments.meshes]
     subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
     begin(arguments)
     return arguments, classifier, subjects
 
 
-def read_item(mesh: str, label: str) -> ObjectSettings:
-    """A value of --meshes."""
+def read_item(mesh: str) -> ObjectSettings:
+    """A value of --meshes; an orange where it has no label."""
     given = yaml.safe_load(mesh)
-    return ObjectSettings(**({"label": label} | (given if isinstance(given, dict) else {"mesh": mesh})))
+    return ObjectSettings(**({"label": "orange"} | (given if isinstance(given, dict) else {"mesh": mesh})))
 
 
 def begin(arguments: argparse.Namespace) -> None:
@@ -104,13 +101,13 @@ def attack_settings(kind: str, max_steps: int = 30, step: StepSettings | None = 
     return AttackSettings(**{**settings, "rounded": False, "shorten": shorten, **more})
 
 
-def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View]) -> Scene:
-    """An example per view."""
+def scene_of(subject: SceneObject, size: int, views: Sequence[View]) -> Scene:
+    """An example per view, under the light where attacks begin."""
     return Scene(
         [subject],
         [Example(0, (camera,), index) for index, (camera, _) in enumerate(views)],
         torch.tensor([gray for _, gray in views]).view(-1, 1, 1, 1).expand(-1, 3, size, size),
-        load_light(light),
+        load_light("grace"),
         ImageSettings(size, samples=2, normals="smooth"),
         choose(),
     )
@@ -127,15 +124,13 @@ def random_views(count: int, draws: torch.Generator) -> list[View]:
     ]
 
 
-def clean_correct_views(
-    subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator
-) -> list[View]:
+def clean_correct_views(subject: SceneObject, classifier: Classifier, count: int, draws: torch.Generator) -> list[View]:
     """As many random views that the classifier gets right. InputError: hardly any is."""
     correct: list[View] = []
     drawn = 0
     while len(correct) < count:
         views = random_views(BATCH, draws)
-        predicted = predictions(classifier, images_of(scene_of(subject, classifier.size, light, views)))
+        predicted = predictions(classifier, images_of(scene_of(subject, classifier.size, views)))
         correct += [view for view, name in zip(views, predicted, strict=True) if name == subject.label]
         drawn += len(views)
         if len(correct) < LEAST_CORRECT * drawn - BATCH:

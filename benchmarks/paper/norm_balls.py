@@ -66,8 +66,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
     for subject in subjects:
         draws = generator(args.seed, subject.name)
-        views = common.clean_correct_views(subject, classifier, args.light, args.examples, draws)
-        scenes = [common.scene_of(subject, classifier.size, args.light, part) for part in common.batches(views)]
+        views = common.clean_correct_views(subject, classifier, args.examples, draws)
+        scenes = [common.scene_of(subject, classifier.size, part) for part in common.batches(views)]
         for space in args.spaces:
             draws = generator(args.seed, subject.name, space)
             for radius in RADII[space]:

@@ -24,7 +24,7 @@ STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {  # of confidences (c
 }
 
 
-def confidences(subject: SceneObject, classifier: Classifier, light: str, renders: int, seed: int) -> np.ndarray:
+def confidences(subject: SceneObject, classifier: Classifier, renders: int, seed: int) -> np.ndarray:
     """(cameras, grays) with so many clean-correct renders: the confidence in the label, NaN where another class is
     predicted. InputError: hardly any is clean-correct."""
     draws, label = generator(seed, subject.name, "quality"), classifier.label(subject.label)
@@ -35,7 +35,7 @@ def confidences(subject: SceneObject, classifier: Classifier, light: str, render
             raise InputError(f"{subject.name}: only {correct} of {made} renders are clean-correct")
         azimuth = 2 * math.pi * float(torch.rand((), generator=draws))
         camera = OrthographicCamera(math.pi / 3, azimuth, common.WIDTHS[len(rows) % len(common.WIDTHS)])
-        scene = common.scene_of(subject, classifier.size, light, [(camera, gray) for gray in common.GRAYS])
+        scene = common.scene_of(subject, classifier.size, [(camera, gray) for gray in common.GRAYS])
         probabilities = logits_of(classifier, common.images_of(scene), len(common.GRAYS))[:, 0].softmax(1)
         confidence = torch.where(probabilities.argmax(1) == label, probabilities[:, label], torch.nan)
         rows.append(confidence.double().numpy())
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.add_argument("--renders", type=int, default=10_000, help="clean-correct ones, of all meshes together")
     args, classifier, subjects = common.prepare(options, argv)
     count = -(-args.renders // len(subjects))
-    views = {subject.name: confidences(subject, classifier, args.light, count, args.seed) for subject in subjects}
+    views = {subject.name: confidences(subject, classifier, count, args.seed) for subject in subjects}
     for name, values in {**views, "all": np.concatenate(list(views.values()))}.items():
         common.append(args.out, {"mesh": name, **summary(values, args.seed)})
 

@@ -39,14 +39,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = common.parser("survival", __doc__)
     options.add_argument("--examples", type=int, default=2, help="of each mesh and attack, at equal azimuths")
     options.add_argument("--attacks", nargs="+", default=ATTACKS, help="as attack= of pnb-attack")
-    options.add_argument("--verify", default="reload+mitsuba", help="renderers of the files")
     options.add_argument("--overrides", nargs="*", default=[], help="of pnb-attack: attack.max_steps=10")
     args = options.parse_args(argv)
     common.begin(args)
-    chosen = [f"classifier={args.classifier}", f"scene.light={args.light}", f"attack.verify={args.verify}"]
-    chosen += [f"weights={args.weights}"] if args.weights else []
+    name, *weights = args.classifier.split("=", 1)
+    chosen = [f"classifier={name}", *(f"weights={path}" for path in weights), "attack.verify=reload+mitsuba"]
     for mesh, attack, example in product(args.meshes, args.attacks, range(args.examples)):
-        item = common.read_item(mesh, args.label)
+        item = common.read_item(mesh)
         given = (f"{name}:{json.dumps(value)}" for name, value in asdict(item).items() if value)
         view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
         shown = [f"attack={attack}", f"scene.meshes=[{{{','.join(given)}}}]", *view]

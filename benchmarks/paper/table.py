@@ -2,7 +2,7 @@
 
 python -m benchmarks.paper.table docs/paper/norm_balls.jsonl --figure norm_balls.png
 
-Brackets hold 95 % Wilson intervals, or the quartiles of times. A figure is drawn of norm_balls alone.
+Brackets hold 95 % Wilson intervals. A figure is drawn of norm_balls alone.
 """
 
 import argparse
@@ -29,11 +29,6 @@ def fraction(outcomes: Iterable[bool]) -> str:
 def percentages(hits: int, n: int) -> str:
     value, low, high = (100 * (tables.fraction(hits, n)[name] or 0) for name in ("value", "low", "high"))
     return f"{value:.0f} % [{low:.0f}, {high:.0f}] of {n}" if n else "none of 0"
-
-
-def quartiles(values: Sequence[float] | np.ndarray, digits: int = 1) -> str:
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def groups(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
@@ -92,17 +87,10 @@ def views(rows: Rows) -> Table:
 
 
 def run_time(rows: Rows) -> Table:
-    yield ["attack", "on", "pixels", "classifier's pass, ms", "renderer, ms", "1 + renderer / pass"]
-    for row in rows:
-        if "setup" in row:
-            renderer = np.subtract(row["whole"], row["inside"])
-            ratio = quartiles(1 + renderer / np.array(row["bare"]), 3)
-            yield [row["kind"], row["setup"], row["pixels"], quartiles(row["bare"]), quartiles(renderer), ratio]
-    done = [row for row in rows if "seconds" in row]
-    steps, times = ([row[name] for row in done if row["success"]] or [np.nan] for name in ("steps", "seconds"))
+    steps, times = ([row[name] for row in rows if row["success"]] or [np.nan] for name in ("steps", "seconds"))
+    yield ["success", "median of these; 90 % quantile", "of these in fewer than 10 steps"]
     medians = f"{np.median(steps):.0f} steps, {np.median(times):.2f} s; 90 % within {np.quantile(times, 0.9):.2f} s"
-    yield ["lighting", f"{fraction(row['success'] for row in done)} attacks succeed", "", "", "", medians]
-    yield ["lighting", "of which in fewer than 10 steps", "", "", "", fraction(number < 10 for number in steps)]
+    yield [fraction(row["success"] for row in rows), medians, fraction(number < 10 for number in steps)]
 
 
 def rendering_quality(rows: Rows) -> Table:

@@ -24,7 +24,6 @@ from train.networks import load_classifier
 
 FURTHER = 10  # steps that an adversary goes on for
 ATTACKED = (1, 5)  # views that share one light or shape
-TARGETS = ["efficientnet_lite2", "run:pretrained/none", "run:pretrained/random", "run:pretrained/adversarial"]
 
 
 def as_one_example(problem: AttackProblem) -> Any:
@@ -59,8 +58,8 @@ def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> 
 def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[Classifier], args: Namespace) -> None:
     """A record per batch of views and kind of attack: the predictions of all networks, each at its own size."""
     draws = generator(args.seed, subject.name, "transfer")
-    for views in common.batches(common.clean_correct_views(subject, classifier, args.light, args.examples, draws)):
-        scenes = [common.scene_of(subject, network.size, args.light, views) for network in (classifier, *others)]
+    for views in common.batches(common.clean_correct_views(subject, classifier, args.examples, draws)):
+        scenes = [common.scene_of(subject, network.size, views) for network in (classifier, *others)]
         for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
             problems = [settings.problem(scene) for scene in scenes]
@@ -79,18 +78,18 @@ def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[C
 def to_views(subject: SceneObject, classifier: Classifier, index: int, args: Namespace) -> None:
     """A record per number of attacked views and kind of attack: the predictions in views that were not attacked."""
     draws = generator(args.seed, subject.name, "unseen views", index)
-    unseen = common.clean_correct_views(subject, classifier, args.light, args.examples, draws)
+    unseen = common.clean_correct_views(subject, classifier, args.examples, draws)
     for count in ATTACKED:
-        attacked = common.clean_correct_views(subject, classifier, args.light, count, draws)
+        attacked = common.clean_correct_views(subject, classifier, count, draws)
         for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
-            problem = as_one_example(settings.problem(common.scene_of(subject, classifier.size, args.light, attacked)))
+            problem = as_one_example(settings.problem(common.scene_of(subject, classifier.size, attacked)))
             first, further = adversaries(classifier, problem, settings, subject.label, count)
             random = with_random_signs(further, problem.start, draws)
             states = {"first": first, "further": further, "random": random}
             predicted: dict[str, list[str]] = {name: [] for name in states}
             for part in common.batches(unseen):
-                elsewhere = settings.problem(common.scene_of(subject, classifier.size, args.light, part))
+                elsewhere = settings.problem(common.scene_of(subject, classifier.size, part))
                 for name, values in states.items():
                     predicted[name] += common.predictions(classifier, elsewhere.images(values.expand(len(part), -1)))
             record = {"mesh": subject.name, "label": subject.label, "set": index, "kind": kind, "attacked": count}
@@ -103,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.add_argument("--examples", type=int, default=20, help="views of each mesh, or unseen ones of each set")
     options.add_argument("--sets", type=int, default=3, help="of attacked views, of each mesh")
     options.add_argument("--steps", type=int, default=30, help="of a descent at most (the paper's appendix C)")
-    options.add_argument("--targets", nargs="*", default=TARGETS, help="networks that are not attacked, NAME[=WEIGHTS]")
+    options.add_argument("--targets", nargs="*", default=[], help="networks that are not attacked, NAME[=WEIGHTS]")
     args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
     others = [load_classifier(*target.split("=", 1)) for target in args.targets] if args.study == "networks" else []
     for subject in subjects:

@@ -108,12 +108,12 @@ def test_training_is_timed_beside_a_plain_loop(tmp_path):
     assert len(read(tmp_path / "speed.csv")) == 2
 
 
-def test_the_cost_of_renders_is_measured_over_their_number_size_and_meshes(tmp_path, monkeypatch):
+def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, monkeypatch):
     """Here in a thread, since a process would take seconds to import torch."""
     monkeypatch.setattr(training, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers))
     path = tmp_path / "renders.csv"
-    rows = training.main(["renders", "--numbers", "10", "--sizes", "16", "--meshes", "1", "2", "--csv", str(path)])
-    loads = [(row["renders"], row["size"], row["meshes"], row["views"]) for row in rows]
-    assert loads == [(10, 16, 1, 2), (20, 16, 2, 4)]
+    rows = training.main(["renders", "--numbers", "10", "--meshes", "1", "2", "--csv", str(path)])
+    loads = [(row["renders"], row["meshes"], row["views"]) for row in rows]
+    assert loads == [(10, 1, 2), (20, 2, 4)]
     assert all(row["attack_seconds"] > 0 and row["ms_per_render_and_pass"] > 0 for row in rows)
     assert len(read(path)) == 2
