@@ -123,8 +123,9 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
 def _unescaped(override: str) -> str:
     r"""An override as Hydra's sweeper writes it, but with a text in quotes: path='a b' rather than path=a\ b."""
     value = OverridesParser.create().parse_override(override).value()
-    escaped = "\\" in override and type(value) is str
-    return f"{override.partition('=')[0]}={quoted(value)}" if escaped else override
+    if "\\" in override and isinstance(value, str):
+        return f"{override.partition('=')[0]}={quoted(value)}"
+    return override
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
