@@ -183,8 +183,8 @@ def attacks(
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload}: no attack goes on from changed pixels: leave attack= out")
         scene = adversary.scene(chosen_rasterizer(settings.renderer), device)
-        name = adversary.shown.name
-        yield name, settings.scene, attack(classifier, scene, target, settings.attack, seed=seed, force=True)
+        result = attack(classifier, scene, target, settings.attack, seed=seed, force=True)
+        yield adversary.shown.name, settings.scene, result
         return
     for index, item in enumerate(settings.scene.meshes):
         named, chosen = read_object(item, settings.label, index), settings.scene
@@ -207,8 +207,7 @@ def build_attacked(
     device: torch.device,
     scene: AttackSceneSettings,
 ) -> Scene:
-    """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
-    example per background."""
+    """An example per view and background at `size` pixels per side, or per background where views share the attack."""
     options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
     options["rasterizer"] = chosen_rasterizer(settings.renderer)
     with keyed("scene", vars(scene)):
@@ -216,8 +215,7 @@ def build_attacked(
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
-    """The arguments of `augment.transfer`; none where nothing is asked for. InputError: as the loaders, and where
-    a classifier lacks a class."""
+    """The arguments that `augment.transfer` is given. InputError as of the loaders, and for a missing class."""
     others, scene, label = settings.transfer, settings.scene, settings.label
     named = [item if isinstance(item, dict) else {"classifier": item} for item in others.classifiers]
     if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
@@ -231,7 +229,7 @@ def load_others(settings: AttackExperimentSettings, attacked: Classifier, device
     return {name: argument for name, argument in arguments.items() if argument}
 
 
-# ------------------------------------------------------------------------------------- text
+# ------------------------------------------------------------------------------------- output
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
@@ -291,9 +289,6 @@ def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classe
         f"values differ from the saved image's by {difference:.3g}/255 at most"
         for view, (predicted, confidence, difference) in enumerate(rows)
     )
-
-
-# ------------------------------------------------------------------------------------- transfer and radius sweep
 
 
 def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:

@@ -23,8 +23,7 @@ OTHER = "other things"  # the label of hard negatives that belong to no class
 
 
 class Side(NamedTuple):
-    """An example before or after the attack: its image and a white ball in its light, (3, H, W) uint8, and what the
-    model predicts."""
+    """An example before or after the attack: image and white ball in its light, (3, H, W) uint8, and the prediction."""
 
     image: Tensor
     sphere: Tensor

@@ -42,12 +42,9 @@ def rounds_of_epoch(
     images, renders: how many there are; renders come last. None: all images, and one round.
     """
     drawn = torch.randperm(images, generator=generator(seed, epoch, "rounds"))[:images_per_epoch]
-    parts = drawn.split(every or len(drawn))
     last = torch.arange(images, images + renders)
-    return [
-        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, last]), renders)
-        for index, part in enumerate(parts)
-    ]
+    rows = [torch.cat([part.sort().values, last]) for part in drawn.split(every or len(drawn))]
+    return [Round(epoch * len(rows) + index, epoch, part, renders) for index, part in enumerate(rows)]
 
 
 def with_room(split: Split, count: int) -> Split:
@@ -66,10 +63,9 @@ def put_last(split: Split, renders: Renders) -> None:
 def training_batches(
     split: Split, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """One shuffled round of the split as (images (B, 3, H, W) uint8, labels (B,), which are renders (B,)): this
-    process's shard of every batch.
+    """This process's shard of a round's batches: images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
 
-    Reflect-pads by 4 and crops, then flips half of the images: "random" ones, or "alternating", each image in every
+    Shuffles, reflect-pads by 4 and crops, then flips half: "random" ones, or "alternating", each image in every
     other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
     first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
     any number of processes. first: the batch to begin with.
@@ -102,10 +98,8 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
     columns = torch.arange(width, device=images.device).expand(len(chosen), -1)
     columns = torch.where(flips[:, None], columns.flip(1), columns)
     columns = _reflect(columns + shifts[1, :, None], width)
-    channels = torch.arange(3, device=images.device)
-    return images[
-        chosen[:, None, None, None], channels[:, None, None], rows[:, None, :, None], columns[:, None, None, :]
-    ]
+    channels = torch.arange(3, device=images.device)[:, None, None]
+    return images[chosen[:, None, None, None], channels, rows[:, None, :, None], columns[:, None, None, :]]
 
 
 def _reflect(index: Tensor, size: int) -> Tensor:

@@ -57,8 +57,7 @@ def stratified_split(split: Split, fraction: float, seed: int, key: str = "data.
     """(train, held out) with the fraction of every class's images, rounded, held out. InputError names the key."""
     if not 0 < fraction < 1:
         raise InputError(f"{key}={fraction} must lie between 0 and 1")
-    held_out = torch.zeros(len(split), dtype=torch.bool)
-    draws = generator(seed, "validation")
+    held_out, draws = torch.zeros(len(split), dtype=torch.bool), generator(seed, "validation")
     for label in split.labels.unique():
         members = torch.nonzero(split.labels == label).squeeze(1)
         count = round(fraction * len(members))
@@ -104,10 +103,8 @@ def load_npz(path: str) -> DataSet:
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             classes = archive["classes"]
-            splits = [
-                _npz_split(archive[f"{part}_images"], archive[f"{part}_labels"], classes.size)
-                for part in progress(("train", "test"), "reading the data")
-            ]
+            parts = progress(("train", "test"), "reading the data")
+            splits = [_npz_split(archive[f"{part}_images"], archive[f"{part}_labels"], classes.size) for part in parts]
         if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
             raise ValueError("classes must be distinct strings, one per class")
         if splits[0].images.shape[1:] != splits[1].images.shape[1:]:

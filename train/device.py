@@ -72,12 +72,10 @@ def choose_threads(network: nn.Module, images: Tensor) -> int:
     with eval_mode(network), torch.random.fork_rng(devices=[]), torch.enable_grad():
         seconds(most, 1)  # which starts the threads
         count = max(1, int(PASS / seconds(1, 1)))
-        alone, together = zip(
-            *((seconds(1, count), seconds(most, count)) for _ in progress(range(PASSES), "choosing threads")),
-            strict=True,
-        )
+        trials = [(seconds(1, count), seconds(most, count)) for _ in progress(range(PASSES), "choosing threads")]
+    alone, together = map(median, zip(*trials, strict=True))
     torch.set_num_threads(before)
-    _CHOSEN[key] = most if median(alone) > CLEARLY * median(together) else 1
+    _CHOSEN[key] = most if alone > CLEARLY * together else 1
     return _CHOSEN[key]
 
 

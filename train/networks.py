@@ -1,5 +1,4 @@
-"""The networks that are trained: a WideResNet, a classifier of torchvision, or one that a Python function returns; and
-loading them from a run's folder or a published file."""
+"""The networks that are trained, a WideResNet, torchvision's or a Python function's, and loading them from files."""
 
 import json
 import textwrap
@@ -31,15 +30,13 @@ MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are n
 PUBLISHED = "model.safetensors"
 FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
-_WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
-_OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
+_OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
 
 # ------------------------------------------------------------------------------------- wide residual networks
 
 
 class WideResNet(nn.Module):
-    """WRN-depth-width (Zagoruyko and Komodakis 2016) for small images of any size; WRN-16-4 for 100 classes has 2.77 M
-    parameters.
+    """WRN-depth-width (Zagoruyko and Komodakis 2016) for small images; WRN-16-4 has 2.77 M parameters for 100 classes.
 
     Takes (N, 3, H, W) RGB in [0, 1], normalizes with the data's own mean and std inside, gives logits (N, classes).
     depth is 6n + 4: n blocks of two convolutions in each of three groups.
@@ -156,29 +153,25 @@ def build_network(
         if list(its_classes) != list(classes):
             raise InputError(f"model={name} has other classes than the data, or in another order: {classes[0]!r} first")
     elif name.startswith(TORCHVISION):
-        require_architecture(name.removeprefix(TORCHVISION), f"model={name}")
+        architecture = name.removeprefix(TORCHVISION)
+        require_architecture(architecture, f"model={name}")
     else:
         raise InputError(f"model={name}: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION")
     try:
         if name.startswith(TORCHVISION):
-            network = Normalized(_torchvision_network(name.removeprefix(TORCHVISION), len(classes), size), mean, std)
+            from torchvision import models
+
+            options = {"image_size": size} if architecture.startswith("vit_") else _OPTIONS.get(architecture, {})
+            network = models.get_model(architecture, weights=None, num_classes=len(classes), **options)
+            network = Normalized(network, mean, std)
         with eval_mode(network), torch.no_grad():
             logits = network(torch.zeros(2, 3, size, size))
         if logits.shape != (2, len(classes)):
             raise ValueError(f"it returned {tuple(logits.shape)} for 2 images")
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"model={name} does not give {len(classes)} logits for images of {size} pixels per side "
-            f"({in_one_line(error)}): choose another"
-        ) from error
+        task = f"{len(classes)} logits for images of {size} pixels per side"
+        raise InputError(f"model={name} does not give {task} ({in_one_line(error)}): choose another") from error
     return network
-
-
-def _torchvision_network(architecture: str, classes: int, size: int) -> nn.Module:
-    from torchvision import models
-
-    options = {"image_size": size} if architecture.startswith("vit_") else _OPTIONS.get(architecture, {})
-    return models.get_model(architecture, weights=None, num_classes=classes, **options)
 
 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
@@ -227,10 +220,8 @@ def _of_one_architecture(path: Path) -> Iterator[None]:
     try:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
-        reason = textwrap.shorten(in_one_line(error), 300)
-        raise InputError(
-            f"checkpoint {path} is from another architecture ({reason}): use the model settings of its training"
-        ) from error
+        reason, advice = textwrap.shorten(in_one_line(error), 300), "use the model settings of its training"
+        raise InputError(f"checkpoint {path} is from another architecture ({reason}): {advice}") from error
 
 
 def selected_file(run: Path) -> Path | None:
@@ -269,11 +260,8 @@ def start_from(network: nn.Module, description: Mapping[str, Any], path: Path, s
 
 def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:
     """Write a checkpoint's network as half-precision safetensors, with its architecture and other facts as metadata."""
-    weights = {
-        name: value.half().contiguous() if value.is_floating_point() else value
-        for name, value in state["model"].items()
-    }
-    facts = {"architecture": state["architecture"], **facts}
+    model, facts = state["model"], {"architecture": state["architecture"], **facts}
+    weights = {name: value.half().contiguous() if value.is_floating_point() else value for name, value in model.items()}
     metadata = {name: json.dumps(value, ensure_ascii=False) for name, value in facts.items()}
     path.write_bytes(safetensors.torch.save(weights, metadata))
 

@@ -72,9 +72,6 @@ def replicated(model: nn.Module) -> nn.Module:
     return DistributedDataParallel(model)
 
 
-# ------------------------------------------------------------------------------------- signals
-
-
 class Interrupted(SystemExit):
     """A run ended early by a signal, with its checkpoint written; its exit status is the shell's: 128 + number."""
 

@@ -225,8 +225,7 @@ def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool 
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
-    """SHA-256 of every file that INPUTS name, of the network in a run's folder, and of the names and sizes in every
-    other folder, by path."""
+    """SHA-256 by path: of files that INPUTS name, of a run's network, and of the names and sizes in other folders."""
     by_key = dict(dotted(asdict(settings)))
     paths = _texts([by_key.get(key) for key in INPUTS])
     return {path: _fingerprint(Path(path)) for path in sorted(paths) if os.path.exists(path)}

@@ -31,6 +31,7 @@ from train.networks import WIDERESNET, published
 from train.recipe import TrainSettings
 
 Settings = TypeVar("Settings")
+_schema = cache(OmegaConf.structured)  # since OmegaConf takes as long to make it as to read a configuration into it
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
@@ -96,8 +97,7 @@ class ModelSettings:
 
 @dataclass
 class EvaluationSettings:
-    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: skip those that are
-    broken."""
+    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: skip broken."""
 
     photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
@@ -216,9 +216,8 @@ def program(name: str, as_called: bool = False) -> list[str]:
 
 def given_command(overrides: Sequence[str]) -> str:
     """The command of a training run, with these overrides but without the run's folder."""
-    return shlex.join(
-        [*program("train"), *(text for text in overrides if not text.startswith(("run=", "train.resume=")))]
-    )
+    words = [text for text in overrides if not text.startswith(("run=", "train.resume="))]
+    return shlex.join([*program("train"), *words])
 
 
 def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -249,11 +248,6 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
         name = _wrong_key(kind, config) or getattr(error, "full_key", None) or ""
         reason = str(getattr(error, "msg", error)).splitlines()[0]
         raise InputError(f"{_join(key, name)}: {reason}".removeprefix(": ")) from error
-
-
-@cache  # since OmegaConf takes as long to make it as to read a configuration into it
-def _schema(kind: type) -> DictConfig:
-    return OmegaConf.structured(kind)
 
 
 def _check(node: DictConfig, key: str) -> None:

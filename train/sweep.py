@@ -63,8 +63,7 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     """
     runs = _runs(overrides)
     parent = writable_folder(str(compose("train", runs[0]).sweep), "sweep")
-    names = [run_name([override for override in words if not HYDRAS_OWN.match(override)]) for words in runs]
-    folders = [parent / name for name in names]
+    folders = [parent / run_name([text for text in words if not HYDRAS_OWN.match(text)]) for words in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has a run twice: give each value once")
     for folder, words in zip(folders, runs, strict=True):

@@ -29,8 +29,6 @@ def as_text(value: object) -> str:
     """A cell: numbers with three significant digits, nothing for None."""
     if value is None:
         return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
     return f"{value:,}" if isinstance(value, int) else str(value)

@@ -64,16 +64,14 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     if not paths:
         raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
-    has_class_folders = _has_class_folders(folder, paths, classes)
+    nested = _has_class_folders(folder, paths, classes)
     rows = _read_table(folder / TABLE)
     if unknown := sorted(rows.keys() - set(files)):
         fault = f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, like {unknown[0]}"
         if len(unknown) == len(rows):
             raise InputError(f"{fault}; give paths such as {paths[0]}")
         console.warning(fault)
-    photographs = [
-        Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
-    ]
+    photographs = [Photograph(path, path.parts[0] if nested else label, *rows.get(path, (None, ()))) for path in paths]
     sources = {item.source for item in photographs}
     if missing := {name for item in photographs for name in item.hard_negatives} - sources:
         raise InputError(f"{folder / TABLE} names hard_negatives of source {min(missing)!r}, which has no image")
@@ -110,10 +108,8 @@ def _has_class_folders(folder: Path, paths: Sequence[PurePosixPath], classes: Se
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
     for name in names:
         if name not in classes and not name.startswith(FOREIGN):
-            raise InputError(
-                f"{folder / name} is not named after a class of the model (such as {nearest(name, classes)}): rename "
-                f"it, to {FOREIGN}{name} if the model lacks its class"
-            )
+            fault = f"is not named after a class of the model (such as {nearest(name, classes)})"
+            raise InputError(f"{folder / name} {fault}: rename it, to {FOREIGN}{name} if the model lacks its class")
     if names and (loose := [path for path in paths if len(path.parts) == 1]):
         raise InputError(f"{folder / loose[0]} lies beside class folders: move it into the folder of its class")
     return bool(names)
@@ -176,8 +172,7 @@ def load_photographs(
     rows = [row for row, error in enumerate(errors) if error is None]
     broken = [(item.path, error) for item, error in zip(photographs, errors, strict=True) if error is not None]
     if broken and not (rows and skip_unreadable):
-        raise InputError(
-            f"{len(broken)} of {len(photographs)} photographs cannot be read, the first being {folder / broken[0][0]} "
-            f"({broken[0][1]}): replace them{advice if rows else ''}"
-        )
+        first = f"{folder / broken[0][0]} ({broken[0][1]})"
+        fault = f"{len(broken)} of {len(photographs)} photographs cannot be read, the first being {first}"
+        raise InputError(f"{fault}: replace them{advice if rows else ''}")
     return [photographs[row] for row in rows], images[rows] if broken else images, [str(path) for path, _ in broken]

@@ -45,11 +45,9 @@ def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str
     with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
         batches = [model(to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
         logits = torch.cat(batches).float().cpu()
-    if logits.shape != (len(images), classes):
-        raise InputError(
-            f"the model returned logits of shape {tuple(logits.shape)}, not {(len(images), classes)}: "
-            "evaluate a checkpoint that was trained on these classes"
-        )
+    if logits.shape != (shape := (len(images), classes)):
+        advice = "evaluate a checkpoint that was trained on these classes"
+        raise InputError(f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}")
     if not logits.isfinite().all():
         raise InputError("the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged")
     return logits
@@ -92,9 +90,8 @@ def read_predictions(path: Path, label: str) -> list[Prediction]:
         with path.open(newline="", encoding="utf-8") as file:
             return [_read_row(row, label) for row in csv.DictReader(file)]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
-        raise InputError(
-            f"{path} cannot be used ({in_one_line(error)}): score the photographs again, with label={label}"
-        ) from error
+        advice = f"score the photographs again, with label={label}"
+        raise InputError(f"{path} cannot be used ({in_one_line(error)}): {advice}") from error
 
 
 def _read_row(row: dict[str, str], label: str) -> Prediction:

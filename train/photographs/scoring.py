@@ -65,18 +65,13 @@ def evaluate_photographs(
     labels = sorted({item.photograph.label for item in predictions})
     by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
     whole = pools.pop(OVERALL)
+    counts = {"positives": len(whole.positives), "negatives": len(whole.negatives)}
     summary = {
         "label": label,
         "size": size,
         "images": images_hash.hexdigest(),
         **metrics[OVERALL],
-        "n": {
-            "photographs": len(predictions),
-            "positives": len(whole.positives),
-            "negatives": len(whole.negatives),
-            "unreadable": len(unreadable),
-            "left_out": len(others),
-        },
+        "n": {"photographs": len(predictions), **counts, "unreadable": len(unreadable), "left_out": len(others)},
         "most_common_wrong": _most_common_wrong(whole.positives),
         "by_source": {
             source: {"n": len(group.positives) + len(group.negatives), **metrics[source]}

@@ -99,8 +99,7 @@ def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> boo
 
 
 def difference_tables(arms: Evaluations, pooled: str, sources: Sequence[str] | None = None) -> list[Table]:
-    """A table for each pair of `pairs_of`: the difference by source and metric. pooled: OVERALL's name. sources: None
-    for all."""
+    """The differences by source and metric of each of `pairs_of`. pooled: OVERALL's name. sources: None for all."""
     tables = []
     for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
@@ -149,10 +148,8 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     ]
     folders = [run.folder / name for group in compared for run, name in next(iter(group.values()))[:1]]
     if len(folders) > 1:
-        raise InputError(
-            f"{folders[1]} has other photographs or sources than {folders[0]}: score both networks on the same folder "
-            "with pnb-evaluate"
-        )
+        advice = "score both networks on the same folder with pnb-evaluate"
+        raise InputError(f"{folders[1]} has other photographs or sources than {folders[0]}: {advice}")
     if not folders and photographs != PHOTOGRAPHS:
         raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
     for group in compared:

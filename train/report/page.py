@@ -35,7 +35,6 @@ ATTACK_EXAMPLES = 4  # with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
 HEADLINE = "recall_at/0.10"  # of METRICS, in the first sentence
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
-ROUNDS = "attack success on clean-correct renders"
 
 
 def write_report(folders: Sequence[Path], out: Path) -> Path:
@@ -98,15 +97,12 @@ def _command(config: Mapping[str, Any]) -> str:
 
 
 def _curves(arms: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> list[Picture]:
-    """Plots of the epochs' lines of each arm's runs."""
     pictures = []
     for name, title in CURVES.items():
-        series = {
-            arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs] for arm, runs in arms.items()
-        }
-        pictures.append(plots.curves(series, title))
+        lines = {arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs] for arm, runs in arms.items()}
+        pictures.append(plots.curves(lines, title))
     rates = {arm: [[*enumerate(_attacks_by_round(run), 1)] for run in runs] for arm, runs in arms.items()}
-    pictures.append(plots.curves(rates, ROUNDS, "round of renders"))
+    pictures.append(plots.curves(rates, "attack success on clean-correct renders", "round of renders"))
     return [picture for picture in pictures if picture]
 
 
@@ -175,10 +171,8 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
 
 def _photographs(title: str, group: Scored) -> dict[str, Any]:
     """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
-    sheets = {
-        arm: plots.from_file(run.folder / name / "contact_sheet.png", f"predictions of {arm} on {title}", SHEET)
-        for arm, ((run, name), *_) in group.items()
-    }
+    paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
+    sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}
     tables = [summary.score_table("", group)]
     content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "sentences": []}
     try:
@@ -201,12 +195,9 @@ def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
     for arm, base in compare.pairs_of(arms):
         if result := compare.difference(arms[arm], arms[base], OVERALL, HEADLINE):
             after, before = result["means"]
-            is_shown = result["low"] > 0 or result["high"] < 0
-            sentences.append(
-                f"{images}: {metric_title(HEADLINE)} is {before:.2f} with {base} and {after:.2f} with {arm}. "
-                f"The difference is {format_interval(result, '+')}"
-                f"{'' if is_shown else ', so that no difference is shown'}."
-            )
+            doubt = "" if result["low"] > 0 or result["high"] < 0 else ", so that no difference is shown"
+            recall = f"{metric_title(HEADLINE)} is {before:.2f} with {base} and {after:.2f} with {arm}"
+            sentences.append(f"{images}: {recall}. The difference is {format_interval(result, '+')}{doubt}.")
     return sentences
 
 

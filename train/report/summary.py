@@ -82,10 +82,9 @@ def summarize(folder: Path) -> RunSummary:
     except InputError:
         raise
     except Exception as error:  # entries may be missing or of any type
-        raise InputError(
-            f"{folder}: {CONFIG}, {run_folder.METRICS} or a {SUMMARY} is not as `pnb-train` wrote it "
-            f"({type(error).__name__}: {in_one_line(error)}): use another run"
-        ) from error
+        files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
+        reason = f"{type(error).__name__}: {in_one_line(error)}"
+        raise InputError(f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run") from error
 
 
 def _read_run(folder: Path) -> RunSummary:
@@ -210,11 +209,9 @@ def seconds_table(arms: Arms) -> Table:
     titles |= {"attack_classifier": "attack: in the classifier", "operators": "operators, once"}
     rows = []
     for arm, (run, *_) in arms.items():
-        measured = {
-            phase: [line[key] for line in run.epochs if (key := f"seconds/{phase}") in line] for phase in titles
-        }
-        means = {phase: fmean(seconds or [0]) for phase, seconds in measured.items()}
-        if any(measured.values()):
+        times = {phase: [line[key] for line in run.epochs if (key := f"seconds/{phase}") in line] for phase in titles}
+        means = {phase: fmean(seconds or [0]) for phase, seconds in times.items()}
+        if any(times.values()):
             total = sum(means[phase] for phase in PHASES)
             rows.append([arm, *(f"{seconds:.2f}" for seconds in (total, *means.values()))])
     return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
@@ -238,7 +235,7 @@ def _spread(metrics: Sequence[Metric]) -> str:
     return f"{fmean(values):.3f} ± {stdev(values):.3f}" if len(values) == len(metrics) else "-"
 
 
-# ------------------------------------------------------------------------------------- attacks
+# ------------------------------------------------------------------------------------- attacks and folders
 
 
 def read_attack(folder: Path) -> dict[str, Any]:
@@ -267,9 +264,6 @@ def _example_row(line: dict[str, Any]) -> tuple[int, str, str, str, str]:
     )
     outcome = f"{'success' if line['success'] else 'no success'} in {int(line['steps'])} steps"
     return int(line["example"]), label, before, after, "wrong before any step" if line["success_before"] else outcome
-
-
-# ------------------------------------------------------------------------------------- folders
 
 
 Findings = tuple[list[RunSummary], list[dict[str, Any]], list[tuple[Path, str, list[dict[str, float]]]]]
