@@ -30,4 +30,4 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
         assert re.search(rf"^\| {network} .*\b{value:.3f}\b", done.stdout, re.M)
     *_, last = done.stdout.splitlines()
     page = Path(last.removeprefix("report: "))
-    assert page.parent == folder and "Attack examples" in page.read_text()
+    assert page.parent == folder and "Examples of renders" in page.read_text()

@@ -10,6 +10,7 @@ from PIL import Image
 from torch import nn
 from torch.utils.data import Dataset
 
+import augment
 import renderer
 from renderer.image import to_bytes
 
@@ -55,22 +56,13 @@ def test_load_block_recognizes_an_orange(folder):
     assert run("Load")["predicted"] == "orange"
 
 
-class Brightness(nn.Module):
-    """Calls bright images orange and dark ones plum."""
-
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        mean = 30 * images.mean((1, 2, 3))
-        return torch.stack([mean, 20.5 - mean], dim=1)
-
-
-@pytest.mark.slow
 def test_attack_block_saves_what_it_found(folder):
-    names = run("Attack a classifier", network=Brightness(), CLASSES=["orange", "plum"])
+    names = run("Attack a classifier")
     result = names["result"]
-    assert names["after"].shape == names["before"].shape == (1, 3, 3, 224, 224)
+    assert names["after"].shape == names["before"].shape == (1, 3, 3, 32, 32)
     assert (folder / "adversaries" / "attack.jsonl").is_file()
     assert (folder / "adversaries" / "example_000" / "light.json").is_file()
-    assert len(result.success) == 1
+    assert result.success.all() and augment.check(result)["random_search"] == 0
 
 
 class Photographs(Dataset):

@@ -111,6 +111,7 @@ def log_to(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), file]
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # which tells of its font cache
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=handlers, force=True)
 
 

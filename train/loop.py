@@ -228,7 +228,7 @@ class Trainer:
             f"epoch {self.epoch}/{self.settings.epochs}  train loss {trained['loss']:.3f} accuracy "
             f"{trained['accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
             f"{'' if success is None else f'  attack success {success:.2f} of the {correct:.0%} clean-correct'}"
-            f"  {sum(seconds[name] for name in PHASES):.0f} s (attack {seconds['attack']:.1f} s)"
+            f"  {sum(seconds[name] for name in PHASES):.0f} s (renders {seconds['attack']:.1f} s)"
         )
 
     def _require_finite(self, loss: float, epoch: int) -> None:

@@ -70,7 +70,7 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         torch.set_num_threads(threads)  # of this run, after others were prepared
         console.info(
             f"{len(train)} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
-            f"{threads} threads, {utils.world_size()} processes"
+            f"threads: {threads}, processes: {utils.world_size()}"
         )
         before = _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)

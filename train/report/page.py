@@ -33,7 +33,7 @@ MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
 MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with images
 ATTACK_EXAMPLES = 4  # with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
-HEADLINE = "recall_at/0.10"  # of METRICS, in the first sentence
+HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")  # of METRICS, in the first sentences
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
@@ -154,7 +154,7 @@ def _side(label: str, when: str, side: Side) -> Picture:
 def _title(arms: Arms) -> str:
     labels = dict.fromkeys(group[0].label for group in arms.values() if group[0].label)
     names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
-    return f"{' and '.join(labels)}: {', '.join(names)}"
+    return f"{' and '.join(labels)}, trained with renders: {', '.join(names)}"
 
 
 def _accuracy_sentences(arms: Arms) -> list[str]:
@@ -165,7 +165,8 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
         if bases:
             after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
             verb = "rose" if after > before else "fell" if after < before else "stayed"
-            sentences.append(f"{arm}: test accuracy {verb} from {before:.1%} to {after:.1%}.")
+            data = OmegaConf.select(group[0].config, "data.name")
+            sentences.append(f"{arm}: accuracy on the test images of {data} {verb} from {before:.1%} to {after:.1%}.")
     return sentences
 
 
@@ -190,14 +191,18 @@ def _photographs(title: str, group: Scored) -> dict[str, Any]:
 
 
 def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
-    """How far recall at a fixed false positive rate is from that of the arm that an arm is compared with."""
+    """How far each of HEADLINES is from that of the arm that an arm is compared with."""
     sentences = []
     for arm, base in compare.pairs_of(arms):
-        if result := compare.difference(arms[arm], arms[base], OVERALL, HEADLINE):
-            after, before = result["means"]
-            doubt = "" if result["low"] > 0 or result["high"] < 0 else ", so that no difference is shown"
-            recall = f"{metric_title(HEADLINE)} is {before:.2f} with {base} and {after:.2f} with {arm}"
-            sentences.append(f"{images}: {recall}. The difference is {format_interval(result, '+')}{doubt}.")
+        parts = []
+        for metric in HEADLINES:
+            if result := compare.difference(arms[arm], arms[base], OVERALL, metric):
+                after, before = result["means"]
+                is_shown = result["low"] > 0 or result["high"] < 0
+                difference = format_interval(result, "+") if is_shown else "no difference is shown"
+                parts.append(f"{metric_title(metric)} {before:.2f} and {after:.2f} ({difference})")
+        if parts:
+            sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
     return sentences
 
 
