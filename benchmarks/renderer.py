@@ -20,10 +20,10 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks import scene
+from benchmarks import reference, scene
 from benchmarks.common import Row, machine, medians, write_csv
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
-from renderer import reference, shading
+from renderer import shading
 from renderer.cache import OperatorCache
 from renderer.camera import orbit_cameras
 from renderer.fragments import Fragments

@@ -13,8 +13,8 @@ import torch
 import trimesh
 from torch import Tensor
 
+from benchmarks import reference
 from benchmarks.common import Row, relative_error
-from renderer import reference
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments

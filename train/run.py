@@ -91,18 +91,12 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
     data, cache, base = settings.data, TensorCache(cache_folder(settings.renderer.cache)), settings.train.init_from
+    classes = load_selected(Path(base))[1]["architecture"]["classes"] if base and data.name == "shapes" else None
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
         "folder": lambda: load_folder(data.path, data.size, data.test_fraction),
-        "shapes": lambda: load_shapes(
-            data.train_per_class,
-            data.test_per_class,
-            data.size,
-            data.seed,
-            cache,
-            load_selected(Path(base))[1]["architecture"]["classes"] if base else None,
-        ),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache, classes),
     }
     require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)
@@ -192,8 +186,8 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
     model, device = trainer.initial, trainer.device
     if not model or utils.rank():
         return {}
-    is_ours = not settings.model.name.startswith(PYTHON)  # the code of others may change unseen
-    cache = TensorCache(cache_folder(settings.renderer.cache) if is_ours else None)
+    is_foreign = settings.model.name.startswith(PYTHON)  # whose code may change unseen
+    cache = TensorCache(None if is_foreign else cache_folder(settings.renderer.cache))
     key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
 
     def predict(images: torch.Tensor) -> torch.Tensor:

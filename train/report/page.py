@@ -198,8 +198,8 @@ def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
         for metric in HEADLINES:
             if result := compare.difference(arms[arm], arms[base], OVERALL, metric):
                 after, before = result["means"]
-                is_shown = result["low"] > 0 or result["high"] < 0
-                difference = format_interval(result, "+") if is_shown else "no difference is shown"
+                doubtful = result["low"] <= 0 <= result["high"]
+                difference = "no difference is shown" if doubtful else format_interval(result, "+")
                 parts.append(f"{metric_title(metric)} {before:.2f} and {after:.2f} ({difference})")
         if parts:
             sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
