@@ -119,9 +119,9 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     image = _openimageio().ImageBuf(str(path))
-    texels, spec = image.get_pixels("float"), image.spec()
-    if image.has_error:
+    if not image.read():  # the library's get_pixels would end the process
         raise InputError(image.geterror())
+    texels, spec = image.get_pixels("float"), image.spec()
     if image.file_format_name not in ("hdr", "openexr"):
         raise InputError(f"it is a {image.file_format_name} image, give an .hdr or .exr file")
     if spec.roi != spec.roi_full or image.orientation != 1:
