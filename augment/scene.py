@@ -215,8 +215,9 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        views = product(range(len(examples)), range(self.views))
-        for image, (row, view) in enumerate(progress(views, "rendering views", len(examples) * self.views)):
+        views = [*product(range(len(examples)), range(self.views))]
+        shown = progress(views, "rendering views") if len(views) > 8 else views  # a bar costs a step of few views 4 %
+        for image, (row, view) in enumerate(shown):
             index = int(examples[row])
             example, mesh = self.examples[index], self.mesh(index)
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
