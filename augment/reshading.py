@@ -95,6 +95,10 @@ class Reshading:
         """(V, 3) of each unmoved object."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
+    @cached_property
+    def _faces(self) -> list[Tensor]:
+        return [torch.from_numpy(item.mesh.faces).to(self.like.device) for item in self.objects]
+
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
         """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
         key = number, camera
@@ -135,7 +139,7 @@ class Reshading:
             fragments, albedo = self._rasterized(number, camera, shape)
         if added is not None:
             albedo = painted_albedo(item.mesh, fragments, settings.encoding, item.albedo_scale, added)
-        faces = torch.from_numpy(item.mesh.faces).to(self.like.device) if settings.normals == "smooth" else None
+        faces = self._faces[number] if settings.normals == "smooth" else None
         lights = [(part, light[where]) for where, part in parts_of(self.basis)]
 
         @cache  # called only where the scene has local lights
