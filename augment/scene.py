@@ -216,8 +216,8 @@ class Scene:
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         views = [*product(range(len(examples)), range(self.views))]
-        shown = progress(views, "rendering views") if len(views) > 8 else views  # a bar costs a step of few views 4 %
-        for image, (row, view) in enumerate(shown):
+        counted = progress(views, "rendering views") if len(views) > 8 else views  # a bar costs a step of few views 4 %
+        for image, (row, view) in enumerate(counted):
             index = int(examples[row])
             example, mesh = self.examples[index], self.mesh(index)
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
