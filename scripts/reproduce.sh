@@ -8,7 +8,8 @@ usage() {
 usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden|best [key=value ...]
 
 In the root of the clone. gpu: training speed, experiments paper and fast; cpu: training speed, experiment cpu; harden:
-experiment harden from a network, four arms and four baselines, three seeds each; best: experiment best, three seeds.
+experiment harden from a network, four arms; best: experiment best, alone, with TrivialAugment, and five arms without
+renders; three seeds each.
 Further settings of conf/train.yaml go to every training run. From the environment:
   DATA      CIFAR-100 as data=npz reads it
   MESHES    scene.meshes, a list
@@ -61,13 +62,16 @@ gpu | cpu)
     done
     exit
     ;;
-best) sweep best "${from_network[@]}" "$@" ;;
+best)
+    sweep best "${from_network[@]}" "$@"
+    sweep best train.augmentation=trivial_augment "${from_network[@]}" "$@"
+    # The rivals, without renders: the same network, images, soup and seeds. PGD takes three more passes for each image.
+    sweep best augment=none train.ranking=0 train.augmentation=none,color_jitter,trivial_augment,augmix,pgd \
+        "${from_network[@]}" "$@"
+    ;;
 harden)
     sweep harden augment=none,random,adversarial "${from_network[@]}" "$@"
     sweep harden augment=random "augment.random_light.radius=${DISTANCE:-0.6}" "${from_network[@]}" "$@"
-    sweep harden augment=none train.augmentation=color_jitter,trivial_augment,augmix "${from_network[@]}" "$@"
-    # PGD takes three steps for each image: with 1,800 images it takes as long as the others.
-    sweep harden augment=none train.augmentation=pgd train.images_per_epoch=1800 "${from_network[@]}" "$@"
     ;;
 esac
 tables "$command" laboratory []
