@@ -14,8 +14,11 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
-from train import lab
-from train.lab import FAMILIES, FOV, LabSettings, Shot, draw_pattern, draw_shots, lab_parts, path_traced
+from train.lab import laboratory as lab
+from train.lab import patterns
+from train.lab.laboratory import LabSettings, lab_parts, path_traced
+from train.lab.patterns import FAMILIES, draw_pattern
+from train.lab.shots import FOV, Shot, draw_shots
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -26,7 +29,7 @@ MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "albedo_scale": 0.5}, "so
 @pytest.fixture(autouse=True, scope="module")
 def coarse_patterns():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lab, "RESOLUTION", 64)
+        patch.setattr(patterns, "RESOLUTION", 64)
         yield
 
 
@@ -137,7 +140,7 @@ def test_a_pattern_mixes_two_colors_one_of_which_is_darkness_in_some_families(fa
         assert np.linalg.matrix_rank(colors - colors[0], tol=1e-3) == 1
     else:
         assert len(colors) == (1 if family == "solid" else 2)
-        assert (colors.min(axis=0).max() == 0) == (family not in (*lab.TWO_COLORED, "solid"))
+        assert (colors.min(axis=0).max() == 0) == (family not in (*patterns.TWO_COLORED, "solid"))
 
 
 def test_every_family_has_as_many_setups_from_dim_to_bright_that_differ_and_stay_within_their_ranges():

@@ -1,27 +1,18 @@
-"""The laboratory: path-traced renders of objects on a dark table under a projector, to score networks on.
+"""Path-trace shots of objects, and write them as a folder of photographs."""
 
-World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
-RGB; a radiance of 1 is white at an exposure of 1.
-"""
-
-import colorsys
 import csv
 import json
-import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from omegaconf import MISSING
-from PIL import Image, ImageDraw, ImageFont
-from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation
+from PIL import Image
 
 from augment.objects import load_object
 from augment.utils import progress, stream_seed
@@ -29,11 +20,12 @@ from renderer.errors import FACTOR, InputError, require_choice, require_limits, 
 from renderer.image import LARGEST_SIZE, decode, encode
 from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
 from renderer.light.environment import read_panorama
-from renderer.light.harmonics import equirectangular
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES
 from train.errors import writable_folder
+from train.lab.patterns import FAMILIES, TRAINED
+from train.lab.shots import FOV, Shot, draw_shots
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
 from train.settings import LARGEST_SEED, read_object
@@ -44,210 +36,10 @@ SOLIDS = (
     *("pear:101", "sweet_pepper:101", "lemon:101", "lemon:102", "peach:101", "peach:102", "ball:101", "ball:103"),
 )
 LARGEST = {"setups": 10**6, "size": LARGEST_SIZE, "spp": 10**5, "bounces": 1000}
-FOV = 25.0  # degrees, of the camera
-RESOLUTION = 512  # pixels per side of a projected image
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
 FLOOR = 100.0  # half of the table's width
 SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: at a right-angled edge at most 0.82
 ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
-
-# ------------------------------------------------------------------------------------- projected patterns
-
-# Points are (..., 2) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
-# family gives each point a weight in [0, 1] between two colors of light, or one for each channel (..., 3).
-
-
-def solid(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return np.ones(points.shape[:-1])
-
-
-def gradient(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A ramp along x about the middle."""
-    return np.clip(points[..., 0] / rng.uniform(0.6, 1.6) + 0.5, 0, 1)
-
-
-def stripes(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Stripes along y."""
-    phase = points[..., 0] / rng.uniform(0.12, 0.5) + rng.uniform()
-    return (phase % 1 < rng.uniform(0.3, 0.7)).astype(float)
-
-
-def checkers(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Squares of a chessboard."""
-    odd = (points / rng.uniform(0.12, 0.5) + rng.uniform(size=2)) % 1 < 0.5
-    return (odd[..., 0] != odd[..., 1]).astype(float)
-
-
-def half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One side of a line through the object."""
-    return (points[..., 0] > rng.uniform(-0.12, 0.12)).astype(float)
-
-
-def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Discs of one size at random positions, over about half of the image."""
-    radius = rng.uniform(0.08, 0.25)
-    lit = np.zeros(points.shape[:-1], dtype=bool)
-    for center in rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2)):
-        lit |= ((points - center) ** 2).sum(axis=-1) < radius**2
-    return lit.astype(float)
-
-
-def rings(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Rings of one width about a random point."""
-    radius = np.linalg.norm(points - rng.uniform(-0.5, 0.5, 2), axis=-1)
-    return ((radius / rng.uniform(0.12, 0.4) + rng.uniform()) % 1 < rng.uniform(0.3, 0.7)).astype(float)
-
-
-def window(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The panes of a window with bars between them and darkness around."""
-    panes, size = rng.integers(2, 5, 2), rng.uniform(0.15, 0.4, 2)
-    places = (points - rng.uniform(-0.15, 0.15, 2)) / size + panes / 2
-    inside = (places > 0) & (places < panes) & (abs(places % 1 - 0.5) < rng.uniform(0.3, 0.45))
-    return inside.all(axis=-1).astype(float)
-
-
-def leaves(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The shadows of leaves: ellipses at all angles, over about half of the image."""
-    length = rng.uniform(0.15, 0.35)
-    lit = np.ones(points.shape[:-1], dtype=bool)
-    for _ in range(round(2.8 / (math.pi * length**2 / 3))):
-        angle, offset = rng.uniform(0, math.pi), points - rng.uniform(-1, 1, 2)
-        along = offset @ [math.cos(angle), math.sin(angle)]
-        across = offset @ [-math.sin(angle), math.cos(angle)]
-        lit &= (along / length) ** 2 + (across / length * 3) ** 2 > 1
-    return lit.astype(float)
-
-
-def text(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Lines of random capitals, bright, on a dark slide."""
-    height = int(rng.integers(40, 120))
-    slide, font = Image.new("L", (RESOLUTION, RESOLUTION)), ImageFont.load_default(float(height))
-    for top in range(0, RESOLUTION, int(1.2 * height)):
-        line = "".join(rng.choice(list("ABCDEFGHIJKLMNOPQRSTUVWXYZ "), 24))
-        ImageDraw.Draw(slide).text((-int(rng.integers(height)), top), line, 255, font)
-    return _sampled(np.asarray(slide, dtype=np.float32)[..., None] / 255, points, order=1)[..., 0]
-
-
-def colors(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A smooth field of colors, each channel by itself."""
-    grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
-    return _sampled(grid, points, order=3).clip(0, 1)
-
-
-def _sampled(image: np.ndarray, points: np.ndarray, order: int) -> np.ndarray:
-    """The image (H, W, C), which spans [-1, 1], at points (..., 2), by splines; mirrored beyond its sides."""
-    places = np.moveaxis((points[..., ::-1] + 1) / 2 * image.shape[:2] - 0.5, -1, 0)
-    channels = [map_coordinates(channel, places, order=order, mode="reflect") for channel in np.moveaxis(image, -1, 0)]
-    return np.stack(channels, axis=-1)
-
-
-TRAINED = ("solid", "gradient", "stripes", "checkers", "half", "spots")  # all but gradients are thrown in training, too
-FAMILIES = {
-    family.__name__: family
-    for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
-}
-TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
-
-
-def draw_pattern(family: str, rng: np.random.Generator) -> np.ndarray:
-    """An image (RESOLUTION, RESOLUTION, 3) float32 of the family in random color, scale, angle and position, linear RGB
-    in [0, 1]."""
-    first, second = draw_color(rng), draw_color(rng) * rng.uniform() * (family in TWO_COLORED)
-    centers = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
-    angle = rng.uniform(0, 2 * math.pi)
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
-    weight = FAMILIES[family](points, rng)
-    weight = weight if weight.ndim == 3 else weight[..., None]
-    return (second + weight * (first - second)).astype(np.float32)
-
-
-def draw_color(rng: np.random.Generator) -> np.ndarray:
-    """(3,) linear RGB, the largest channel 1: any hue, from white to pure in even steps of the sRGB values."""
-    srgb = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
-    return decode(torch.tensor(srgb, dtype=torch.float64), "srgb").numpy()
-
-
-# ------------------------------------------------------------------------------------- light, camera and pose
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One light, camera, pose and table, for any object.
-
-    brightness: radiance of a white surface that faces the projector where its image is white, or that faces up under an
-    environment. pattern: the projected image (H, W, 3). environment: radiance (H, W, 3), laid out as in
-    `renderer.light.environment`, in place of projector and ambient. ambient: radiance from everywhere (3,). table:
-    albedo (3,). projector, camera: positions (3,). center, aim: the points (3,) that they look at. rotation: of the
-    object (3, 3). scale: the object's largest coordinate.
-    """
-
-    family: str
-    brightness: float
-    pattern: np.ndarray
-    ambient: np.ndarray
-    table: np.ndarray
-    projector: np.ndarray
-    camera: np.ndarray
-    center: np.ndarray
-    aim: np.ndarray
-    rotation: np.ndarray
-    scale: float
-    environment: np.ndarray | None = None
-
-
-def draw_shots(
-    setups: int, families: Sequence[str], brightness: Sequence[float], seed: int, environments: Mapping[str, np.ndarray]
-) -> Iterator[Shot]:
-    """`setups` shots, equally many of each pattern family and each environment (by name), in this order.
-
-    Brightness rises evenly in ratios within each. An environment is turned about the vertical by a random angle.
-    """
-    dimmest, brightest = brightness
-    kinds = [*families, *environments]
-    per_kind = setups // len(kinds)
-    for kind, index in product(kinds, range(per_kind)):
-        rng = np.random.default_rng(stream_seed(seed, "shot", kind, index))
-        radiance = dimmest * (brightest / dimmest) ** ((index + rng.uniform()) / per_kind)
-        if kind not in environments:
-            yield _draw_shot(kind, radiance, rng)
-            continue
-        shot, sky = _draw_shot("solid", radiance, rng), environments[kind]
-        directions, solid_angles = equirectangular(*sky.shape[:2])
-        cosines = directions[..., 2].clamp(min=0) * solid_angles
-        on_white = float((cosines[..., None] * torch.from_numpy(sky)).sum((0, 1)).mean()) / math.pi  # and facing up
-        turned = np.roll(sky, rng.integers(sky.shape[1]), axis=1)
-        yield replace(shot, family=kind, environment=(radiance / on_white * turned).astype(np.float32))
-
-
-def _draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
-    """A shot under a pattern of the family. The projector stands on the camera's side, up to 70° off."""
-    azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
-    center = np.array([0, 0, 0.8 * scale])
-    aim = center + rng.uniform(-0.25, 0.25, 3)
-    return Shot(
-        family=family,
-        brightness=brightness,
-        pattern=draw_pattern(family, rng),
-        ambient=rng.uniform(0.01, 0.06) * draw_color(rng),
-        table=rng.uniform(0.04, 0.16) * draw_color(rng),
-        projector=center + _position(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
-        camera=aim + _position(azimuth, rng.uniform(18, 60), half_width / math.tan(math.radians(FOV / 2))),
-        center=center,
-        aim=aim,
-        rotation=Rotation.from_euler("ZXZ", rng.uniform(0, (360, 60, 360)), degrees=True).as_matrix(),
-        scale=scale,
-    )
-
-
-def _position(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """(3,) from angles in degrees."""
-    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
-    horizontal = math.cos(elevation)
-    return distance * np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)])
-
-
-# ------------------------------------------------------------------------------------- path tracing
 
 
 def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
@@ -315,9 +107,6 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
         twosided = {"type": "twosided", "surface": surface}
         shapes.append(shape(module, twosided, positions, faces, normals, uvs, colors))
     return shapes
-
-
-# ------------------------------------------------------------------------------------- the folder
 
 
 @dataclass
