@@ -2,10 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
 from typing import Any
-
-NORMAL_95 = 1.959963984540054  # standard deviations on either side of the mean: 95 % of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -41,12 +38,10 @@ def fraction(hits: int, n: int) -> dict[str, Any]:
     """
     if n == 0:
         return {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
-    # Written out, since scipy.stats takes a second to import.
-    value, scale = hits / n, 2 * (n + NORMAL_95**2)
-    center = (2 * n * value + NORMAL_95**2) / scale
-    half_width = NORMAL_95 / scale * sqrt(4 * n * value * (1 - value) + NORMAL_95**2)
-    low, high = center - half_width if hits else 0.0, center + half_width if hits < n else 1.0
-    return {"value": value, "low": low, "high": high, "hits": hits, "n": n}
+    from scipy.stats import binomtest  # takes a second to import
+
+    ends = binomtest(hits, n).proportion_ci(method="wilson")
+    return {"value": hits / n, "low": float(ends.low), "high": float(ends.high), "hits": hits, "n": n}
 
 
 def format_fraction(result: Mapping[str, Any]) -> str:
