@@ -19,7 +19,7 @@ from torch.utils.benchmark import Timer
 Key = TypeVar("Key")
 Row = dict[str, Any]
 BURST = 2e-3  # seconds: a shorter call is repeated for as long, since one call alone is within the clock's noise
-LIMIT = 20.0  # seconds of wall time, after which a comparison stops at the end of its third round
+LIMIT = 20.0  # seconds by the comparison's clock, after which a comparison stops at the end of its third round
 
 
 def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[Key, float]:
@@ -28,13 +28,14 @@ def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str 
     All calls take turns in every round, so that noise hits all alike. On a CPU the clock is the process's own time,
     which leaves out other processes on a shared machine; elsewhere it is wall time after synchronization.
     """
-    clock = {"timer": time.process_time} if device == "cpu" else {}
+    now = time.process_time if device == "cpu" else time.perf_counter
+    clock = {"timer": now} if device == "cpu" else {}
     timers = {key: Timer("call()", globals={"call": call}, **clock) for key, call in calls.items()}
     repeats = {key: max(1, round(BURST / timer.timeit(1).median)) for key, timer in timers.items()}
     times: dict[Key, list[float]] = {key: [] for key in calls}
-    start = time.perf_counter()
+    start = now()
     for past in range(rounds):
-        if past >= 3 and time.perf_counter() - start > LIMIT:
+        if past >= 3 and now() - start > LIMIT:
             break
         for key, timer in timers.items():
             times[key].append(1e3 * timer.timeit(repeats[key]).median)  # warms up first

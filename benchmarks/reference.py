@@ -13,13 +13,17 @@ from torch import Tensor
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:
     """Σ A_l U_lm Y_lm(n), (N, 3), at unit normals (N, 3) under light ((degree + 1)², 3)."""
-    rows, weights = [], []
-    for index, harmonic in harmonics(normals, math.isqrt(len(light)) - 1):
-        factor = clamped_cosine(math.isqrt(index))
-        if factor:
-            rows.append(harmonic)
-            weights.append(factor * light[index])
-    return torch.stack(rows, dim=1) @ torch.stack(weights)
+    matrix, rows, factors = reaching_harmonics(normals, math.isqrt(len(light)) - 1)
+    return matrix @ (factors * light[rows])
+
+
+def reaching_harmonics(normals: Tensor, degree: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(Y_lm at unit normals (N, 3), (N, K); their indices (K,); A_l of each, (K, 1)) where A_l is not zero."""
+    factors = {index: clamped_cosine(math.isqrt(index)) for index in range((degree + 1) ** 2)}
+    reaching = {index: harmonic for index, harmonic in harmonics(normals, degree) if factors[index]}
+    rows = torch.tensor(list(reaching), device=normals.device)
+    column = normals.new_tensor([factors[index] for index in reaching])[:, None]
+    return torch.stack(list(reaching.values()), dim=1), rows, column
 
 
 def harmonics(unit_normals: Tensor, degree: int) -> Iterator[tuple[int, Tensor]]:

@@ -40,6 +40,7 @@ PER_SIDE = (1, 2, 4, 8, 16)  # samples per side of a pixel
 
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 Call = Callable[[], object]
+Lit = Callable[[Tensor], tuple[Tensor, Tensor]]  # a light to the covered pixels and their radiance
 Contender = tuple[str, int, int, Step, Call]  # setting, samples per side, degree, what is right, what is timed
 
 
@@ -111,26 +112,56 @@ def builds(view: View, mitsuba: bool) -> Iterator[Contender]:
 
 
 def light_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
-    """The gradient by the light: operator, plain autograd with cached visibility, Mitsuba."""
-    light, operator = coefficients(DEGREE, torch.float32, view.device), view.operator()
-    upstream, vertices = view.upstream(operator.pixels), view.vertices()
-    fragments, albedo, _ = view.rasterized(1, vertices)
-    sparse_upstream = view.upstream(fragments.pixels)
+    """The gradient by the light: the operator, plain autograd with ever more computed once and kept, Mitsuba."""
+    light, vertices = coefficients(DEGREE, torch.float32, view.device), view.vertices()
+    operator = view.operator()
+    upstream = view.upstream(operator.pixels)
 
     def by_operator() -> Result:
         return operator.pixels, operator.radiance(light), operator.light_gradient(upstream)
 
-    def by_autograd() -> Result:
-        variable = light.clone().requires_grad_()
-        radiance = shade_by_face(fragments, vertices, variable, albedo)
-        [gradient] = torch.autograd.grad((radiance * sparse_upstream).sum(), variable)
-        return fragments.pixels, radiance.detach(), gradient
-
     yield "operator", SAMPLES, DEGREE, by_operator, by_operator
-    yield f"{AUTOGRAD}, visibility cached", 1, DEGREE, by_autograd, by_autograd
+    for samples, (kept, render) in [(s, item) for s in (1, SAMPLES) for item in lit_by_autograd(view, vertices, s)]:
+        upstream_there = view.upstream(view.operator(samples).pixels)
+
+        def by_autograd(render: Lit = render, upstream: Tensor = upstream_there) -> Result:
+            variable = light.clone().requires_grad_()
+            pixels, radiance = render(variable)
+            return pixels, radiance.detach(), *torch.autograd.grad(radiance, variable, upstream)
+
+        yield f"plain autograd, kept: {kept}", samples, DEGREE, by_autograd, by_autograd
     if mitsuba:
         step, _ = scene.mitsuba_steps(view)
         yield "Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step
+
+
+def lit_by_autograd(view: View, vertices: Tensor, samples: int) -> Iterator[tuple[str, Lit]]:
+    """What is kept from step to step, and a function of the light to the covered pixels and their radiance."""
+    operator, (fragments, albedo, _) = view.operator(samples), view.rasterized(samples, vertices)
+    pixels, faces = fragments.pixels, len(fragments.faces)
+    if samples == 1:  # with more, both take as many times as long
+
+        def drawn(light: Tensor) -> tuple[Tensor, Tensor]:
+            fragments, albedo, _ = view.rasterized(samples, vertices)
+            return pixels, shade_by_face(fragments, vertices, light, albedo)
+
+        yield "nothing", drawn
+        yield "visibility", lambda light: (pixels, shade_by_face(fragments, vertices, light, albedo))
+    normals = reference.face_normals(vertices[fragments.corners]) * fragments.facing.to(vertices)
+    matrix, rows, factors = reference.reaching_harmonics(normals, DEGREE)
+    key, pair = (fragments.pixel * faces + fragments.face).unique(return_inverse=True)
+    pixel, face = key // faces, key % faces
+    weight = albedo.new_zeros(3, len(key)).index_add(1, pair, albedo.T / samples**2)
+    at_faces, at_pixels = (matrix * factors.T).T.contiguous(), operator.transfer[0]
+
+    def by_face(light: Tensor) -> tuple[Tensor, Tensor]:
+        shade = (light[rows].T @ at_faces).index_select(1, face) * weight
+        return pixels, shade.new_zeros(3, len(pixels)).index_add(1, pixel, shade)
+
+    yield "harmonics of the seen faces", by_face
+    pixel_major, pixel_albedo = at_pixels.T.contiguous(), operator.albedo.T.contiguous()
+    yield "operator, pixels first", lambda light: (pixels, (pixel_major @ light[operator.nonzero] * pixel_albedo).T)
+    yield "operator", lambda light: (pixels, light[operator.nonzero].T @ at_pixels * operator.albedo)
 
 
 def vertex_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:

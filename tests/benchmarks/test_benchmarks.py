@@ -63,6 +63,18 @@ def test_the_benchmarks_plain_autograd_is_the_analytic_gradient():
     torch.testing.assert_close(plain, analytic, rtol=0, atol=1e3 * 2.2e-16 * float(analytic.abs().max()))
 
 
+def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples():
+    """Whatever plain autograd keeps from step to step; to float32's rounding of sums over all pixels."""
+    contenders = list(renderer.light_gradients(scene.View(scene.ellipsoid(2), 16, choose("numpy")), mitsuba=False))
+    for samples in (1, scene.SAMPLES):
+        (pixels, *first), *others = [step() for _, count, _, step, _ in contenders if count == samples]
+        assert len(others) == 3 + (samples == 1)
+        for others_pixels, *values in others:
+            assert torch.equal(others_pixels, pixels)
+            for value, expected in zip(values, first, strict=True):
+                torch.testing.assert_close(value, expected, rtol=0, atol=2e-5 * float(expected.abs().max()))
+
+
 def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     cases = {name: lights.LOCAL_LIGHTS[name] for name in ("harmonics", "3 lamps")}
     few = {"VIEWS": 1, "RAYS": 2**10, "PATCHES": 64, "RAYS_OF_PATCH": 64, "LOCAL_LIGHTS": cases}
