@@ -12,10 +12,11 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 
 from omegaconf import MISSING
 
+from augment.classifiers import load_classifier
 from renderer.errors import InputError
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
-from train.networks import load_classifier, load_run, published
+from train.networks import load_run, published
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder import sole_writer
 

@@ -20,7 +20,7 @@ from augment.attacks.evaluate import check, require_transferable, success_by_rad
 from augment.attacks.files import LINES, require_renderers, save
 from augment.attacks.search import find_scene
 from augment.build import LampsSettings, ProjectorSettings, RendererSettings, SceneSettings, build_scene
-from augment.classifiers import Classifier
+from augment.classifiers import Classifier, load_classifier
 from augment.objects import ObjectSettings, load_object, on_ground
 from augment.scene import Scene
 from augment.utils import generator
@@ -28,7 +28,6 @@ from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
 from train.device import choose_device
 from train.errors import writable_folder
-from train.networks import load_classifier
 from train.run_folder import sole_writer, write_config
 from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
 from train.tables import Table, format_fraction, fraction

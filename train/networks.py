@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from safetensors import safe_open
 from torch import Tensor, nn
 
-from augment import classifiers, utils
-from augment.classifiers import Classifier
+from augment import utils
+from augment.classifiers import SOURCES, Classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
@@ -186,11 +186,6 @@ def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: st
 # ------------------------------------------------------------------------------------- loading and publishing
 
 
-def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
-    """`run:FOLDER`, or a name that `augment.classifiers.load_classifier` knows, whose errors are raised."""
-    return classifiers.load_classifier(name, weights, {**classifiers.SOURCES, "run:": load_run})
-
-
 def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:
     """The network that `load_selected` finds for a run's folder, one under pretrained/, or a file of either.
 
@@ -212,6 +207,9 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
         network = build_network(classes, size, **shape)
         network.load_state_dict(state["model"])
         return Classifier(network, size, classes, f"run:{run}")
+
+
+SOURCES["run:"] = load_run  # a classifier's name in the commands
 
 
 @contextmanager

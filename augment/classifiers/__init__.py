@@ -3,7 +3,7 @@
 `load_classifier` makes one from a name; `Classifier(function, size, classes)` makes one of any callable.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,8 @@ from renderer.errors import InputError
 __all__ = ["SOURCES", "Classifier", "load_classifier"]
 
 # A name that ends in a colon is followed by the source's own name for the model, the loader's first argument.
-SOURCES: Mapping[str, Callable[..., Classifier]] = {
+# `train.networks` adds `run:`, the networks that this project trains.
+SOURCES: dict[str, Callable[..., Classifier]] = {
     **{f"efficientnet_lite{version}": partial(load_efficientnet_lite, version) for version in range(3)},
     SQUEEZENET_CAFFE: load_squeezenet_caffe,
     "torchvision:": load_torchvision,
@@ -28,11 +29,9 @@ SOURCES: Mapping[str, Callable[..., Classifier]] = {
 }
 
 
-def load_classifier(
-    name: str, weights: str | Path | None = None, sources: Mapping[str, Callable[..., Classifier]] = SOURCES
-) -> Classifier:
+def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     """`efficientnet_lite0` (to 2), `squeezenet_caffe`, `torchvision:NAME` or `python:package.module:function`, on
-    the CPU.
+    the CPU. In the commands also `run:FOLDER`, which in Python is `train.load_run(FOLDER)`.
 
     weights: a local file; None for those that the source brings or downloads. InputError for an unknown name, for
     weights that are missing, damaged or another network's, and where a package or the network is wanting.
@@ -42,10 +41,10 @@ def load_classifier(
     renderer.errors.InputError: absent.pt does not exist: give the path of a file of weights
     """
     source, colon, model = name.partition(":")
-    if source + colon not in sources:
-        choices = [f"{source}NAME" if source.endswith(":") else source for source in sources]
+    if source + colon not in SOURCES:
+        choices = [f"{source}NAME" if source.endswith(":") else source for source in SOURCES]
         raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
-    load = sources[source + colon]
+    load = SOURCES[source + colon]
     path = None if weights is None else Path(weights)
     with announced(f"loading {name}"):
         return load(model, path) if colon else load(path)

@@ -13,14 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment import AttackSettings, Classifier
+from augment import AttackSettings, Classifier, load_classifier
 from augment.attacks.descent import Goal, descend
 from augment.attacks.parameters import AttackProblem
 from augment.objects import SceneObject
 from augment.utils import generator
 from benchmarks.paper import common
 from renderer.errors import FACTOR
-from train.networks import load_classifier
 
 FURTHER = 10  # steps that an adversary goes on for
 ATTACKED = (1, 5)  # views that share one light or shape
