@@ -54,6 +54,7 @@ DIRECT: Case = (HARMONICS, {})
 LIGHT_PATHS: dict[str, Case] = {
     "direct": DIRECT,
     "shadows": (HARMONICS, {"shadows": True}),
+    "shadows, smooth": (HARMONICS, {"shadows": True, "normals": "smooth"}),
     "bounces:3": (HARMONICS, {"bounces": 3}),
 }
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
@@ -128,17 +129,18 @@ def hard_meshes() -> dict[str, Mesh]:
 
 
 def beside_mitsuba(size: int) -> Iterator[Row]:
-    for (name, mesh), paths in product(hard_meshes().items(), ["shadows", "bounces:3"]):
+    for (name, mesh), paths in product(hard_meshes().items(), list(LIGHT_PATHS)[1:]):
         yield {"table": "mitsuba", "mesh": name, "light": paths, "size": size} | differences(mesh, size, paths)
 
 
 def differences(mesh: Mesh, size: int, paths: str) -> Row:
     """Of the image, over its brightest value and inside the outline."""
     light, (samples, finest) = load_light("st_peters"), SAMPLES["cost"]  # a probe that is positive all around
+    unblocked = {**LIGHT_PATHS[paths][1], "shadows": False, "bounces": 0}
     ours = {
         "image_error": operators(mesh, size, samples, LIGHT_PATHS[paths])[0],
         "image_error_converged": converged(mesh, size, finest, LIGHT_PATHS[paths]),
-        "image_error_direct": operators(mesh, size, samples, DIRECT)[0],
+        "image_error_direct": operators(mesh, size, samples, (HARMONICS, unblocked))[0],
     }
     image, coverage, noise = mitsuba_image(mesh, size, paths, light)
     inside, row = coverage > 0.999, {}

@@ -86,7 +86,7 @@ class Patches:
 
     def weights_by_patch(self, hits: RayHits, weights: Tensor) -> csr_matrix:
         """(B, N) sums of the weights (B, D) of directions over the patch that is hit there."""
-        pixel, direction = torch.nonzero(weights, as_tuple=True)
+        pixel, direction = torch.nonzero(weights * (hits.face >= 0), as_tuple=True)
         face = hits.face[pixel, direction]
         behind = (self._normals[face] * hits.directions[direction]).sum(1) > 0
         entries = pixel.numpy(), self.of_side[behind.long(), face].numpy()

@@ -27,6 +27,7 @@ from renderer.shading import smooth_normals
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
 COMPARISONS = 2**30  # of faces with vertices: about a second
+BENT = 1 / 1024  # of an even sky: a face that blocks no more of it from its smooth normals is taken for flat
 BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 
 
@@ -74,7 +75,8 @@ class RayHits(NamedTuple):
 
     pixels: (B,), indices among the view's. directions: (D, 3). sample: from which the ray starts. weight: of the
     radiance from there in the pixel's irradiance, solid angle × cosine × the number of the pixel's samples, and zero
-    where the ray hits no face. face: the first that the ray hits, -1 for none.
+    where nothing blocks it. face: the first that the ray hits; -1 for none, and where the sample's own face blocks
+    light from below it, which smooth normals would receive.
     """
 
     pixels: Tensor
@@ -94,7 +96,7 @@ class Rays:
 
     def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
         """Blocks of a view's pixels that may see another surface, in directions (D, 3) of a `sphere`.
-        No ray is cast below the plane of a sample's face, from where smooth normals may still be lit."""
+        A sample's face blocks all light from below its plane, as it would in the solid that a closed mesh bounds."""
         fragments = surface.fragments
         pixels = self._pixels_to_cast(surface)
         if not len(pixels):
@@ -112,7 +114,7 @@ class Rays:
             start = sample[cast]
             face = self.first_hit(surface.points[start] + self.offset * planes[start], directions[cast[1]])
             face = torch.full_like(sample, -1).index_put_(cast, face)
-            weight = (cosine * of_pixel * solid_angle).masked_fill(face < 0, 0)
+            weight = (cosine * of_pixel * solid_angle).masked_fill((face < 0) & (above >= 0), 0)
             yield RayHits(some, directions, sample, weight, face)
 
     @cached_property
@@ -140,8 +142,8 @@ class Rays:
         return torch.from_numpy(vertices).double()
 
     def _pixels_to_cast(self, surface: Surface) -> Tensor:
-        """The pixels with a sample on a face above whose plane other vertices lie; all pixels, where that test would
-        take longer than the rays."""
+        """The pixels with a sample on a face above whose plane other vertices lie, or whose plane blocks light: of an
+        even sky (1 - cos) / 2, by the angle to the normal. All, where comparing would take longer than the rays."""
         fragments, planes = surface.fragments, surface.face_planes
         if len(planes) * len(self._outermost) > COMPARISONS:
             return torch.arange(len(fragments.pixels))
@@ -149,7 +151,8 @@ class Rays:
         highest = torch.cat([(part @ self._outermost.T).amax(1) for part in parts])
         corners = surface.vertices[fragments.corners[:, 0]]
         rises = highest - (planes * corners).sum(1) > self.offset
-        return fragments.pixel[rises[fragments.face]].unique()
+        bent = (surface.normals * surface.planes).sum(1) < 1 - 2 * BENT
+        return fragments.pixel[rises[fragments.face] | bent].unique()
 
     def first_hit(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
         """(N,) the first face that each ray (N, 3) hits, -1 for none. lengths: (N,) of the rays."""

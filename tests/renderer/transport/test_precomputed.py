@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
-from oracles import mesh_of
+from oracles import mesh_of, scipy_basis
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
@@ -68,15 +68,37 @@ CONVEX = {
 }
 
 
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
-def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh, normals):
+def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh):
     camera = OrthographicCamera(1.0, 0.3, 2.2)
-    direct = operator_of(mesh, camera, shadows=False, normals=normals)
+    direct = operator_of(mesh, camera, shadows=False)
     for bounces in (0, 2):
-        shaped = operator_of(mesh, camera, bounces=bounces, normals=normals)
+        shaped = operator_of(mesh, camera, bounces=bounces)
         assert torch.equal(shaped.transfer, direct.transfer)
         assert torch.equal(shaped.nonzero, nonzero_coefficients(6))
+
+
+@pytest.mark.parametrize("bounces", [0, 2])
+def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive(bounces, monkeypatch):
+    """On the octahedron |x| + |y| + |z| = 1, the smooth normal n at p is p / |p|. Its face leaves (1 + cos) / 2 of an
+    even sky, by the angle between the normals, and of other light its integral over max(n·d, 0) above the face."""
+    monkeypatch.setattr(rays, "DIRECTIONS", 2**14)
+    hull, camera = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)])), OrthographicCamera(0, 0, 2.1)
+    built = operator_of(mesh_of(hull), camera, size=8, normals="smooth", bounces=bounces)
+    row, column = np.divmod(built.pixels.numpy(), 8)
+    right, up, back = camera.axes()
+    points = 2.1 * ((column[:, None] + 0.5) / 8 - 0.5) * right + 2.1 * (0.5 - (row[:, None] + 0.5) / 8) * up
+    points += (1 - abs(points).sum(axis=1, keepdims=True)) * back
+    normals, faces = points / np.linalg.norm(points, axis=1, keepdims=True), np.sign(points) / math.sqrt(3)
+    even = (1 + (normals * faces).sum(axis=1)) / 2
+    assert even.min() < 0.9
+    np.testing.assert_allclose(sky_fraction(built)[0], even, atol=1e-3)
+
+    heights, weights = np.polynomial.legendre.leggauss(128)
+    z, azimuth = (grid.ravel() for grid in np.meshgrid(heights, np.arange(256) * math.pi / 128, indexing="ij"))
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
+    received = (normals @ directions.T).clip(0) * (faces @ directions.T > 0) * weights.repeat(256) * math.pi / 128
+    np.testing.assert_allclose(all_rows(built)[0].T, received @ scipy_basis(directions, 6), atol=4e-3)
 
 
 def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
@@ -142,13 +164,14 @@ def test_render_shows_the_operators_shadows_also_of_moved_vertices(degree):
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=10 * FLOAT32)
 
 
-def test_render_differentiates_shadows_by_the_light_and_freezes_them_by_the_vertices():
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_render_differentiates_shadows_by_the_light_and_freezes_them_by_the_vertices(normals):
     light, vertices = ambient(torch.full((3,), 0.1).double()).requires_grad_(), torch.from_numpy(dented().vertices)
     vertices.requires_grad_()
-    shown = {"size": 6, "normals": "flat", "rasterizer": "numpy"}
+    shown = {"size": 6, "normals": normals, "rasterizer": "numpy"}
     gradients = []
     for shadows in (True, False):
         image = render(dented(), ABOVE, light, vertices=vertices, shadows=shadows, **shown)
         gradients.append(torch.autograd.grad(image.sum(), (light, vertices)))
-    torch.testing.assert_close(gradients[0][0], all_rows(operator_of(dented(), samples=2)).sum(2).T)
+    torch.testing.assert_close(gradients[0][0], all_rows(operator_of(dented(), samples=2, normals=normals)).sum(2).T)
     assert torch.equal(gradients[0][1], gradients[1][1])
