@@ -9,7 +9,8 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 
 from omegaconf import MISSING
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
+from train.photographs.metrics import GROUPS
 from train.report.compare import format_comparison
 from train.report.summary import summarize
 
@@ -18,9 +19,11 @@ from train.report.summary import summarize
 class Settings:
     runs: list[str] = MISSING  # finished run folders
     exclude: list[str] = field(default_factory=list)  # sources of photographs to leave out of the averages
+    by: str = "source"  # source | mesh: the groups of the tables
     photographs: str = "photographs"  # the sub-folder of scores to compare, by its name in evaluate.photos
 
     def __post_init__(self) -> None:
+        require_choice("by", self.by, GROUPS)
         if not self.runs:
             raise InputError("runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]")
         folders = [Path(run).resolve() for run in self.runs]
@@ -31,7 +34,7 @@ class Settings:
 @cli.command()
 def main(settings: Settings) -> None:
     runs = [summarize(Path(run)) for run in settings.runs]
-    print(format_comparison(runs, settings.exclude, settings.photographs))
+    print(format_comparison(runs, settings.exclude, settings.photographs, settings.by))
 
 
 if __name__ == "__main__":

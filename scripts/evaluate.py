@@ -13,10 +13,11 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from augment.classifiers import load_classifier
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
 from train.networks import load_run, published
+from train.photographs.metrics import GROUPS
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder import sole_writer
 
@@ -30,11 +31,13 @@ class Settings:
     photos: str = MISSING  # a folder of class folders, or of images of `label`; pretrained/laboratory is installed
     label: str = "orange"  # the class whose recall and false positives count, and that of a flat folder's images
     out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
+    by: str = "source"  # source | mesh: the groups of the tables, columns of photos.csv
     skip_unreadable: bool = False  # skip broken photographs
     precision: str = "auto"  # auto (bfloat16 where the hardware has it) | bfloat16 | float32
     device: str = "auto"  # auto | cpu | cuda | cuda:N
 
     def __post_init__(self) -> None:
+        require_choice("by", self.by, GROUPS)
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
         if self.classifier and self.model:
@@ -53,8 +56,9 @@ def main(settings: Settings) -> None:
     out = writable_folder(settings.out, "out")
     photos, label, skip = published(Path(settings.photos)), settings.label, settings.skip_unreadable
     with sole_writer("out", out):
-        summary = evaluate_photographs(model, network.classes, photos, label, out, network.size, skip, device)
-    print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")
+        arguments = model, network.classes, photos, label, out, network.size, skip, device
+        summary = evaluate_photographs(*arguments, settings.by)
+    print(f"{format_summary(summary, settings.by)}\n\ntable, scores and image: {out}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import csv
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path, PurePosixPath
 from typing import NoReturn
@@ -29,15 +29,16 @@ SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image: its path relative to the folder, its class (or `other_*`) and, if known, its source.
+    """An image: its path relative to the folder, its class (or `other_*`) and, if known, its source and its object.
 
-    hard_negatives: the sources of other things that it is ranked against, besides its own.
+    hard_negatives: the sources of other things that it is ranked against, besides its own. mesh: the object's name.
     """
 
     path: PurePosixPath
     label: str
     source: str | None
     hard_negatives: tuple[str, ...] = ()
+    mesh: str | None = field(default=None, repr=False)
 
 
 def require_outside(out: Path, folder: Path) -> None:
@@ -52,7 +53,8 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     The folder holds either a sub-folder per class, named as in `classes` (or `other_NAME` for a class that the model
     lacks), or images only, which are then all of class `label`. Sub-folders are searched to any depth, through symbolic
     links, too; hidden files and other kinds of file (`left_out`) are skipped. An optional `photos.csv` gives sources in
-    its columns `path` and `source_tag`; its column `hard_negatives` names further sources, separated by `;`.
+    its columns `path` and `source_tag`; its column `hard_negatives` names further sources, separated by `;`, and `mesh`
+    the object, over which intervals are taken, too.
 
     InputError: the folder is missing, unreadable, empty or mixes both layouts; a sub-folder or `label` is not a class;
     `photos.csv` lacks its columns, contradicts itself, or names no file of the folder or a source without images.
@@ -71,7 +73,9 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
         if len(unknown) == len(rows):
             raise InputError(f"{fault}; give paths such as {paths[0]}")
         console.warning(fault)
-    photographs = [Photograph(path, path.parts[0] if nested else label, *rows.get(path, (None, ()))) for path in paths]
+    photographs = [
+        Photograph(path, path.parts[0] if nested else label, *rows.get(path, (None, (), None))) for path in paths
+    ]
     sources = {item.source for item in photographs}
     if missing := {name for item in photographs for name in item.hard_negatives} - sources:
         raise InputError(f"{folder / TABLE} names hard_negatives of source {min(missing)!r}, which has no image")
@@ -115,16 +119,17 @@ def _has_class_folders(folder: Path, paths: Sequence[PurePosixPath], classes: Se
     return bool(names)
 
 
-def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...]]]:
-    """Source and hard negatives by path; empty without a table."""
-    rows: dict[PurePosixPath, tuple[str | None, tuple[str, ...]]] = {}
+def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...], str | None]]:
+    """Source, hard negatives and mesh by path; empty without a table."""
+    rows: dict[PurePosixPath, tuple[str | None, tuple[str, ...], str | None]] = {}
     if not os.path.lexists(table):
         return rows
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
             for line in csv.DictReader(file, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
-                row = line["source_tag"] or None, split_sources(line.get("hard_negatives", ""))
+                negatives = split_sources(line.get("hard_negatives", ""))
+                row = line["source_tag"] or None, negatives, line.get("mesh") or None
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:

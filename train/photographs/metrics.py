@@ -1,13 +1,12 @@
 """The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from typing import Any
 
 import numpy as np
-import torch
 
 from train.photographs.predictions import Prediction
 from train.tables import fraction
@@ -17,6 +16,7 @@ RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
 METRICS = ("recall", "false_positive_rate", *RANKED)  # the main metrics, by their place in a summary or its sources
 TITLES = {"recall": "recall", "false_positive_rate": "FPR", "auc": "AUC"}
 OVERALL = ""  # in the place of a source: all images
+GROUPS = ("source", "mesh")
 
 REPLICATES = 2000
 BLOCK = 250  # replicates at a time, which bounds the memory
@@ -24,19 +24,34 @@ IMAGES, RUNS = 0, 1  # seeds, so that images and runs are drawn independently
 Scores = Sequence[float] | np.ndarray
 
 
-def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
-    """A statistic's values in the bootstrap's replicates, (..., REPLICATES).
+def resample(*groups: np.ndarray) -> Iterator[list[np.ndarray]]:
+    """How often replicates of the bootstrap draw each image: (BLOCK, n) per group, until there are REPLICATES.
 
-    groups: values (n,) of images, n at least 1. A replicate draws as many from each group, with replacement. The
-    statistic takes an array (BLOCK, n) per group and returns (..., BLOCK). Groups of equal sizes get equal draws at
-    every call, so that the metrics of two networks on the same images are replicated in pairs.
+    groups: the object of each image, (n,) numbers by first appearance from 0 on, n at least 1. A replicate draws as
+    many objects as a group has, with replacement, and from each as many images as it has (Davison and Hinkley 1997,
+    section 3.8); with an image per object that is the bootstrap over images. The variance of a mean over k objects
+    comes out (k - 1) / k times too small, and with that of the images, but for one object, counted about twice. Equal
+    groups get equal draws at every call, so that the metrics of networks on the same images are replicated in pairs.
     """
     generator = np.random.default_rng(IMAGES)
-    blocks = []
     for _ in range(REPLICATES // BLOCK):
-        samples = [group[generator.integers(len(group), size=(BLOCK, len(group)))] for group in groups]
-        blocks.append(statistic(*samples))
-    return np.concatenate(blocks, axis=-1)
+        yield [_draw(objects, generator) for objects in groups]
+
+
+def _draw(objects: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    n, sizes = len(objects), np.bincount(objects)
+    images = generator.integers(len(sizes), size=(BLOCK, len(sizes)))
+    rows = np.arange(BLOCK).repeat(len(sizes))
+    if len(sizes) < n:  # objects are drawn, and now images of each
+        counts, first = sizes[images].ravel(), (sizes.cumsum() - sizes)[images].ravel()
+        places = first.repeat(counts) + generator.integers(counts.repeat(counts))
+        images, rows = objects.argsort(kind="stable")[places], rows.repeat(counts)
+    return np.bincount(rows * n + images.ravel(), minlength=BLOCK * n).reshape(BLOCK, n)
+
+
+def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
+    """A statistic's values, (..., REPLICATES), of the counts that `resample` draws from groups."""
+    return np.concatenate([statistic(*counts) for counts in resample(*groups)], axis=-1)
 
 
 def interval(replicates: np.ndarray) -> dict[str, float]:
@@ -60,22 +75,35 @@ def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np
     return sum(group.mean(axis=0) for group in drawn)
 
 
-def auc_and_recalls(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
-    """RANKED, (4, ...), of scores (..., n) of positives and (..., m) of negatives.
+def auc_and_recalls(
+    positives: np.ndarray, negatives: np.ndarray, drawn: np.ndarray | None = None, others: np.ndarray | None = None
+) -> np.ndarray:
+    """RANKED, (4, ...), of scores (n,) of positives and (m,) of negatives.
 
     AUC is the probability that a positive scores above a negative, a tie counting half (Mann and Whitney 1947). Recall
     at a rate is the fraction of positives above the threshold; a positive that ties with it is missed.
+    drawn, others: how often each positive (..., n) and negative (..., m) counts, once by default.
     """
-    values, ordered = (torch.from_numpy(np.sort(scores, axis=-1)) for scores in (positives, negatives))
-    below = sum(torch.searchsorted(ordered, values, side=side).sum(-1).numpy() for side in ("left", "right"))
-    recalls = [(positives > threshold[..., None]).mean(axis=-1) for threshold in thresholds(negatives)]
-    return np.stack([below / (2 * positives.shape[-1] * negatives.shape[-1]), *recalls])
+    drawn, others = (
+        np.ones(len(scores), int) if counts is None else counts
+        for scores, counts in ((positives, drawn), (negatives, others))
+    )
+    order, total = negatives.argsort(), drawn.sum(axis=-1)
+    below = np.insert(others[..., order].cumsum(axis=-1), 0, 0, axis=-1)
+    places = [negatives[order].searchsorted(positives, side) for side in ("left", "right")]
+    wins = sum((drawn * below[..., place]).sum(axis=-1) for place in places)
+    recalls = [(drawn * (positives > bar[..., None])).sum(axis=-1) / total for bar in thresholds(negatives, others)]
+    return np.stack([wins / (2 * total * below[..., -1]), *recalls])
 
 
-def thresholds(negatives: np.ndarray) -> list[np.ndarray]:
-    """At each of RATES, (...), the lowest of the scores (..., m) that at most this fraction of them exceeds."""
-    ordered, m = np.sort(negatives, axis=-1), negatives.shape[-1]
-    return [ordered[..., m - 1 - int(Fraction(rate) * m)] for rate in RATES]  # exact, unlike 0.29 * 100
+def thresholds(negatives: np.ndarray, counts: np.ndarray, rates: Sequence[str] = RATES) -> list[np.ndarray]:
+    """At each rate, (...), the lowest of the scores (m,), each there `counts` times (..., m), that at most this
+    fraction of them exceeds."""
+    order = negatives.argsort()
+    below = counts[..., order].cumsum(axis=-1)
+    exact = [Fraction(rate) for rate in rates]  # unlike 0.29 * 100
+    allowed = [rate.numerator * below[..., -1] // rate.denominator for rate in exact]
+    return [negatives[order][(below < (below[..., -1] - most)[..., None]).sum(axis=-1)] for most in allowed]
 
 
 def roc_curve(positives: Scores, negatives: Scores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,84 +119,115 @@ def roc_curve(positives: Scores, negatives: Scores) -> tuple[np.ndarray, np.ndar
     return rate, recall, thresholds
 
 
-def roc_metrics(positives: Scores, negatives: Scores) -> dict[str, Any]:
+def roc_metrics(positives: Scores, negatives: Scores, *objects: np.ndarray) -> dict[str, Any]:
     """auc and recall_at, a mapping by rate: each {value, low, high}, None where either kind of image is missing.
 
-    auc also has the numbers of positives and negatives, and each recall its threshold.
+    objects: of the positives and of the negatives, as of `resample`; by default every image is its own.
+    auc also has the numbers of positives and negatives, and of their objects, and each recall its threshold.
     """
+    objects = objects or (np.arange(len(positives)), np.arange(len(negatives)))
     results: list[dict[str, Any]] = [{"value": None, "low": None, "high": None}] * len(RANKED)
     bars: list[float | None] = [None] * len(RATES)
     if len(positives) and len(negatives):
         groups = np.asarray(positives), np.asarray(negatives)
-        pairs = zip(auc_and_recalls(*groups), bootstrap(auc_and_recalls, *groups), strict=True)
+        pairs = zip(auc_and_recalls(*groups), bootstrap(partial(auc_and_recalls, *groups), *objects), strict=True)
         results = [{"value": float(value), **interval(replicates)} for value, replicates in pairs]
-        bars = [float(bar) for bar in thresholds(groups[1])]
+        bars = [float(bar) for bar in thresholds(groups[1], np.ones(len(negatives), int))]
     auc, *recalls = results
     recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
-    return {"auc": {**auc, "positives": len(positives), "negatives": len(negatives)}, "recall_at": recall_at}
+    numbers = dict(zip(("positive_objects", "negative_objects"), (len(set(group)) for group in objects), strict=True))
+    auc = {**auc, "positives": len(positives), "negatives": len(negatives), **numbers}
+    return {"auc": auc, "recall_at": recall_at}
+
+
+def resampled(auc: Mapping[str, Any]) -> str:
+    """What the intervals of an `auc` resample: images, or objects of several images, too."""
+    pairs = ((auc.get(f"{kind}_objects"), auc.get(f"{kind}s")) for kind in ("positive", "negative"))
+    return "images" if all(objects in (None, images) for objects, images in pairs) else "objects and images"
 
 
 @dataclass(frozen=True)
 class Pool:
     """Predictions that are scored together: of the class under study, `label`, and of everything else.
 
-    ranked: the negatives of the ROC curve, with the named hard negatives of other sources.
+    ranked: the positives and the negatives of the ROC curve, which may be of other sources or meshes.
     """
 
     label: str
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
-    ranked: Sequence[Prediction]
+    ranked: tuple[Sequence[Prediction], Sequence[Prediction]]
 
     @property
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
-        """The log-odds of the positives, and of the negatives that they are ranked against."""
-        return np.array([item.log_odds for item in self.positives]), np.array([item.log_odds for item in self.ranked])
+        """The log-odds of the positives and the negatives of the ROC curve."""
+        positives, negatives = (np.array([item.log_odds for item in group]) for group in self.ranked)
+        return positives, negatives
 
     @property
-    def outcomes(self) -> dict[str, list[bool]]:
-        """Whether each image counts in recall, top5 and false_positive_rate."""
+    def outcomes(self) -> dict[str, tuple[Sequence[Prediction], list[bool]]]:
+        """The images of recall, top5 and false_positive_rate, and whether each counts."""
         ranks = [item.true_rank or np.inf for item in self.positives]
         return {
-            "recall": [rank == 1 for rank in ranks],
-            "top5": [rank <= 5 for rank in ranks],
-            "false_positive_rate": [item.predicted == self.label for item in self.negatives],
+            "recall": (self.positives, [rank == 1 for rank in ranks]),
+            "top5": (self.positives, [rank <= 5 for rank in ranks]),
+            "false_positive_rate": (self.negatives, [item.predicted == self.label for item in self.negatives]),
         }
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
-        counted = {name: fraction(sum(values), len(values)) for name, values in self.outcomes.items()}
-        return counted | roc_metrics(*self.scores)
+        counted = {name: fraction(sum(hits), len(hits)) for name, (_, hits) in self.outcomes.items()}
+        return counted | roc_metrics(*self.scores, *map(_objects, self.ranked))
 
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
         """METRICS and top5 in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
-        outcomes = {name: np.array(values) for name, values in self.outcomes.items() if values}
-        counted = {name: bootstrap(lambda drawn: drawn.mean(axis=-1), values) for name, values in outcomes.items()}
-        if not all(map(len, self.scores)):
-            return counted
-        return counted | dict(zip(RANKED, bootstrap(auc_and_recalls, *self.scores), strict=True))
+        replicates = {
+            name: bootstrap(partial(_weighted_mean, np.array(hits)), _objects(group))
+            for name, (group, hits) in self.outcomes.items()
+            if hits
+        }
+        if all(self.ranked):
+            ranked = bootstrap(partial(auc_and_recalls, *self.scores), *map(_objects, self.ranked))
+            replicates |= dict(zip(RANKED, ranked, strict=True))
+        return replicates
+
+
+def _weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return counts @ values / counts.sum(axis=-1)
+
+
+def _objects(predictions: Sequence[Prediction]) -> np.ndarray:
+    """The object of each image as a number, as `resample` takes them; one of unknown mesh is an object of its own."""
+    numbers: dict[str | int, int] = {}
+    names = (item.photograph.mesh or index for index, item in enumerate(predictions))
+    return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
 def pool(predictions: Sequence[Prediction], label: str) -> Pool:
     """All predictions, the positives ranked against all negatives."""
+    positives = [item for item in predictions if item.photograph.label == label]
     negatives = [item for item in predictions if item.photograph.label != label]
-    return Pool(label, [item for item in predictions if item.photograph.label == label], negatives, negatives)
+    return Pool(label, positives, negatives, (positives, negatives))
 
 
-def pool_by_source(predictions: Sequence[Prediction], label: str, exclude: Sequence[str] = ()) -> dict[str, Pool]:
-    """OVERALL, without the sources to exclude, and a pool per source.
+def pool_by(predictions: Sequence[Prediction], label: str, by: str, exclude: Sequence[str] = ()) -> dict[str, Pool]:
+    """OVERALL, without the sources to exclude, and a pool per source or, of what is in OVERALL, per mesh.
 
     A source's positives are ranked against its own negatives and those of the sources that the positives name as hard
-    negatives, as far as those could be read.
+    negatives, as far as those could be read; a mesh's images against all of the other kind.
     """
-    pools = {OVERALL: pool([item for item in predictions if item.photograph.source not in exclude], label)}
-    for source in sorted({item.photograph.source for item in predictions if item.photograph.source is not None}):
-        group = pool([item for item in predictions if item.photograph.source == source], label)
-        named = {name for item in group.positives for name in item.photograph.hard_negatives} - {source}
-        others = pool([item for item in predictions if item.photograph.source in named], label).negatives
-        pools[source] = replace(group, ranked=[*group.negatives, *others])
+    whole = pool([item for item in predictions if item.photograph.source not in exclude], label)
+    pools, items = {OVERALL: whole}, predictions if by == "source" else [*whole.positives, *whole.negatives]
+    for name in sorted({getattr(item.photograph, by) for item in items} - {None}):
+        group = pool([item for item in items if getattr(item.photograph, by) == name], label)
+        ranked = group.positives or whole.positives, group.negatives or whole.negatives
+        if by == "source":
+            named = {source for item in group.positives for source in item.photograph.hard_negatives} - {name}
+            others = pool([item for item in items if item.photograph.source in named], label).negatives
+            ranked = group.positives, [*group.negatives, *others]
+        pools[name] = replace(group, ranked=ranked)
     return pools
 
 

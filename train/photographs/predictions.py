@@ -77,11 +77,11 @@ def write_predictions(path: Path, predictions: Sequence[Prediction], label: str)
     """Write a row per photograph; None becomes an empty cell."""
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["path", "label", "source", "hard_negatives", *_columns(label)])
+        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *_columns(label)])
         for prediction in predictions:
             photograph, *cells = vars(prediction).values()
-            names = photograph.path, photograph.label, photograph.source, SEPARATOR.join(photograph.hard_negatives)
-            writer.writerow([*names, *cells])
+            path, label, source, hard_negatives, mesh = vars(photograph).values()
+            writer.writerow([path, label, source, SEPARATOR.join(hard_negatives), mesh, *cells])
 
 
 def read_predictions(path: Path, label: str) -> list[Prediction]:
@@ -95,9 +95,9 @@ def read_predictions(path: Path, label: str) -> list[Prediction]:
 
 
 def _read_row(row: dict[str, str], label: str) -> Prediction:
-    sources = row["source"] or None, split_sources(row["hard_negatives"])
+    names = row["source"] or None, split_sources(row["hard_negatives"]), row.get("mesh") or None
     cells = (kind(row[name]) if row[name] else None for name, kind in _columns(label).items())
-    return Prediction(Photograph(PurePosixPath(row["path"]), row["label"], *sources), *cells)  # type: ignore[arg-type]
+    return Prediction(Photograph(PurePosixPath(row["path"]), row["label"], *names), *cells)  # type: ignore[arg-type]
 
 
 def _columns(label: str) -> dict[str, Callable[[str], object]]:

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from augment.utils import progress
-from train.photographs.folder import find_photographs, left_out, load_photographs, require_outside
-from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by_source
+from renderer.errors import InputError
+from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
+from train.photographs.metrics import OVERALL, RANKED, Pool, find_metric, metric_title, pool_by, resampled
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
 from train.photographs.sheet import contact_sheet, write_roc
 from train.tables import Table, format_fraction, format_interval, fraction
@@ -30,6 +31,7 @@ def evaluate_photographs(
     size: int = 32,
     skip_unreadable: bool = False,
     device: str | torch.device = "cpu",
+    by: str = "source",
 ) -> dict[str, Any]:
     """Evaluate the model on every photograph of a folder; write the results, and return the summary.
 
@@ -44,39 +46,43 @@ def evaluate_photographs(
     - recall, top5: of the photographs of class `label`, and their most common wrong classes, most_common_wrong;
     - false_positive_rate: the fraction of all others that are predicted as `label`;
     - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`roc_metrics`);
-    - by_source: n, and the metrics above of each known source (`pool_by_source`);
+    - by_source, and by_mesh with by="mesh": n, and the metrics above of each known source or mesh (`pool_by`);
     - by_class: n, recall, top5, predicted_label (the fraction predicted as `label`) and most_common_wrong.
 
-    Fractions have 95 % Wilson intervals, `auc` and `recall_at` bootstrap intervals over images. InputError as of
-    `find_photographs`, `load_photographs` and `compute_logits`, and for `out` inside `folder`.
+    Fractions have 95 % Wilson intervals, `auc` and `recall_at` bootstrap intervals over images and, where photos.csv
+    names them, over objects (`resample`). InputError as of `find_photographs`, `load_photographs` and
+    `compute_logits`, for `out` inside `folder`, and for by="mesh" where no mesh is known.
     """
     require_outside(out, folder)
     found = find_photographs(folder, classes, label)
+    if by == "mesh" and not any(photograph.mesh for photograph in found):
+        raise InputError(f"by=mesh: {folder} has no {TABLE} with a column mesh: leave it out")
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = compute_logits(model, images, len(classes), device)
     predictions = predict(photographs, logits, classes, label)
-    pools = pool_by_source(predictions, label)
-    metrics = {source: pool.metrics for source, pool in progress(pools.items(), "intervals")}
+    pools = {key: pool_by(predictions, label, key) for key in dict.fromkeys(("source", by))}
+    whole = pools["source"][OVERALL]
+    metrics = {
+        f"by_{key}": {name: _pool_metrics(group) for name, group in progress(groups.items(), "intervals") if name}
+        for key, groups in pools.items()
+    }
     others = [str(path) for path in left_out(folder)]
     images_hash = hashlib.sha256(label.encode())
     for photograph in photographs:
-        images_hash.update(repr(photograph).encode() + (folder / photograph.path).read_bytes())
+        content = (folder / photograph.path).read_bytes()
+        images_hash.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
 
     labels = sorted({item.photograph.label for item in predictions})
     by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
-    whole = pools.pop(OVERALL)
     counts = {"positives": len(whole.positives), "negatives": len(whole.negatives)}
     summary = {
         "label": label,
         "size": size,
         "images": images_hash.hexdigest(),
-        **metrics[OVERALL],
+        **whole.metrics,
         "n": {"photographs": len(predictions), **counts, "unreadable": len(unreadable), "left_out": len(others)},
         "most_common_wrong": _most_common_wrong(whole.positives),
-        "by_source": {
-            source: {"n": len(group.positives) + len(group.negatives), **metrics[source]}
-            for source, group in pools.items()
-        },
+        **metrics,
         "by_class": {name: _class_metrics(group, label) for name, group in by_class.items()},
         "unreadable": unreadable,
         "left_out": others,
@@ -87,9 +93,13 @@ def evaluate_photographs(
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     contact_sheet(predictions, images, label).save(out / "contact_sheet.png")
-    curves = {source: group.scores for source, group in {OVERALL: whole, **pools}.items()}
+    curves = {source: group.scores for source, group in pools["source"].items()}
     write_roc(out, {source: scores for source, scores in curves.items() if all(map(len, scores))}, label)
     return summary
+
+
+def _pool_metrics(group: Pool) -> dict[str, Any]:
+    return {"n": len(group.positives) + len(group.negatives), **group.metrics}
 
 
 def _class_metrics(predictions: Sequence[Prediction], label: str) -> dict[str, Any]:
@@ -108,10 +118,13 @@ def _most_common_wrong(predictions: Sequence[Prediction]) -> dict[str, int]:
     return dict(counts.most_common(WRONG_CLASSES))
 
 
-def format_summary(summary: dict[str, Any]) -> str:
-    """The summary of `evaluate_photographs` as Markdown tables, without a newline at the end."""
+def format_summary(summary: dict[str, Any], by: str = "source") -> str:
+    """The summary of `evaluate_photographs` as Markdown tables, by source or mesh, without a newline at the end."""
     label, n, files = summary["label"], summary["n"], summary["left_out"]
-    pools = {"all": summary, **summary["by_source"]}
+    pools = {"all": summary, **summary[f"by_{by}"]}
+    over = resampled(auc := summary["auc"])
+    if over != "images":
+        over += f" ({auc['positive_objects']} of {label} and {auc['negative_objects']} others)"
     counts = [[name, *(format_fraction(metrics[key]) for key in COUNTED)] for name, metrics in pools.items()]
     ranked = [[name, *(format_interval(find_metric(metrics, k)) for k in RANKED)] for name, metrics in pools.items()]
     by_class = []
@@ -120,8 +133,8 @@ def format_summary(summary: dict[str, Any]) -> str:
         by_class.append([name, *(format_fraction(metrics[key]) for key in BY_CLASS), wrong])
     paragraphs: list[object] = [
         f"{n['positives']} images of {label}, {n['negatives']} of other things",
-        Table("", ["", "recall", "top-5", "FPR"], counts),
-        Table("", ["", *map(metric_title, RANKED)], ranked),
+        Table("95 % intervals over images", ["", "recall", "top-5", "FPR"], counts),
+        Table(f"95 % intervals over {over}", ["", *map(metric_title, RANKED)], ranked),
         Table("", ["class", "recall", "top-5", f"predicted {label}", "most common wrong classes"], by_class),
     ]
     if summary["unreadable"]:

@@ -19,7 +19,7 @@ TITLES = [metric_title(name) for name in METRICS]
 
 
 class Evaluation(NamedTuple):
-    """Pools of a run's predictions by source; OVERALL, the first, lacks excluded sources."""
+    """Pools of a run's predictions by source or mesh; OVERALL, the first, lacks excluded sources."""
 
     run: RunSummary
     pools: dict[str, Pool]
@@ -28,20 +28,25 @@ class Evaluation(NamedTuple):
 Evaluations = Mapping[str, Sequence[Evaluation]]  # by arm, in the order of their seeds
 
 
-def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
+def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "source") -> Evaluations:
     """The evaluations of arms on the same images, of `by_images`, where they are more than published scores.
 
-    exclude: sources to leave out of OVERALL. InputError as of `read_predictions`, and for a source that does not exist.
+    exclude: sources to leave out of OVERALL. by: source or mesh. InputError as of `read_predictions`, for a source that
+    does not exist, and for meshes where none is known.
     """
     arms: dict[str, list[Evaluation]] = {}
     for arm, scored in group.items():
         for run, name in sorted(scored, key=lambda pair: pair[0].seed or 0):
             path, label = run.folder / name / PREDICTIONS, run.photographs[name]["label"]
             if path.is_file():
-                pools = metrics.pool_by_source(read_predictions(path, label), label, exclude)
+                predictions = read_predictions(path, label)
+                pools = metrics.pool_by(predictions, label, by, exclude)
                 arms.setdefault(arm, []).append(Evaluation(run, pools))
-                if unknown := set(exclude).difference(pools):
-                    names = ", ".join(filter(None, pools))
+                if by == "mesh" and len(pools) == 1:
+                    raise InputError(f"by=mesh: {path} names no mesh: leave it out")
+                sources = {item.photograph.source for item in predictions} - {None}
+                if unknown := set(exclude) - sources:
+                    names = ", ".join(sorted(filter(None, sources)))
                     raise InputError(f"exclude: no photograph is of source {min(unknown)!r}; the sources are {names}")
     return arms
 
@@ -56,8 +61,8 @@ def mean_metric(group: Sequence[Evaluation], source: str, name: str) -> Mapping[
     return {"value": fmean(values), "low": min(values), "high": max(values)}
 
 
-def source_table(arms: Evaluations, pooled: str | None = None) -> Table:
-    """METRICS by source and arm, as of `mean_metric`. pooled: OVERALL's name; None leaves it out."""
+def group_table(arms: Evaluations, pooled: str | None = None, by: str = "source") -> Table:
+    """METRICS by source or mesh and arm, as of `mean_metric`. pooled: OVERALL's name; None leaves it out."""
     sources = dict.fromkeys(source for group in arms.values() for run in group for source in run.pools)
     if pooled is None:
         del sources[OVERALL]
@@ -66,7 +71,9 @@ def source_table(arms: Evaluations, pooled: str | None = None) -> Table:
         for arm, group in arms.items():
             means = (format_interval(mean_metric(group, source, name)) for name in METRICS)
             rows.append([source or str(pooled), arm, *means])
-    return Table("by source", ["source", "network", *TITLES], rows)
+    over = metrics.resampled(next(iter(arms.values()))[0].pools[OVERALL].metrics["auc"])
+    title = f"by {by}" if over == "images" else f"by {by}, AUC and recall at FPR over {over}"
+    return Table(title, [by, "network", *TITLES], rows)
 
 
 def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
@@ -81,9 +88,9 @@ def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
 def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
     """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high, means.
 
-    The interval is a 95 % bootstrap interval over images, of which each replicate has the same ones for all runs, and
-    over seeds, which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n,
-    the bootstrap underestimates the variance by 1/n, and with one it finds none. Empty where a run lacks the metric.
+    The interval is a 95 % bootstrap interval over objects and images (`resample`), the same ones for all runs, and over
+    seeds, which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n, the
+    bootstrap underestimates the variance by 1/n, and with one it finds none. Empty where a run lacks the metric.
     """
     pools = [[evaluation.pools[source] for evaluation in evaluations] for evaluations in (group, reference)]
     if any(name not in pool.replicates for pool in (*pools[0], *pools[1])):
@@ -98,18 +105,20 @@ def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> boo
     return [evaluation.run.seed or 0 for evaluation in group] == [evaluation.run.seed or 0 for evaluation in reference]
 
 
-def difference_tables(arms: Evaluations, pooled: str, sources: Sequence[str] | None = None) -> list[Table]:
-    """The differences by source and metric of each of `pairs_of`. pooled: OVERALL's name. sources: None for all."""
+def difference_tables(
+    arms: Evaluations, pooled: str, groups: Sequence[str] | None = None, by: str = "source"
+) -> list[Table]:
+    """The differences by group and metric of each of `pairs_of`. pooled: OVERALL's name. groups: None for all."""
     tables = []
     for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]
-            for source in (reference[0].pools if sources is None else sources)
+            for source in (reference[0].pools if groups is None else groups)
         ]
         paired = ", paired" if _paired(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
-        tables.append(Table(title, ["source", *TITLES], rows))
+        tables.append(Table(title, [by, *TITLES], rows))
     return tables
 
 
@@ -129,8 +138,10 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     return "\n\n".join(filter(None, [*(str(table) for table in tables if table.rows), "\n".join(sheets)]))
 
 
-def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS) -> str:
-    """Tables of runs as Markdown: accuracy, metrics on photographs by source and their differences, and seconds.
+def format_comparison(
+    runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS, by: str = "source"
+) -> str:
+    """Tables of runs as Markdown: accuracy, metrics on photographs by source or mesh, differences, and seconds.
 
     Runs that differ only in the seed are a group; a table for each group shows how far it is from another (`pairs_of`).
     exclude: sources that the pooled metrics leave out; photographs: the sub-folder of each run with its scores.
@@ -154,6 +165,6 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
         raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
     for group in compared:
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
-        evaluations = read_evaluations(group, exclude)
-        tables += [source_table(evaluations, pooled), *difference_tables(evaluations, pooled)]
+        evaluations = read_evaluations(group, exclude, by)
+        tables += [group_table(evaluations, pooled, by), *difference_tables(evaluations, pooled, by=by)]
     return "\n\n".join(str(table) for table in [*tables, seconds_table(arms)] if table.rows)

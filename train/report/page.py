@@ -184,7 +184,7 @@ def _photographs(title: str, group: Scored) -> dict[str, Any]:
             content["sentences"] = _difference_sentences(evaluations, title)
             tables.append(compare.overall_differences(evaluations))
             if len(first.pools) > 1:
-                tables.append(compare.source_table(evaluations))
+                tables.append(compare.group_table(evaluations))
     except InputError as error:
         content["sentences"] = [str(error)]
     return content

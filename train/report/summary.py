@@ -16,7 +16,7 @@ from augment.service import ARMS
 from renderer.errors import InputError, in_one_line
 from train import checkpoint, run_folder
 from train.networks import PUBLISHED, load_selected, published
-from train.photographs.metrics import METRICS, find_metric, metric_title
+from train.photographs.metrics import METRICS, find_metric, metric_title, resampled
 from train.photographs.scoring import SUMMARY
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.tables import Table, format_interval
@@ -168,6 +168,7 @@ def by_images(arms: Arms) -> dict[str, Scored]:
         auc, label = scores["auc"], scores["label"]
         if "positives" in auc:
             title += f", {auc['positives']:,} of {label} and {auc['negatives']:,} of other things"
+            title += "" if resampled(auc) == "images" else "; AUC and recall at FPR over objects, too"
         titled[f"{title} ({len(titled) + 1})" if title in titled else title] = group
     return titled
 

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import bootstrap, mannwhitneyu
+from scipy.stats import bootstrap as scipy_bootstrap
+from scipy.stats import mannwhitneyu
 
 from train.photographs.metrics import (
     RANKED,
     RATES,
     REPLICATES,
     auc_and_recalls,
+    bootstrap,
     find_metric,
     replicate_difference,
     roc_curve,
@@ -36,7 +38,7 @@ def test_auc_is_the_mann_whitney_statistic_and_recall_that_at_the_lowest_thresho
     statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
     auc, *recalls = auc_and_recalls(np.array(positives), np.array(negatives))
     assert auc == pytest.approx(statistic / (len(positives) * len(negatives)), rel=0, abs=1e-12)
-    bars = thresholds(np.array(negatives))
+    bars = thresholds(np.array(negatives), np.ones(len(negatives), int))
     for rate, recall, threshold in zip(RATES, recalls, bars, strict=True):
         assert (recall, threshold) == brute_force_recall(positives, negatives, rate)
 
@@ -48,18 +50,30 @@ def scores() -> tuple[np.ndarray, np.ndarray]:
     return generator.normal(1, 1, 80).round(1), generator.normal(0, 1.5, 120).round(1)
 
 
+@pytest.mark.parametrize("images", [1, 3])
 @pytest.mark.parametrize("name", ["auc", "recall_at/0.10"])
-def test_intervals_are_those_of_scipys_stratified_percentile_bootstrap(scores, name):
+def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_image_repeats(scores, name, images):
     """Up to the replicates' chance: an end's own standard error is below 0.006 here, and a recall's step is 1/80."""
-    reference = bootstrap(
+    reference = scipy_bootstrap(
         scores,
-        lambda positives, negatives, axis: auc_and_recalls(positives, negatives)[RANKED.index(name)],
-        vectorized=True, method="percentile", n_resamples=2000, batch=50, rng=np.random.default_rng(8),
+        lambda positives, negatives: auc_and_recalls(positives, negatives)[RANKED.index(name)],
+        vectorized=False, method="percentile", n_resamples=2000, rng=np.random.default_rng(8),
     ).confidence_interval  # fmt: skip
-    metrics = roc_metrics(*scores)
+    repeated = [group.repeat(images) for group in (*scores, np.arange(80), np.arange(120))]
+    metrics = roc_metrics(*repeated)
     metric = find_metric(metrics, name)
     assert (metric["low"], metric["high"]) == pytest.approx(tuple(reference), rel=0, abs=0.02)
-    assert metrics == roc_metrics(*scores)  # the same at every call
+    assert metrics == roc_metrics(*repeated)  # the same at every call
+
+
+def test_the_spread_over_objects_and_their_images_is_that_of_a_two_level_bootstrap_in_closed_form():
+    """For the mean of k objects of m images: (variance of objects' means + mean variance of an object / m) / k."""
+    generator = np.random.default_rng(2)
+    values = generator.normal(0, 1, (8, 5)) + generator.normal(0, 0.5, 5)  # a column per object; both parts matter
+    means = bootstrap(lambda counts: counts @ values.ravel() / 40, np.arange(40) % 5)
+    variance = (values.mean(axis=0).var() + values.var(axis=0).mean() / 8) / 5
+    assert means.mean() == pytest.approx(values.mean(), abs=4 * (variance / REPLICATES) ** 0.5)
+    assert means.var() == pytest.approx(variance, rel=0.13)  # four standard errors of 2,000 replicates
 
 
 @pytest.mark.slow

@@ -131,6 +131,23 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
     assert summary["auc"]["value"] == 0.34 and summary["by_source"]["street"]["auc"]["value"] == 0.25
 
 
+def test_a_mesh_is_ranked_against_all_images_of_the_other_kind_and_objects_count_in_intervals(fruit, tmp_path):
+    """Meshes m and n of oranges, k of others, by letters of FRUIT; an image without one is an object of its own."""
+    _, _, folder = fruit
+    meshes = {"a": "m", "c": "m", "b": "n", "f": "k", "h": "k"}
+    header, *rows = (folder / "photos.csv").read_text().splitlines()
+    rows = [f"{row},{meshes.get(row.split('/')[1][0], '')}" for row in rows]
+    (folder / "photos.csv").write_text("\n".join([f"{header},mesh", *rows]))
+    summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", by="mesh")
+    assert (summary["auc"]["positive_objects"], summary["auc"]["negative_objects"]) == (4, 4)
+    for mesh, metrics in summary["by_mesh"].items():
+        of_mesh = [(name, order) for name, _, order in FRUIT if meshes.get(name.split("/")[1][0]) == mesh]
+        other = [(name, order) for name, _, order in FRUIT if name.startswith("orange/") == (mesh == "k")]
+        assert metrics["auc"]["value"] == pytest.approx(score(of_mesh + other)["auc"], abs=1e-12)
+        assert metrics["recall"] == score(of_mesh)["recall"]
+    assert list(summary["by_mesh"]) == ["k", "m", "n"] and "objects and images" in format_summary(summary, "mesh")
+
+
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
     logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3], [0, -4000, -5000]]
     names = [f"{index}.png" for index in range(4)]
@@ -213,7 +230,7 @@ def test_scores_are_never_written_among_the_photographs(fruit, tmp_path, out):
 
 PREDICTIONS = [
     Prediction(
-        Photograph(PurePosixPath("orange/a, b.png"), "orange", "web", ("lab", "studio")),
+        Photograph(PurePosixPath("orange/a, b.png"), "orange", "web", ("lab", "studio"), "m"),
         *("orange", 1 / 3, 1 / 3, 1, 1 / 3, 1, -0.1),
     ),
     Prediction(Photograph(PurePosixPath("other_x/ü.png"), "other_x", None), "pear", 1.0, None, None, 1e-300, 2, -690.0),
