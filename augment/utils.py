@@ -22,7 +22,7 @@ from tqdm import tqdm
 from renderer.errors import InputError, is_out_of_memory
 
 MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # of Linux, and of a container (cgroup v2)
-PATIENCE = 5.0  # seconds without a word
+PATIENCE = 2.0  # seconds without a word
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -96,7 +96,7 @@ def _free(device: torch.device) -> int | None:
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
-    """The items; after 5 seconds, with a bar on a terminal, or else a line, which comes again with the number of items
+    """The items; after 2 seconds, with a bar on a terminal, or else a line, which comes again with the number of items
     that are done, each time after twice as long; by the first process.
 
     total: their number, where they have no length. done: how many came before.

@@ -33,6 +33,7 @@ from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read
 from train.tables import Table, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
+NAMES = {"float": "computed", "reload": "rendered again from the saved files", "mitsuba": "rendered by Mitsuba"}
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
 LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
@@ -250,9 +251,10 @@ def format_attack(
     if checks is not None:
         by_steps = ", ".join(f"{rate:.0%} in {steps}" for steps, rate in checks["success_by_steps"].items())
         text += [
-            "cost {cost_before:.2f} before and {cost:.2f} after; it fell in {cost_fell:.0%}; "
-            "first gradients that are zero: {zero_gradient:.0%}".format(**checks),
-            f"success of as many random draws: {checks['random_search']:.0%}; by longer attacks: {by_steps} steps",
+            "log-probability of the right class, less that of a target: {cost_before:.2f} before, {cost:.2f} after; "
+            "lower in {cost_fell:.0%} of examples; no gradient to begin with: {zero_gradient:.0%}".format(**checks),
+            f"random changes of the same size, one for each step, succeed on {checks['random_search']:.0%}; "
+            f"attacks of more steps: {by_steps}",
             *(f"warning: {warning}" for warning in warnings(checks)),
         ]
     adversaries = [line["versions"] for line in lines if line["success"] and line["clean_correct"]]
@@ -261,8 +263,8 @@ def format_attack(
         largest = 255 * max(line["largest_difference"] for line in numbers)
         mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
         text.append(
-            f"{version}: {sum(line['success'] for line in numbers)} of {len(numbers)} still succeed; "
-            f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+            f"images as {NAMES.get(version, version)}: {sum(line['success'] for line in numbers)} of {len(numbers)} "
+            f"still succeed; pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
         )
     return "\n".join(text)
 

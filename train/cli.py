@@ -51,10 +51,16 @@ def _complete() -> None:
 if sys.argv[1:2] in (["-sc"], ["--shell-completion"]):
     _complete()
 
-_loading = threading.Timer(5, print, ["loading PyTorch and other libraries ..."], {"file": sys.stderr, "flush": True})
+_loaded = threading.Event()
+
+
+def _announce_imports() -> None:
+    while not _loaded.wait(5):
+        print("loading PyTorch and other libraries ...", file=sys.stderr, flush=True)
+
+
 if "torch" not in sys.modules:
-    _loading.daemon = True
-    _loading.start()
+    threading.Thread(target=_announce_imports, daemon=True).start()
 
 
 @contextmanager
@@ -70,7 +76,7 @@ def handled_errors() -> Iterator[None]:
     _started, _interrupted = True, False
     if Path(sys.argv[0]).stem.startswith(PREFIX):  # in further processes, train is no train.py of the current folder
         os.environ["PYTHONSAFEPATH"] = "1"
-    _loading.cancel()
+    _loaded.set()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -16,7 +16,7 @@ from torch.optim.swa_utils import AveragedModel, get_swa_avg_fn
 
 from augment import utils
 from augment.service import AugmentationService, Renders
-from augment.utils import eval_mode, progress, stream_seed
+from augment.utils import announced, eval_mode, progress, stream_seed
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
@@ -93,9 +93,9 @@ class Trainer:
         self.selected = cast(MixedPrecision, average.module) if average else model
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
         options: dict[str, Any] = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0}
-        self.optimizer = torch.optim.SGD(
-            model.parameters(), settings.learning_rate, settings.momentum, fused=True, **options
-        )
+        rate, momentum = settings.learning_rate, settings.momentum
+        with announced("loading the optimizer"):  # torch imports its compiler here: seconds
+            self.optimizer = torch.optim.SGD(model.parameters(), rate, momentum, fused=True, **options)
         norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
         self._frozen_norms = norms if settings.freeze_statistics else []
         compiled = compiles(settings.compile, self.device)

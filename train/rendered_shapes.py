@@ -34,21 +34,20 @@ VIEWS, BACKGROUNDS = 5, 4  # images per instance: every view on every background
 CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
 
 
-def load_shapes(
-    train: int, test: int, size: int, seed: int, cache: TensorCache | None = None, classes: Sequence[str] | None = None
-) -> DataSet:
-    """That many training and test images of every solid, in even light; whole instances (20 images) each.
-
-    classes: the names that labels count, by default those of the solids. InputError where one of these is not there.
-    """
-    classes = classes or CLASSES
-    labels = torch.tensor([class_index(classes, name, "data=shapes") for name in CLASSES])
-    parts = {"train": train, "test": test}
+def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
+    """That many training and test images of every solid, in even light; whole instances (20 images) each."""
+    parts, labels = {"train": train, "test": test}, torch.arange(len(CLASSES))
     splits = (
         Split(_cached_images(part, count, size, seed, cache), labels.repeat_interleave(count))
         for part, count in parts.items()
     )
-    return DataSet(tuple(classes), *splits)
+    return DataSet(CLASSES, *splits)
+
+
+def relabeled(data: DataSet, classes: Sequence[str]) -> DataSet:
+    """The data with labels that count these classes. InputError where one of its own is not among them."""
+    labels = torch.tensor([class_index(classes, name, "data=shapes") for name in data.classes])
+    return DataSet(tuple(classes), *(Split(part.images, labels[part.labels]) for part in (data.train, data.test)))
 
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:

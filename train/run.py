@@ -26,7 +26,7 @@ from train.photographs.metrics import METRICS, find_metric
 from train.photographs.predictions import Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
-from train.rendered_shapes import load_shapes
+from train.rendered_shapes import load_shapes, relabeled
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
@@ -43,6 +43,9 @@ def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str 
 
 def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], dict]:
     """All of `run` that comes before the first epoch, where wrong input shows; returns a function for the rest."""
+    base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
+    if base and settings.data.name == "shapes":
+        data = relabeled(data, base[1]["architecture"]["classes"])
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
@@ -53,7 +56,6 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     if begun:
         recorded = OmegaConf.select(require_same_run(folder, settings), "hardware.threads")
         threads = threads or (recorded if isinstance(recorded, int) and recorded > 0 else None)
-    base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
     fraction, left_out = _validation(settings, data.train, base)
     train, validation = stratified_split(data.train, fraction, seed=0)
     trainer = build_trainer(settings, data, folder, base, left_out, threads)
@@ -90,13 +92,12 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
-    data, cache, base = settings.data, TensorCache(cache_folder(settings.renderer.cache)), settings.train.init_from
-    classes = load_selected(Path(base))[1]["architecture"]["classes"] if base and data.name == "shapes" else None
+    data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
         "folder": lambda: load_folder(data.path, data.size, data.test_fraction),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache, classes),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
     }
     require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)

@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -246,6 +247,11 @@ def _fingerprint(path: Path) -> str:
         files = [file for file in path.rglob("*") if file.is_file()]
         sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
         return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
+    return _content_hash(path, path.stat().st_size, path.stat().st_mtime_ns)
+
+
+@cache
+def _content_hash(path: Path, size: int, modified: int) -> str:
     with open(path, "rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
 

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from augment.build import RendererSettings, SceneSettings, count_views
 from augment.objects import ObjectSettings
 from augment.service import AugmentationSettings
-from augment.utils import world_size
+from augment.utils import announced, world_size
 from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.rasterizer import Rasterizer, choose
@@ -300,7 +300,7 @@ def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
 
 def chosen_rasterizer(settings: RendererSettings) -> Rasterizer:
     """The rasterizer of the settings; InputError naming the key where it does not start."""
-    with keyed("renderer.rasterizer"):
+    with keyed("renderer.rasterizer"), announced("starting the rasterizer"):
         return choose(settings.rasterizer)
 
 

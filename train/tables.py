@@ -1,5 +1,7 @@
 """Fractions with their intervals, and tables, as text for people."""
 
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,19 +9,38 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title, which may be empty. As text: Markdown below the title, aligned on a console, too."""
+    """A table with a title, which may be empty. As text: Markdown below the title, aligned on a console, too.
+
+    On a terminal that is too narrow, its rows and columns change places or, where that is too wide as well, columns go
+    on in further tables, which repeat the first one.
+    """
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[object]]
 
     def __str__(self) -> str:
+        room = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        lines.insert(1, ["-" * width for width in widths])
-        padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
-        table = "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
-        return f"{self.title}:\n\n{table}" if self.title else table
+        upright, turned = ([_aligned(cells) for cells in columns] for columns in (zip(*lines, strict=True), lines))
+        first, *others = turned if _width(upright) > room >= _width(turned) else upright
+        parts = [[first]]
+        for column in others:
+            if len(parts[-1]) > 1 and _width([*parts[-1], column]) > room:
+                parts.append([first])
+            parts[-1].append(column)
+        tables = ("\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True)) for part in parts)
+        return "\n\n".join(filter(None, [self.title and f"{self.title}:", *tables]))
+
+
+def _aligned(cells: Sequence[str]) -> list[str]:
+    """A column's cells, a line beneath the first, in one width."""
+    width = max(map(len, cells))
+    return [cell.ljust(width) for cell in (cells[0], "-" * width, *cells[1:])]
+
+
+def _width(columns: Sequence[Sequence[str]]) -> int:
+    return sum(len(column[0]) + 3 for column in columns) + 1
 
 
 def as_text(value: object) -> str:

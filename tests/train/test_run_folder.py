@@ -1,5 +1,6 @@
 """A run's folder, also where others write to it or have damaged its files."""
 
+import hashlib
 import io
 import itertools
 import os
@@ -90,6 +91,17 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     file.write_bytes(b"another")
     with pytest.raises(InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"):
         require_same_run(folder, settings)
+
+
+def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(tiny, tmp_path, monkeypatch):
+    file, reads = tmp_path / "data.npz", []
+    file.write_bytes(b"data")
+    settings, digest = tiny(f"data.path={file}"), hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda opened, name: reads.append(opened.name) or digest(opened, name))
+    write_config(tmp_path / "run", settings)
+    require_same_run(tmp_path / "run", settings)
+    require_same_run(tmp_path / "run", settings)
+    assert reads == [str(file)]
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):

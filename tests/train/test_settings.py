@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.attack import AttackExperimentSettings
+from train.batches import rounds_of_epoch
 from train.run import load_data, prepare
 from train.settings import ExperimentSettings, as_override, compose, dotted, quoted, read_settings
 
@@ -33,6 +34,13 @@ def test_every_experiment_takes_other_data(experiment):
     overrides = [f"experiment={experiment}", "data=npz", "data.path=a.npz", "train.init_from=b", "run=here"]
     settings = read_settings(ExperimentSettings, compose("train", overrides))
     assert (settings.data.name, settings.data.path, settings.train.init_from in ("b", None)) == ("npz", "a.npz", True)
+
+
+def test_the_demonstration_keeps_its_last_network_of_three_rounds_with_new_renders_each():
+    settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
+    images, renders = round(0.9 * 10 * settings.data.train_per_class), settings.augment.examples
+    rounds = rounds_of_epoch(images, renders, 0, 0, settings.train.images_per_epoch, settings.augment.every)
+    assert settings.train.epochs == 1 and [(part.renders, len(part.rows)) for part in rounds] == [(480, 600)] * 3
 
 
 def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by_default():

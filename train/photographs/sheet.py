@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 PER_SECTION, COLUMNS = 40, 10
 IMAGE, FRAME = 96, 4  # px: the side of an enlarged image, and the width of its frame
 LONGEST_CAPTION = 18  # characters
+LEGEND = "Under each image: the predicted class and its probability; in gray, where that is wrong, the true class"
 Item = TypeVar("Item")
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -37,7 +38,7 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor, label
         ("false negatives", "#d03b3b", [pair for pair in positives if pair[0].predicted != label], len(positives)),
         ("false positives", "#e8a317", [pair for pair in negatives if pair[0].predicted == label], len(negatives)),
     ]
-    grids = []
+    grids = [draw_grid([], heading=LEGEND)]
     for name, color, group, total in sections:
         part = f" ({PER_SECTION} shown, evenly by probability)" if len(group) > PER_SECTION else ""
         tiles = [_tile(prediction, image, color) for prediction, image in evenly(group, PER_SECTION)]

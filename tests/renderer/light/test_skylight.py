@@ -1,11 +1,9 @@
-"""The sky's coefficients against the published formula, integrated by scipy and by scripts/fit_skylight.py."""
+"""The sky's coefficients against the published formula, integrated by scipy and by benchmarks/fit_skylight.py."""
 
 import itertools
 import math
 import re
-import runpy
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +12,14 @@ from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
 
+from benchmarks import fit_skylight
 from renderer.errors import InputError
 from renderer.light.harmonics import basis, rotate
 from renderer.light.skylight import coefficients
 
 ROOT = Path(__file__).parents[3]
 FIT = ROOT / "renderer" / "light" / "skylight_fit.safetensors"
-SCRIPT = SimpleNamespace(**runpy.run_path(str(ROOT / "scripts" / "fit_skylight.py")))
-by_quadrature = SCRIPT.coefficients_by_quadrature
+by_quadrature = fit_skylight.coefficients_by_quadrature
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 HORIZON = math.pi / 2
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
@@ -100,7 +98,7 @@ def test_errors_of_quadrature_and_fit_are_as_documented():
         exact = by_quadrature(*sky, nodes=96)
         assert relative_error(by_quadrature(*sky, nodes=24), exact) < 1e-5
         assert relative_error(by_quadrature(*sky, nodes=48), exact) < 2e-8
-    assert SCRIPT.fit_error(load_file(FIT)["fit"], 10, np.random.default_rng(1)) < 7e-5
+    assert fit_skylight.fit_error(load_file(FIT)["fit"], 10, np.random.default_rng(1)) < 7e-5
     for corner in itertools.product([0.0, HORIZON], [1.0], [2.0, 10.0]):
         assert relative_error(coefficients(*corner), by_quadrature(*corner)) < 4e-4
 
@@ -116,14 +114,14 @@ def test_the_fit_has_the_derivatives_of_the_quadrature(sky):
 
 def test_a_new_fit_is_the_committed_one():
     """The first Chebyshev coefficients do not depend on the degree: what aliases at these points is beyond 11."""
-    committed, fit = load_file(FIT)["fit"], SCRIPT.fit_polynomials(6, 4, nodes=16)
+    committed, fit = load_file(FIT)["fit"], fit_skylight.fit_polynomials(6, 4, nodes=16)
     # Quadratures of 16 nodes are off by up to 1e-4 of the norm, 140.
     torch.testing.assert_close(committed[:7, :5].double(), fit, rtol=0, atol=1e-2)
 
 
 @pytest.mark.slow
-def test_the_script_makes_the_committed_fit(tmp_path, call, capsys):
-    assert call("fit_skylight", f"{tmp_path}/fit.safetensors") == 0
+def test_the_script_makes_the_committed_fit(tmp_path, capsys):
+    fit_skylight.main(f"{tmp_path}/fit.safetensors")
     assert float(re.search(r"off by up to (\S+)", capsys.readouterr().out)[1]) < 7e-5
     torch.testing.assert_close(load_file(tmp_path / "fit.safetensors"), load_file(FIT), rtol=0, atol=140 * EPS32)
 

@@ -1,4 +1,4 @@
-"""Fit the sky's coefficients with polynomials and print the largest error: python scripts/fit_skylight.py
+"""Fit the sky's coefficients with polynomials and print the largest error: python -m benchmarks.fit_skylight
 
 The model is that of `renderer.light.skylight`, and its coefficients are integrals by Gauss-Legendre quadrature.
 """
@@ -13,7 +13,6 @@ from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 from scipy.special import roots_legendre
 
-sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from renderer.light.harmonics import basis
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 
