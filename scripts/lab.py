@@ -5,7 +5,8 @@ import sys
 sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
-from train.lab.laboratory import LabSettings, write_laboratory
+from train.lab.laboratory import write_laboratory
+from train.lab.shots import LabSettings
 
 
 @cli.command()

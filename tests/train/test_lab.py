@@ -16,9 +16,9 @@ from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 from train.lab import laboratory as lab
 from train.lab import patterns
-from train.lab.laboratory import LabSettings, lab_parts, path_traced
+from train.lab.laboratory import lab_parts, path_traced
 from train.lab.patterns import FAMILIES, draw_pattern
-from train.lab.shots import FOV, Shot, draw_shots
+from train.lab.shots import FOV, LabSettings, Shot, draw_shots
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -36,6 +36,14 @@ def coarse_patterns():
 def settings(out: Path, **changes) -> LabSettings:
     small = {"setups": 4, "patterns": ["stripes", "half"], "size": 8, "spp": 4, "bounces": 2}
     return LabSettings(**{"out": str(out), "meshes": MESHES, **small, **changes})
+
+
+def draw(
+    setups: int, families, brightness=(0.2, 2.5), seed: int = 0, environments=None, pictures=(), **changes
+) -> list[Shot]:
+    maps = environments or {}
+    changes |= {"patterns": list(families), "environments": list(maps), "brightness": list(brightness), "seed": seed}
+    return list(draw_shots(LabSettings(setups=setups, **changes), maps, pictures))
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -101,6 +109,7 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
         ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, r"meshes\[0\]: the label '.*x' names the"),
         ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label: give {mesh: fruit.glb, label: "),
         ({"setups": 5}, "setups=5 must be a positive multiple of the 2 patterns"),
+        ({"patterns": ["stripes+slides"]}, "patterns has slides: name image files in slides="),
         ({"patterns": ["stripe"]}, "patterns=stripe: choose one of solid, gradient, stripes"),
     ],
 )
@@ -144,15 +153,15 @@ def test_a_pattern_mixes_two_colors_one_of_which_is_darkness_in_some_families(fa
 
 
 def test_every_family_has_as_many_setups_from_dim_to_bright_that_differ_and_stay_within_their_ranges():
-    shots = list(draw_shots(220, list(FAMILIES), (0.2, 2.5), seed=3, environments={}))
+    shots = draw(220, FAMILIES, seed=3)
     assert [shot.family for shot in shots] == [name for name in FAMILIES for _ in range(20)]
     edges = np.geomspace(0.2, 2.5, 21)
     brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
     assert (edges[:-1] <= brightness).all() and (brightness <= edges[1:]).all()
-    other = draw_shots(11, list(FAMILIES), (0.2, 2.5), 4, {})
+    other = draw(11, FAMILIES, seed=4)
     assert len({tuple(shot.camera) for shot in [*shots, *other]}) == 231
     for shot in shots:
-        back, towards = shot.camera - shot.aim, shot.projector - shot.center
+        back, towards = shot.camera - shot.aim, shot.projectors[0] - shot.center
         assert 18 <= np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) <= 60
         assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FOV / 2)) <= 1.9  # the object fits the view
         assert np.abs(shot.aim - shot.center).max() <= 0.25
@@ -164,16 +173,42 @@ def test_every_family_has_as_many_setups_from_dim_to_bright_that_differ_and_stay
         assert shot.ambient.max() <= 0.06 and shot.table.max() <= 0.16
 
 
+def test_wider_settings_leave_the_draws_that_they_do_not_name_as_they_were():
+    """Another roughness, walls and a second projector: the same camera, pose, table and first projector."""
+    (one,), (other,) = draw(1, ["rings"]), draw(1, ["rings"], walls=1.0, roughness=[0.1, 0.2])
+    assert one.wall is None and one.roughness == 0.5 and 0.1 <= other.roughness <= 0.2
+    for name in ("camera", "aim", "rotation", "table", "ambient", "patterns", "projectors"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    behind, camera = (other.wall - other.center)[:2], (other.camera - other.aim)[:2]
+    assert behind @ camera / np.linalg.norm(behind) / np.linalg.norm(camera) <= -np.cos(np.radians(30)) + 1e-9
+    shots = draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
+    assert {len(shot.projectors) for shot in shots} == {len(shot.patterns) for shot in shots} == {2}
+    assert any(shot.wall is None for shot in shots) and any(shot.wall is not None for shot in shots)
+    for shot in shots:
+        towards = np.array([position - shot.center for position in shot.projectors])
+        above = np.degrees(np.arcsin(towards[:, 2] / np.linalg.norm(towards, axis=1)))
+        assert (above >= 5).all() and (above <= 85).all()
+        assert shot.wall is None or (towards @ (shot.wall - shot.center) < np.sum((shot.wall - shot.center) ** 2)).all()
+
+
+def test_slides_project_a_picture_in_its_own_colors():
+    picture = np.zeros((4, 4, 3), np.float32)
+    picture[..., 0] = [[0.25], [0.5], [0.75], [1]]
+    for shot in draw(3, ["slides"], slides=["a.png"], pictures=[picture]):
+        assert shot.patterns[0].shape == (64, 64, 3) and 0.25 <= shot.patterns[0][..., 0].min() < 0.5
+        assert shot.patterns[0][..., 0].max() <= 1 and not shot.patterns[0][..., 1:].any()
+
+
 # The light comes from the table and the surroundings without bounces.
 
 
 def frontal(**changes) -> Shot:
     """A camera and a projector in front of an upright object, in white light on a black table."""
-    [shot] = draw_shots(1, ["solid"], (1, 1), seed=0, environments={})
+    [shot] = draw(1, ["solid"], (1, 1))
     center, front = np.array([0, 0, 1.0]), np.array([0, -6.0, 1.0])
     plain = {
-        "pattern": np.ones((4, 4, 3), np.float32), "ambient": np.zeros(3), "table": np.zeros(3), "projector": front,
-        "camera": front, "center": center, "aim": center, "rotation": np.eye(3), "scale": 1.0,
+        "patterns": [np.ones((4, 4, 3), np.float32)], "ambient": np.zeros(3), "table": np.zeros(3),
+        "projectors": [front], "camera": front, "center": center, "aim": center, "rotation": np.eye(3), "scale": 1.0,
     }  # fmt: skip
     return replace(shot, **plain | changes)
 
@@ -202,19 +237,31 @@ def directions(shot: Shot, size: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
-    [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed, {})
+    [shot] = draw(1, ["solid"], (1.5, 1.5), seed)
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
     image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)
 
     rays = directions(shot, 8)
     positions = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
-    axis, ray = shot.center - shot.projector, positions - shot.projector
+    axis, ray = shot.center - shot.projectors[0], positions - shot.projectors[0]
     depth = ray @ axis / np.linalg.norm(axis)
     evenly = axis @ axis / depth**2 * (-ray[..., 2] / depth)
-    lit = evenly[..., None] * shot.brightness * shot.pattern[0, 0] + shot.ambient
+    lit = evenly[..., None] * shot.brightness * shot.patterns[0][0, 0] + shot.ambient
     inside = np.linalg.norm(positions, axis=-1) < 1.5  # the projector's cone
     assert inside.mean() > 0.3
     np.testing.assert_allclose(image[inside], (shot.table * lit)[inside], rtol=0.03)
+
+
+def test_two_projectors_share_the_brightness_and_a_wall_behind_is_lit_like_the_table():
+    """From one place they light as one does; a wall that faces the projector has its color times the brightness."""
+    card_parts = lab_parts(card(np.full((4, 4, 3), 128, dtype=np.uint8)), 1.0)
+    shot = frontal(wall=np.array([0, 3.0, 1.0]), table=np.array([0.2, 0.1, 0.3]))
+    twice = replace(shot, patterns=2 * shot.patterns, projectors=2 * shot.projectors)
+    one, two = (path_traced(card_parts, item, 8, 64, bounces=1, seed=0) for item in (shot, twice))
+    np.testing.assert_allclose(two, one, rtol=1e-5)
+    evenly = 6**2 / 9**2  # the wall is three units behind what the brightness is of
+    lit = path_traced(card_parts, replace(shot, scale=1e-4), 8, 256, bounces=1, seed=0)
+    np.testing.assert_allclose(lit[0, 3:5], np.broadcast_to(evenly * shot.table, (2, 3)), rtol=0.1)
 
 
 def test_a_texture_lies_upright_on_its_faces():
@@ -229,7 +276,7 @@ def test_a_texture_lies_upright_on_its_faces():
 def test_a_card_reflects_its_linear_albedo_times_the_albedo_scale_and_the_brightness():
     """Facing projector and camera, with its gloss: 4 % of the light times the GGX peak, 1 / (4 α²)."""
     gray = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
-    gloss = 0.04 / (4 * lab.ROUGHNESS**4)  # α is the roughness's square
+    gloss = 0.04 / (4 * frontal().roughness ** 4)  # α is the roughness's square
     for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
         image = path_traced(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
@@ -252,7 +299,7 @@ def test_the_table_under_an_environment_has_the_brightness_times_its_albedo_at_e
     sky = np.zeros((64, 128, 3), np.float32)
     sky[16, 40] = 1e4, 1e4, 1e4
     for seed in range(2):
-        [shot] = draw_shots(1, [], (0.7, 0.7), seed, {"lamp": sky})
+        [shot] = draw(1, [], (0.7, 0.7), seed, {"lamp": sky})
         shot = replace(shot, scale=1e-4)
         image = path_traced(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)
         assert shot.family == "lamp"

@@ -4,42 +4,36 @@ import csv
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import MISSING
 from PIL import Image
 
 from augment.objects import load_object
 from augment.utils import progress, stream_seed
-from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
-from renderer.image import LARGEST_SIZE, decode, encode
+from renderer.errors import InputError
+from renderer.image import decode, encode
+from renderer.io.images import read_image
 from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
 from renderer.light.environment import read_panorama
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES
 from train.errors import writable_folder
-from train.lab.patterns import FAMILIES, TRAINED
-from train.lab.shots import FOV, Shot, draw_shots
+from train.lab.patterns import RESOLUTION
+from train.lab.shots import FOV, LabSettings, Shot, draw_shots
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
-from train.settings import LARGEST_SEED, read_object
+from train.settings import read_object
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
-SOLIDS = (
-    *("orange:101", "orange:102", "orange:103", "orange:104", "orange:105", "orange:106", "apple:101", "apple:102"),
-    *("pear:101", "sweet_pepper:101", "lemon:101", "lemon:102", "peach:101", "peach:102", "ball:101", "ball:103"),
-)
-LARGEST = {"setups": 10**6, "size": LARGEST_SIZE, "spp": 10**5, "bounces": 1000}
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
-FLOOR = 100.0  # half of the table's width
+FLOOR = 100.0  # half of the width of table and wall
 SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: at a right-angled edge at most 0.82
-ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
 
 
 def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
@@ -61,7 +55,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
 def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
     """(size, size, 3) float32 linear radiance by Mitsuba 3, from `spp` samples per pixel and light.
 
-    Projector and surroundings are rendered one by one and added: with both in one scene each path would choose one of
+    Projectors and surroundings are rendered one by one and added: with both in one scene each path would choose one of
     them at random, which is most of the noise. InputError: Mitsuba is not installed.
     """
     with mitsuba() as module:
@@ -69,11 +63,8 @@ def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces:
             "type": "scene",
             "integrator": {"type": "path", "max_depth": bounces + 1},
             "sensor": sensor(look_at(shot.camera, shot.aim), size, FOV, "rgb"),
-            "table": {
-                "type": "rectangle",
-                "to_world": np.diag([FLOOR, FLOOR, FLOOR, 1.0]),
-                "bsdf": {"type": "diffuse", "reflectance": _rgb(shot.table)},
-            },
+            "table": _plane(np.eye(4), shot.table),
+            **({} if shot.wall is None else {"wall": _plane(look_at(shot.wall, shot.center), shot.table)}),
             **{f"part_{index}": part for index, part in enumerate(_object(module, parts, shot))},
         }
         scenes = [load(module, {**scene, "light": light}) for light in _lights(shot)]
@@ -87,10 +78,19 @@ def _rgb(color: np.ndarray) -> dict[str, Any]:
 def _lights(shot: Shot) -> list[dict[str, Any]]:
     if shot.environment is not None:
         return [environment({"bitmap": shot.environment})]
-    distance = float(np.linalg.norm(shot.projector - shot.center))
-    fov, scale = 2 * float(np.degrees(np.arctan(THROW / distance))), shot.brightness * distance**2
-    pattern = projector(look_at(shot.projector, shot.center), fov, {"bitmap": shot.pattern}, scale)
-    return [pattern, {"type": "constant", "radiance": _rgb(shot.ambient)}]
+    lights = []
+    for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
+        distance = float(np.linalg.norm(position - shot.center))
+        fov, scale = 2 * float(np.degrees(np.arctan(THROW / distance))), shot.brightness * distance**2
+        pose = look_at(position, shot.center)
+        lights.append(projector(pose, fov, {"bitmap": pattern}, scale / len(shot.patterns)))
+    return [*lights, {"type": "constant", "radiance": _rgb(shot.ambient)}]
+
+
+def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
+    """A large square whose front is seen from its own z > 0."""
+    sides = np.diag([FLOOR, FLOOR, 1.0, 1.0])
+    return {"type": "rectangle", "to_world": pose @ sides, "bsdf": {"type": "diffuse", "reflectance": _rgb(color)}}
 
 
 def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
@@ -101,47 +101,12 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
         albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
         if part.texture is not None:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
-        surface = {"type": "principled", "base_color": albedo, "roughness": ROUGHNESS}
+        surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
         faces, normals = np.arange(len(positions)).reshape(-1, 3), (part.normals @ shot.rotation.T).reshape(-1, 3)
         positions, uvs, colors = positions - [0, 0, lowest], part.uvs.reshape(-1, 2), part.colors.reshape(-1, 3)
         twosided = {"type": "twosided", "surface": surface}
         shapes.append(shape(module, twosided, positions, faces, normals, uvs, colors))
     return shapes
-
-
-@dataclass
-class LabSettings:
-    """The settings of pnb-lab. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
-    whose label is a class, or other_NAME if the network lacks it."""
-
-    out: str = MISSING  # a new folder, for photos= of pnb-evaluate
-    label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
-    meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
-    setups: int = 180  # draws of light, camera and pose; two renders each
-    patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # of the projector, for as many setups each
-    environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
-    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
-    exposure: float = 1.0  # multiplies radiance; at 1, a radiance of 1 is white
-    size: int = 64  # pixels per side
-    spp: int = 32  # paths per pixel and light
-    bounces: int = 4  # of light, at most
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in self.patterns:
-            require_choice("patterns", name, FAMILIES)
-        sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
-        if not sources or self.setups < 1 or self.setups % len(sources):
-            raise InputError(
-                f"setups={self.setups} must be a positive multiple of the {len(sources)} patterns and environments"
-            )
-        if len(set(sources)) < len(sources):
-            raise InputError("patterns and environments must have different names, which are the renders' sources")
-        require_limits("brightness", self.brightness, 1 / FACTOR, FACTOR)
-        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
-        require_range("seed", self.seed, 0, LARGEST_SEED)
-        for name, most in LARGEST.items():
-            require_range(name, getattr(self, name), 1, most)
 
 
 def write_laboratory(settings: LabSettings) -> int:
@@ -158,7 +123,8 @@ def write_laboratory(settings: LabSettings) -> int:
     negatives = [subject for subject in subjects if subject[0] != settings.label]
     if not (positives and negatives):
         raise InputError(f"meshes: name at least one of label={settings.label} and one of another class")
-    shots = draw_shots(settings.setups, settings.patterns, settings.brightness, settings.seed, environments)
+    slides = [decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy() for path in settings.slides]
+    shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
         if any(path.name != LOCK for path in out.iterdir()):
             raise InputError(f"out={out} is not an empty folder: name another, or delete it")

@@ -6,6 +6,7 @@ family gives each point a weight in [0, 1] between two colors of light, or one f
 
 import colorsys
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -106,17 +107,21 @@ FAMILIES = {
     family.__name__: family
     for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
 }
+SLIDES = "slides"  # pictures that the user names, in their own colors
 TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
 
 
-def draw_pattern(family: str, rng: np.random.Generator) -> np.ndarray:
+def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()) -> np.ndarray:
     """An image (RESOLUTION, RESOLUTION, 3) float32 of the family in random color, scale, angle and position, linear RGB
-    in [0, 1]."""
+    in [0, 1]. slides: the pictures (H, W, 3) of the family SLIDES."""
     first, second = draw_color(rng), draw_color(rng) * rng.uniform() * (family in TWO_COLORED)
     centers = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
     angle = rng.uniform(0, 2 * math.pi)
     rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
+    if family == SLIDES:
+        picture, points = slides[rng.integers(len(slides))], points * rng.uniform(0.3, 1) + rng.uniform(-0.5, 0.5, 2)
+        return _sampled(picture, points, order=1).astype(np.float32)
     weight = FAMILIES[family](points, rng)
     weight = weight if weight.ndim == 3 else weight[..., None]
     return (second + weight * (first - second)).astype(np.float32)
