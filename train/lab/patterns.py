@@ -120,8 +120,8 @@ def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndar
     rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
     if family == SLIDES:
-        picture, points = slides[int(rng.integers(len(slides)))], points * rng.uniform(0.3, 1) + rng.uniform(-0.5, 0.5, 2)
-        return _sampled(picture, points, order=1).astype(np.float32)
+        picture = slides[int(rng.integers(len(slides)))]
+        return _sampled(picture, points * rng.uniform(0.3, 1) + rng.uniform(-0.5, 0.5, 2), order=1).astype(np.float32)
     weight = FAMILIES[family](points, rng)
     weight = weight if weight.ndim == 3 else weight[..., None]
     return (second + weight * (first - second)).astype(np.float32)
