@@ -142,16 +142,16 @@ def _draw_shot(
     aim = center + rng.uniform(-0.25, 0.25, 3)
 
     def projector(rng: np.random.Generator) -> np.ndarray:
-        angles = azimuth + rng.uniform(*settings.azimuth), rng.uniform(*settings.elevation)
+        angles = azimuth + _between(settings.azimuth, rng), _between(settings.elevation, rng)
         return center + _position(*angles, rng.uniform(5, 8))
 
-    roughness = more.uniform(*settings.roughness)
+    roughness = _between(settings.roughness, more)
     shot = Shot(
         family=kind,
         brightness=brightness,
         patterns=[draw_pattern(first, rng, slides), *(draw_pattern(family, more, slides) for family in others)],
-        ambient=rng.uniform(*settings.ambient) * draw_color(rng),
-        table=rng.uniform(*settings.albedo) * draw_color(rng),
+        ambient=_between(settings.ambient, rng) * draw_color(rng),
+        table=_between(settings.albedo, rng) * draw_color(rng),
         projectors=[projector(rng), *(projector(more) for _ in others)],
         camera=aim + _position(azimuth, rng.uniform(18, 60), half_width / math.tan(math.radians(FOV / 2))),
         center=center,
@@ -161,8 +161,12 @@ def _draw_shot(
         roughness=roughness,
     )
     behind = _position(azimuth + 180 + more.uniform(-30, 30), 0, more.uniform(1.8, 3.5))
-    clear = all((position - center) @ behind < behind @ behind for position in shot.projectors)
-    return replace(shot, wall=center + behind) if more.uniform() < settings.walls and clear else shot
+    free = all((position - center) @ behind < behind @ behind for position in shot.projectors)
+    return replace(shot, wall=center + behind) if more.uniform() < settings.walls and free else shot
+
+
+def _between(limits: Sequence[float], rng: np.random.Generator) -> float:
+    return rng.uniform(limits[0], limits[1])
 
 
 def _position(azimuth: float, elevation: float, distance: float) -> np.ndarray:
