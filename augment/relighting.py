@@ -133,7 +133,7 @@ class Relighting:
 
     Equal views share an operator, and background terms are cached. Operators are built when they are first needed, a
     stack at a time. views: (object's number, camera) of each image. behind: (N,) the background of each. build: the
-    operators of a mesh from cameras, for an albedo_scale.
+    operators of a mesh from cameras, for an albedo_scale. beside: bytes that an attack needs beside the operators.
     """
 
     objects: Sequence[SceneObject]
@@ -142,6 +142,7 @@ class Relighting:
     backgrounds: Tensor
     settings: ImageSettings
     build: Callable[..., Sequence[TransferOperator]]
+    beside: int = 0
 
     def __post_init__(self) -> None:
         self._distinct = sorted(dict.fromkeys(self.views), key=itemgetter(0))  # (object, camera) of each operator
@@ -176,7 +177,7 @@ class Relighting:
             if len(self._stacks) == 1:  # the others are as large
                 rest = (self._count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + behind.nbytes)
                 views = f"{len(self._distinct)} views of {self.settings.size} pixels per side (views)"
-                require_memory(views, rest, self.backgrounds.device)
+                require_memory(views, rest + self.beside, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         """(a stack; (N,) each image's rank among the A images of the stack; the background terms of these (A, C,

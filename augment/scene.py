@@ -27,7 +27,10 @@ from renderer.rasterizer import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-AT_ONCE = 2**24  # pixels of the images that are rendered at once: some 2 GB, with what a gradient needs of them
+AT_ONCE = 2**24  # pixels of the images that are rendered at once
+# Numbers that an attack on the light holds beside the operators: for each pixel of all images, for each of those that
+# are rendered at once, without and with camera effects, and for each number of an example's light.
+KEPT, RENDERED, LIGHTS = 10, (16, 48), 12
 
 
 @dataclass(frozen=True)
@@ -109,12 +112,16 @@ class Scene:
         views = [(example.object, camera) for example in self.examples for camera in example.cameras]
         self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
         renders = f"{len(views)} renders of {size} pixels per side (meshes × views × backgrounds)"
-        require_memory(renders, 24 * len(views) * size**2, device)
+        kept = KEPT * len(self) + RENDERED[self.camera_effects is not None] * min(len(self), self.at_once)
+        needed = self.lights.element_size() * (kept * self.views * size**2 + LIGHTS * self.lights.numel())
+        require_memory(renders, needed, device)
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
         build = partial(self.operators.operators, **shading, dtype=self.lights.dtype)
         behind = self._background.repeat_interleave(self.views)
-        self._relighting = Relighting(self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build)
+        self._relighting = Relighting(
+            self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, needed
+        )
         self._reshading = Reshading(self.objects, like=self.lights, **shading)
 
     @classmethod

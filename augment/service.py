@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ARMS = ("none", "random", "adversarial")
 INITS = ("scene", "random")
-MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
+MOST_EXAMPLES = 10**6
 MOST_EVERY = 10**9
 SHOWN_EXAMPLES = 4  # of an attack, to look at
 

@@ -5,7 +5,8 @@
 
 `speed` lets three contestants take turns, so that a busy machine slows all alike: `python -m train` without renders and
 with adversarial ones, each a process whose second epoch counts, and the loop that one writes with torchvision: a
-DataLoader over PIL images, torch's own dropout, eager float32. `renders` measures one round of attacks over the number
+DataLoader over PIL images and torch's own dropout, in float32, in bfloat16 with channels last, and without a network.
+`renders` measures one round of attacks over the number
 of renders and of meshes, at 32 pixels per side, each in a process of its own, whose peak memory is then its own.
 """
 
@@ -19,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,6 +37,7 @@ from augment import AugmentationService, AugmentationSettings
 from augment.service import TrainingAttackSettings
 from benchmarks.common import Row, machine, write_csv
 from train import checkpoint
+from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
@@ -63,8 +66,9 @@ def collate(transform: Callable[[Image.Image], Tensor], batch: list[tuple[Image.
     return torch.stack([transform(image) for image, _ in batch]), torch.tensor([label for _, label in batch])
 
 
-def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
-    """A function that trains one epoch and returns its seconds; the same network as `train`'s, eager, in float32."""
+def plain_loop(options: argparse.Namespace) -> dict[str, Callable[[], float]]:
+    """Functions that train one epoch and return its seconds, eager, on the same network as `train`'s, by number type,
+    which for bfloat16 has its channels last; "data" loads the batches alone."""
     with np.load(options.data, allow_pickle=False) as archive:
         pixels, labels = (archive[f"train_{name}"][: options.images] for name in ("images", "labels"))
         count = len(archive["classes"])
@@ -80,12 +84,15 @@ def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
         for name, child in parent.named_children():
             if isinstance(child, Dropout):
                 setattr(parent, name, nn.Dropout(child.p))
-    network.to(options.device).train()
-    optimizer = torch.optim.SGD(network.parameters(), lr=0.125, momentum=0.9, weight_decay=5e-4, nesterov=True)
+    networks = {name: deepcopy(network).to(options.device).train() for name in ("float32", "bfloat16")}
+    networks["bfloat16"] = MixedPrecision(networks["bfloat16"], "bfloat16")
 
-    def epoch() -> float:
+    def epoch(network: nn.Module | None) -> float:
         start = time.perf_counter()
+        optimizer = network and torch.optim.SGD(network.parameters(), 0.125, 0.9, weight_decay=5e-4, nesterov=True)
         for batch, classes in loader:
+            if network is None or optimizer is None:
+                continue
             loss = F.cross_entropy(network(batch.to(options.device)), classes.to(options.device))
             optimizer.zero_grad()
             loss.backward()
@@ -94,7 +101,7 @@ def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
             torch.cuda.synchronize()
         return time.perf_counter() - start
 
-    return epoch
+    return {name: partial(epoch, network) for name, network in {**networks, "data": None}.items()}
 
 
 def speed(options: argparse.Namespace) -> list[Row]:
@@ -102,19 +109,21 @@ def speed(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        plain = plain_loop(options)
+        loops = plain_loop(options)
         train(folder / "sure", options, "augment=none")
         state = checkpoint.load(folder / "sure" / checkpoint.BEST)
         make_sure({name: state["model"][f"head.{name}"] for name in ("weight", "bias")})
         checkpoint.save(folder / "sure" / checkpoint.BEST, state)
         attacked = ("augment=adversarial", f"train.init_from={folder}/sure", "train.learning_rate=1e-6")
-        plain()  # warms up
+        for loop in loops.values():
+            loop()  # warms up
         for number in range(options.rounds):
             none = train(folder / f"none_{number}", options, "augment=none")
             adversarial = train(folder / f"adversarial_{number}", options, *attacked)
-            loop, ours, attack = plain(), none["seconds/training"], adversarial["seconds/attack"]
+            ours, attack = none["seconds/training"], adversarial["seconds/attack"]
             row: Row = {"round": number, "train_images_per_second": options.images / ours}
-            row |= {"plain_loop_images_per_second": options.images / loop, "speedup": loop / ours}
+            for name, seconds in {name: loop() for name, loop in loops.items()}.items():
+                row |= {f"{name}_images_per_second": options.images / seconds, f"{name}_ratio": seconds / ours}
             row |= {"attack_seconds": attack, "attack_steps": adversarial["augment/steps"]}
             row["attack_fraction_of_epoch"] = attack / (attack + ours * EPOCH_IMAGES / options.images)
             rows.append(row)

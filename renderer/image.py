@@ -158,7 +158,7 @@ def decode(image: Tensor, encoding: str) -> Tensor:
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
     """Image values in [0, 1] to 8 bits, rounded."""
-    return (image * 255).round().to(torch.uint8)
+    return (image * 255).round_().to(torch.uint8)  # in place: of many renders, a copy less
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:

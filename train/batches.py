@@ -11,27 +11,31 @@ import torch
 from torch import Tensor
 
 from augment import utils
-from augment.service import Renders
 from augment.utils import generator
-from renderer.image import to_bytes
 from train.data import Split
 
 PADDING = 4
-CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cropped in several chunks
+CHUNK_BYTES = 2**24  # of the batches that are cropped at once
 FLIPS = ("random", "alternating")
+
+
+class TrainingImages(NamedTuple):
+    """What a round draws from: the rows (N,) of a split, of which no copy is made, and behind them the renders."""
+
+    split: Split
+    rows: Tensor
+    renders: Split
 
 
 class Round(NamedTuple):
     """The training between two regenerations of the renders: an epoch, or a part of one.
 
-    number: counts a run's rounds from 0. epoch: from 0. rows: (N,) int64, ascending, the images that it shows.
-    renders: how many of these, the last, are renders.
+    number: counts a run's rounds from 0. epoch: from 0. rows: (N,) int64, ascending, the training images that it shows.
     """
 
     number: int
     epoch: int
     rows: Tensor
-    renders: int = 0
 
 
 def rounds_of_epoch(
@@ -44,24 +48,11 @@ def rounds_of_epoch(
     drawn = torch.randperm(images, generator=generator(seed, epoch, "rounds"))[:images_per_epoch]
     last = torch.arange(images, images + renders)
     rows = [torch.cat([part.sort().values, last]) for part in drawn.split(every or len(drawn))]
-    return [Round(epoch * len(rows) + index, epoch, part, renders) for index, part in enumerate(rows)]
-
-
-def with_room(split: Split, count: int) -> Split:
-    """The split's images and, behind them, room for a round's renders."""
-    room = split.images.new_zeros(count, *split.images.shape[1:]), split.labels.new_zeros(count)
-    return Split(torch.cat([split.images, room[0]]), torch.cat([split.labels, room[1]]))
-
-
-def put_last(split: Split, renders: Renders) -> None:
-    """Overwrite the split's last images with the renders, as 8-bit images."""
-    first = len(split) - len(renders.labels)
-    split.images[first:] = to_bytes(renders.images)
-    split.labels[first:] = renders.labels
+    return [Round(epoch * len(rows) + index, epoch, part) for index, part in enumerate(rows)]
 
 
 def training_batches(
-    split: Split, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
+    images: TrainingImages, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """This process's shard of a round's batches: images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
 
@@ -70,25 +61,31 @@ def training_batches(
     first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
     any number of processes. first: the batch to begin with.
     """
-    images, rows = split.images, now.rows
+    (split, data, renders), rows = images, now.rows
     order = rows[torch.randperm(len(rows), generator=generator(seed, now.number, "batches"))]
     order = order[torch.arange(math.ceil(len(rows) / batch_size) * batch_size) % len(rows)].view(-1, batch_size)
     shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
     if flips == "random":
         flipped = torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
     else:
-        in_even_epochs = torch.randint(0, 2, (len(images),), generator=generator(seed, "flips"), dtype=torch.bool)
-        flipped = in_even_epochs[order] ^ bool(now.epoch % 2)
+        drawn = torch.randint(0, 2, (len(data) + len(renders),), generator=generator(seed, "flips"), dtype=torch.bool)
+        flipped = drawn[order] ^ bool(now.epoch % 2)
     shard = batch_size // utils.world_size()
+    at_once = shard * max(1, CHUNK_BYTES // (shard * split.images[0].numel()))
     columns = slice(utils.rank() * shard, (utils.rank() + 1) * shard)
-    order, shifts, flipped = (draws[..., first:, columns].to(images.device) for draws in (order, shifts, flipped))
-    batches_at_once = max(1, CHUNK_BYTES // (shard * images[0].numel()))
-    for begin in range(0, len(order), batches_at_once):
-        chunk = slice(begin, begin + batches_at_once)
-        chosen = order[chunk].flatten()
-        cropped = crop_and_flip(images, chosen, shifts[:, chunk].flatten(1), flipped[chunk].flatten())
-        rendered = chosen >= len(images) - now.renders
-        yield from zip(*(part.split(shard) for part in (cropped, split.labels[chosen], rendered)), strict=True)
+    order, shifts, flipped = (draws[..., first:, columns].flatten(-2) for draws in (order, shifts, flipped))
+    rendered, device = order >= len(data), split.images.device
+    places = [part.nonzero().squeeze(1).to(device) for part in rendered.split(at_once)]
+    draws = data[order.clamp(max=len(data) - 1)], order - len(data), shifts, flipped, rendered
+    draws = [part.to(device) for part in draws]
+    for begin, place in zip(range(0, len(order), at_once), places, strict=False):
+        row, number, shift, flip, is_render = (part[..., begin : begin + at_once] for part in draws)
+        cropped, labels = crop_and_flip(split.images, row, shift, flip), split.labels[row]
+        if len(place):
+            number = number[place]
+            cropped[place] = crop_and_flip(renders.images, number, shift[:, place], flip[place])
+            labels[place] = renders.labels[number]
+        yield from zip(*(part.split(shard) for part in (cropped, labels, is_render)), strict=True)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:

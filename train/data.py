@@ -53,8 +53,8 @@ class DataSet:
         return self.train.images.shape[-1]
 
 
-def stratified_split(split: Split, fraction: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:
-    """(train, held out) with the fraction of every class's images, rounded, held out. InputError names the key."""
+def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.validation") -> Tensor:
+    """(N,) bool, true of the fraction of every class's images, rounded. InputError names the key."""
     if not 0 < fraction < 1:
         raise InputError(f"{key}={fraction} must lie between 0 and 1")
     held_out, draws = torch.zeros(len(split), dtype=torch.bool), generator(seed, "validation")
@@ -64,7 +64,7 @@ def stratified_split(split: Split, fraction: float, seed: int, key: str = "data.
         if not 0 < count < len(members):
             raise InputError(f"{key}={fraction} of class {int(label)}, {len(members)} images, is all or nothing")
         held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
-    return split[~held_out], split[held_out]
+    return held_out
 
 
 def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
@@ -146,7 +146,8 @@ def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
         raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")
     if parts:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
-    return DataSet(classes, *stratified_split(train, test_fraction, seed=0, key="data.test_fraction"))
+    held_out = held_out_rows(train, test_fraction, seed=0, key="data.test_fraction")
+    return DataSet(classes, train[~held_out], train[held_out])
 
 
 def _folders(root: Path) -> list[str]:

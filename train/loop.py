@@ -20,12 +20,12 @@ from augment.utils import announced, eval_mode, progress, stream_seed
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
-from train.batches import Round, put_last, rounds_of_epoch, training_batches, with_room
+from train.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import Interruption, replicated, summed
-from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, training_loss
+from train.recipe import MovingAverage, TrainSettings, augmentation, training_loss
 from train.run_folder import PHASES, RunLog
 
 EVALUATION_BATCH = 512  # images at a time
@@ -108,17 +108,18 @@ class Trainer:
         self._attacked: nn.Module = GraphedModel(model) if compiled else model
         self._validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
 
-    def fit(self, train: Split, validation: Split, log: RunLog | None) -> None:
+    def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
         """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
 
-        log: of the process that writes. InputError where training diverges. `Interrupted`, after a checkpoint, where a
-        signal asked for it.
+        split: on the trainer's device. held_out: (N,) bool on the CPU, which of its images validate. log: of the
+        process that writes. InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked
+        for it.
         """
-        mixed = with_room(train, len(self.service))
+        train, validation = (torch.nonzero(chosen).squeeze(1) for chosen in (~held_out, held_out))
         with Interruption() as interruption:
             while self.epoch < self.settings.epochs:
-                if self._train_epoch(mixed, len(train), interruption, log):
-                    self._end_epoch(validation, log)
+                if self._train_epoch(split, train, interruption, log):
+                    self._end_epoch(split, validation, log)
                 stopping = interruption.requested()
                 due = self._under_way is None and self.epoch % self.settings.checkpoint_every == 0
                 if stopping or due or self.epoch == self.settings.epochs:
@@ -126,13 +127,10 @@ class Trainer:
                 if stopping:
                     interruption.stop()
 
-    def _train_epoch(self, mixed: Split, images: int, interruption: Interruption, log: RunLog | None) -> bool:
-        """Take the epoch's remaining steps; whether all were taken, since a signal ends them early.
-
-        mixed: the training images, and behind them room for the renders.
-        """
+    def _train_epoch(self, split: Split, rows: Tensor, interruption: Interruption, log: RunLog | None) -> bool:
+        """Take the epoch's remaining steps, on some rows; whether all were taken, since a signal ends them early."""
         settings, shown, every = self.settings, self.settings.images_per_epoch, self.service.settings.every
-        rounds = rounds_of_epoch(images, len(self.service), self.seed, self.epoch, shown, every)
+        rounds = rounds_of_epoch(len(rows), len(self.service), self.seed, self.epoch, shown, every)
         steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
         total = sum(steps)
         if self._under_way is None:
@@ -151,12 +149,12 @@ class Trainer:
                 state.renders = self._regenerate(rounds[index], log)
                 state.diagnostics.append(state.renders.diagnostics)
             with self.phases("training"):
-                put_last(mixed, state.renders)
+                images = TrainingImages(split, rows, Split(to_bytes(state.renders.images), state.renders.labels))
                 self.model.train()
                 for norm in self._frozen_norms:
                     norm.eval()
                 first = state.step - sum(steps[:index])
-                batches = training_batches(mixed, settings.batch_size, self.seed, rounds[index], settings.flips, first)
+                batches = training_batches(images, settings.batch_size, self.seed, rounds[index], settings.flips, first)
                 for batch in progress(batches, f"epoch {self.epoch + 1}", total, state.step):
                     state.sums += self._step(*batch, state.step / total, self.epoch * total + state.step)
                     state.step += 1
@@ -184,7 +182,7 @@ class Trainer:
         if not settings.soup:
             progress = (self.epoch + progress) / settings.epochs
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.learning_rate * SCHEDULES[settings.schedule](progress)
+            group["lr"] = settings.rate(progress)
         images = self._augment(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
         loss, hits = self._loss(images, labels, rendered)
@@ -194,15 +192,15 @@ class Trainer:
             self.ema.update_parameters(self.model)
         return torch.stack([loss.detach() * len(labels), hits])
 
-    def _end_epoch(self, validation: Split, log: RunLog | None) -> None:
-        """Validate, remember the best network, and log the epoch's metrics."""
+    def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
+        """Validate on the split's rows, remember the best network, and log the epoch's metrics."""
         state, self._under_way = cast(EpochState, self._under_way), None
         images = state.step * self.settings.batch_size
         loss_sum, hits = summed(state.sums).tolist()
         if self.soup:
             self.soup.update_parameters(self.ema.module if self.ema else self.model)
         with self.phases("evaluation"):
-            validated = evaluate(self._validated, validation)
+            validated = evaluate(self._validated, split, rows)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         before = [line["validation/accuracy"] for line in self.history]
@@ -315,18 +313,18 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
 
 
 @torch.no_grad()
-def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
-    """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored.
+def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
+    """Mean cross entropy and top-1 accuracy on a split, or its rows, in eval mode; the model's mode is restored.
 
     Every process of a run scores its shard of the images; all get the result.
     """
-    shard = slice(utils.rank(), None, utils.world_size())
+    rows = (torch.arange(len(split)) if rows is None else rows).to(split.images.device)
     loss_sum, hits = totals = torch.zeros(2, device=split.images.device)
-    batches = zip(*(part[shard].split(EVALUATION_BATCH) for part in (split.images, split.labels)), strict=True)
+    batches = rows[utils.rank() :: utils.world_size()].split(EVALUATION_BATCH)
     with eval_mode(model):
-        for images, labels in progress(batches, f"{len(split)} images", math.ceil(len(split) / EVALUATION_BATCH)):
-            logits = model(to_unit(images))
+        for batch in progress(batches, f"{len(rows)} images"):
+            logits, labels = model(to_unit(split.images[batch])), split.labels[batch]
             loss_sum += F.cross_entropy(logits, labels, reduction="sum")
             hits += (logits.argmax(1) == labels).sum()
     loss_sum, hits = summed(totals).tolist()
-    return {"loss": loss_sum / len(split), "accuracy": hits / len(split)}
+    return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

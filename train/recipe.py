@@ -77,6 +77,10 @@ class TrainSettings:
         if not 0 < self.learning_rate <= FACTOR:
             raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
+    def rate(self, done: float) -> float:
+        """The learning rate where that fraction of the training is done."""
+        return self.learning_rate * SCHEDULES[self.schedule](done)
+
 
 def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None) -> Loss:
     """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and the number

@@ -17,7 +17,7 @@ from renderer.cache import TensorCache, cache_folder, content_key
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
-from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
+from train.data import DataSet, Split, channel_statistics, held_out_rows, load_cifar100, load_folder, load_npz
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
 from train.networks import PYTHON, build_network, describe, load_selected, start_from
@@ -54,14 +54,20 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     if begun and not settings.train.resume:
         raise InputError(f"run={folder} holds a run already: set train.resume=true to go on, or choose another run")
     if begun:
-        recorded = OmegaConf.select(require_same_run(folder, settings), "hardware.threads")
+        before = require_same_run(folder, settings)
+        recorded = OmegaConf.select(before, "hardware.threads")
         threads = threads or (recorded if isinstance(recorded, int) and recorded > 0 else None)
     fraction, left_out = _validation(settings, data.train, base)
-    train, validation = stratified_split(data.train, fraction, seed=0)
+    held_out = held_out_rows(data.train, fraction, seed=0)
     trainer = build_trainer(settings, data, folder, base, left_out, threads)
     threads = torch.get_num_threads()
     if begun:
         trainer.resume()
+        epochs, planned = settings.train.epochs, before.train.epochs
+        if epochs != planned and not settings.train.soup:  # each of whose epochs has the whole schedule
+            rates = [settings.train.rate(trainer.epoch / count) for count in (epochs, planned)]
+            stretched = f"train.epochs={epochs}, not {planned}, stretches train.schedule={settings.train.schedule}"
+            console.warning("%s: the learning rate goes on at %.3g, not %.3g", stretched, *rates)
     elif settings.train.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
@@ -71,12 +77,12 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     def train_and_score() -> dict[str, float]:
         torch.set_num_threads(threads)  # of this run, after others were prepared
         console.info(
-            f"{len(train)} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
+            f"{(~held_out).sum()} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
             f"threads: {threads}, processes: {utils.world_size()}"
         )
         before = _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)
-        trainer.fit(train.to(trainer.device), validation.to(trainer.device), log)
+        trainer.fit(data.train.to(trainer.device), held_out, log)
         scores = before | _test_scores(trainer, data)
         summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
         for name, summary in summaries.items():

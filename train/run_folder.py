@@ -290,7 +290,7 @@ class RunLog:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
         from torchvision.utils import make_grid
 
-        grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
+        grid = make_grid(to_bytes(images.cpu()), nrow=20, padding=1, pad_value=255)
         self._renders.mkdir(exist_ok=True)
         path = self._renders / f"epoch_{epoch:03d}.png"
         Image.fromarray(grid.permute(1, 2, 0).numpy()).save(path, compress_level=1)

@@ -9,12 +9,15 @@ import pytest
 import torch
 from torch import nn
 
-from augment import utils
+from augment import AugmentationService, AugmentationSettings, scene, utils
 from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.build import build_scene
+from augment.service import TrainingAttackSettings
 from augment.utils import generator, progress, require_memory, stream_seed
+from augment.variation import CameraEffectSettings
 from renderer.errors import InputError
+from renderer.image import to_bytes
 
 ERRORS = [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you tried")]
 
@@ -123,15 +126,32 @@ def test_more_than_the_free_memory_is_refused_before_it_is_allocated(tmp_path, m
         require_memory("renders", 2**32, device)
 
 
+@pytest.mark.parametrize("at_once, camera", [(2**16, {}), (2**24, {}), (2**24, {"blur": 0.8, "pattern_fraction": 0.7})])
+def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_free(monkeypatch, at_once, camera):
+    """By torch's profiler, for all images at once and for few; with the renders as bytes, as they are trained on."""
+    needed = []
+    monkeypatch.setattr(scene, "AT_ONCE", at_once)
+    monkeypatch.setattr(scene, "require_memory", lambda name, bytes_, device: needed.append(bytes_))
+    settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=1))
+    settings.vary.camera = CameraEffectSettings(**camera)
+    grays = {"views": 2, "backgrounds": [row / 128 for row in range(128)], "samples": 1, "rasterizer": "numpy"}
+    service = AugmentationService.from_meshes([("solid:orange:0", 0)], 32, settings, **grays)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as recorded:
+        to_bytes(service.regenerate(Small(), 0).images)
+    events = [event for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]"]
+    changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+    assert needed[-1] / 2 < max(itertools.accumulate(changes)) <= needed[-1]
+
+
 def test_renders_and_their_views_need_their_memory_before_any_is_made(monkeypatch):
-    monkeypatch.setattr(utils, "_free", lambda device: 2**24)
+    monkeypatch.setattr(utils, "_free", lambda device: 2**26)
     orange, grays = [("solid:orange", "orange")], (0, 0.25, 0.5, 0.75, 1)
-    with pytest.raises(InputError, match=r"^1000 renders of 64 pixels per side .* need 0\.1 GB"):
+    with pytest.raises(InputError, match=r"^1000 renders of 64 pixels per side .* need 0\.4 GB"):
         build_scene(orange, 64, 200, backgrounds=grays, rasterizer="numpy")
-    scene = build_scene(orange, 64, 100, rasterizer="numpy", samples=1)
+    views = build_scene(orange, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(utils, "_free", lambda device: 10**6)
     with pytest.raises(InputError, match=r"^100 views of 64 pixels per side .* need "):
-        _ = scene.stacks
+        _ = views.stacks
 
 
 def test_every_key_seeds_another_stream_and_leaves_the_global_generator():

@@ -3,9 +3,8 @@ import torch
 import torch.nn.functional as F
 from scipy.stats import binomtest, chisquare
 
-from augment.service import Renders
 from train import batches
-from train.batches import PADDING, Round, crop_and_flip, put_last, rounds_of_epoch, training_batches, with_room
+from train.batches import PADDING, Round, TrainingImages, crop_and_flip, rounds_of_epoch, training_batches
 from train.data import Split
 
 
@@ -17,9 +16,10 @@ def epoch_round(images: int, epoch: int) -> Round:
     return Round(epoch, epoch, torch.arange(images))
 
 
-def numbered(images: torch.Tensor) -> Split:
-    """Each image's row is its label."""
-    return Split(images, torch.arange(len(images)))
+def numbered(images: torch.Tensor) -> TrainingImages:
+    """All images of a split, without renders; each image's row is its label."""
+    split = Split(images, torch.arange(len(images)))
+    return TrainingImages(split, split.labels, split[:0])
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
@@ -41,7 +41,7 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flippe
 def test_shifts_and_flips_are_all_drawn_about_equally_often():
     count, size, middle = 6000, 11, 5
     pixel = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
-    (images, *_), *_ = training_batches(Split(pixel, torch.zeros(count)), count, 0, epoch_round(count, 0))
+    (images, *_), *_ = training_batches(numbered(pixel), count, 0, epoch_round(count, 0))
     rows = images[:, 0, middle].long()
     flipped = rows[:, middle - 1] > rows[:, middle + 1]
     assert binomtest(int(flipped.sum()), count).pvalue > 1e-4
@@ -72,7 +72,9 @@ def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last
     for images, labels, _ in epoch:
         assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
         assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
-    ((_, labels, _),) = training_batches(plain[:3], 7, 0, epoch_round(3, 0))  # a batch has every image several times
+    ((_, labels, _),) = training_batches(
+        numbered(plain.split.images[:3]), 7, 0, epoch_round(3, 0)
+    )  # a batch has every image several times
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 
@@ -89,17 +91,17 @@ def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch,
             assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
 
 
-def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels_and_batches_tell_them_apart():
-    data = numbered(noise(5, 3, 16, 16))
-    mixed = with_room(data, 2)
-    for renders in (torch.ones(2, 3, 16, 16), torch.rand(2, 3, 16, 16)):
-        put_last(mixed, Renders(renders, torch.tensor([1, 0]), {}))
-        assert torch.equal(mixed.images[:5], data.images)
-        assert (mixed.images[5:] / 255 - renders).abs().max() <= 0.5 / 255 + 1e-6
-        assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 0]
-    rows = torch.arange(30)
-    epoch = training_batches(numbered(noise(30, 3, 8, 8)), 7, 0, Round(0, 0, rows[5:], renders=4))
-    assert all(torch.equal(rendered, labels >= 26) for _, labels, rendered in epoch)
+def test_rows_and_renders_are_drawn_as_from_one_split_that_holds_them_in_this_order(monkeypatch):
+    split, rows = Split(noise(40, 3, 16, 16), torch.arange(40)), torch.tensor([3, 5, 8, 21, 38])
+    renders = Split(255 - noise(2, 3, 16, 16), torch.tensor([-1, 77]))
+    mixed = numbered(torch.cat([split.images[rows], renders.images]))
+    expected = list(training_batches(mixed, 3, 0, epoch_round(7, 0)))
+    monkeypatch.setattr(batches, "CHUNK_BYTES", 4 * 3 * 16 * 16)
+    drawn = training_batches(TrainingImages(split, rows, renders), 3, 0, epoch_round(7, 0))
+    for (images, labels, rendered), (whole, numbers, _) in zip(drawn, expected, strict=True):
+        assert torch.equal(images, whole) and torch.equal(labels, torch.cat([rows, renders.labels])[numbers])
+        assert torch.equal(rendered, numbers >= 5)
+    assert torch.equal(split.images, noise(40, 3, 16, 16))
 
 
 def test_rounds_divide_the_epochs_images_and_each_has_all_renders():

@@ -37,7 +37,9 @@ def make_trainer(folder, network: nn.Module | None = None, **settings) -> Traine
 
 
 def fit_noise(trainer: Trainer) -> list[dict]:
-    trainer.fit(noise(40), noise(20), RunLog(trainer.folder))
+    parts = noise(40), noise(20)
+    both = Split(torch.cat([part.images for part in parts]), torch.cat([part.labels for part in parts]))
+    trainer.fit(both, torch.arange(60) >= 40, RunLog(trainer.folder))
     return read_metrics(trainer.folder)
 
 
@@ -56,7 +58,7 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
     recipe = {"learning_rate": 0.5, "momentum": 0.9, "weight_decay": 0.1, "schedule": "cosine"}
     trainer = make_trainer(tmp_path, network, epochs=1, batch_size=4, **recipe)
-    trainer.fit(Split(as_bytes.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
+    trainer.fit(Split(as_bytes.flatten(0, 1), labels.flatten()), torch.zeros(8, dtype=torch.bool), RunLog(tmp_path))
 
     velocities, losses = [torch.zeros_like(weight), torch.zeros_like(bias)], []
     for step in range(2):
@@ -137,7 +139,7 @@ def test_a_soup_is_the_mean_of_epochs_that_each_begin_anew(tmp_path, monkeypatch
 def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_path, monkeypatch):
     trainer, weights, accuracies = make_trainer(tmp_path, epochs=5), [], iter([0.2, 0.6, 0.5, 0.6, 0.1])
 
-    def scripted(model, split):
+    def scripted(model, *images):
         weights.append(copy.deepcopy(model.network.state_dict()))
         return {"loss": 1.0, "accuracy": next(accuracies)}
 

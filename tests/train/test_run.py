@@ -1,4 +1,5 @@
 import errno
+import gc
 import json
 import os
 import signal
@@ -13,7 +14,7 @@ from omegaconf import OmegaConf
 
 from augment.losses import complementary_label
 from renderer.errors import InputError
-from train import checkpoint, loop
+from train import batches, checkpoint, loop
 from train.errors import one_sentence
 from train.networks import load_run
 from train.processes import Interrupted
@@ -59,9 +60,36 @@ def train_with_signal(settings, folder: Path, round_number: int, step: int, numb
 @pytest.fixture
 def regenerated(monkeypatch) -> list:
     """The renders of each round, as they are handed to training."""
-    renders, put_last = [], loop.put_last
-    monkeypatch.setattr(loop, "put_last", lambda split, new: renders.append(new) or put_last(split, new))
+    renders, mixed = [], loop.TrainingImages
+    monkeypatch.setattr(loop, "TrainingImages", lambda *mixture: renders.append(mixture[2]) or mixed(*mixture))
     return renders
+
+
+def test_the_training_set_lies_in_memory_once(tiny, tmp_path, monkeypatch):
+    """On the CPU, as it was loaded; a batch is cropped at a time."""
+    data, after = load_data(tiny()), []
+
+    def large() -> set[int]:
+        tensors = [item for item in gc.get_objects() if type(item) is torch.Tensor and item.dtype == torch.uint8]
+        return {t.untyped_storage().data_ptr() for t in tensors if t.numel() > 0.7 * data.train.images.numel()}
+
+    monkeypatch.setattr(batches, "CHUNK_BYTES", 1)
+    act_at(monkeypatch, 0, 2, lambda: after.append(large()))
+    before = large()
+    run(tiny("augment=none", "train.epochs=1"), data, tmp_path)
+    assert after == [before] and data.train.images.data_ptr() in before
+
+
+def test_more_epochs_stretch_the_schedule_and_a_jump_of_its_rate_is_said(tiny, tmp_path, caplog):
+    """One cycle's rate ends at zero; half way through, it is .5 / .8 of the highest."""
+    keys = "augment=none", "train.schedule=one_cycle", "train.resume=true"
+    data = load_data(tiny())
+    run(tiny(*keys, "train.epochs=1"), data, tmp_path)
+    prepare(tiny(*keys, "train.epochs=1"), data, tmp_path)
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
+    prepare(tiny(*keys, "train.epochs=2"), data, tmp_path)
+    (message,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert message.endswith(f" {0.05 * 0.5 / 0.8:.3g}, not 0")
 
 
 @pytest.mark.parametrize(
