@@ -24,7 +24,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from augment import utils
 from augment.build import load_background
 from renderer import InputError, load_light, load_mesh
 from train import checkpoint
@@ -320,11 +319,3 @@ def test_a_forged_file_is_refused(outcome, file, content):
 @pytest.mark.parametrize("file", ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"])
 def test_what_is_no_file_is_refused(outcome, file, instead):
     assert outcome(file, lambda path: (path.unlink(), INSTEAD[instead](path))) is not None
-
-
-def test_renders_beyond_the_memory_are_refused_before_any_is_made(data, capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr(utils, "_free", lambda device: 10**8)
-    settings = [word.replace("examples=4", "examples=20000") for word in TRAINING]
-    assert run_here("train", f"run={tmp_path}/run", *settings, folder=data) == 2
-    errors = capfd.readouterr().err
-    assert re.fullmatch(r"error: scene: 20000 renders of 16 pixels per side .* and 0\.1 GB are free: .*\n", errors)
