@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
 _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `orbit_cameras`
-_choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
+_choose = cache(choose)  # "opengl" checks the driver, which takes longer than an image
 
 
 def render(

@@ -15,7 +15,6 @@ All snap vertices to 1/256 of a sample, so faces that share an edge cover each s
 bit; OpenGL rounds depths otherwise.
 """
 
-import re
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -26,7 +25,6 @@ from renderer.rasterizer import opengl
 
 NAMES = ("auto", "opengl", "numba", "numpy")
 SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
-_SOFTWARE_OPENGL = re.compile("llvmpipe|softpipe|swrast|swiftshader|software rasterizer", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -49,22 +47,12 @@ class Rasterizer:
 def choose(rasterizer: str = "auto") -> Rasterizer:
     """Settle on a rasterizer, once at the start.
 
-    "auto" takes OpenGL where a GPU drives it, else numba where it is installed, else numpy. InputError:
-    an unknown name, "opengl" on a machine that cannot, or "numba" without numba.
+    "auto" takes numba where it is installed, else numpy, so that images are the same on every machine. InputError: an
+    unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
     require_choice("rasterizer", rasterizer, NAMES)
-    reason = ""
-    if rasterizer in ("auto", "opengl"):
-        try:
-            device = opengl.device()
-        except InputError as error:
-            if rasterizer == "opengl":
-                raise
-            reason = f" ({error})"
-        else:
-            if rasterizer == "opengl" or not _SOFTWARE_OPENGL.search(device):
-                return Rasterizer("opengl", f"opengl ({device})")
-            reason = " (no GPU drives OpenGL)"
+    if rasterizer == "opengl":
+        return Rasterizer("opengl", f"opengl ({opengl.device()})")
     if rasterizer != "numpy":
         try:
             from renderer.rasterizer import numba  # takes half a second to import
@@ -73,4 +61,4 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
         except InputError:
             if rasterizer == "numba":
                 raise
-    return Rasterizer("numpy", f"numpy{reason}")
+    return Rasterizer("numpy", "numpy" if rasterizer == "numpy" else "numpy (numba is faster: pip install numba)")

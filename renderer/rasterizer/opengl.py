@@ -4,6 +4,7 @@ A context is made, used and released in one call, since one that is kept returns
 After a fork only the process that made a context first can make another: under Mesa a child hangs. Ids come from
 gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly. Triton and Mesa's llvmpipe each bring an LLVM of
 their own, and a process that loads Triton second crashes; so it is loaded here, where it is installed.
+Of several EGL devices moderngl takes the one whose number is in GLCONTEXT_DEVICE_INDEX, by default the first.
 """
 
 from __future__ import annotations
