@@ -63,8 +63,7 @@ class BatchSize:
                 yield result
                 begin = part.stop
                 continue
-            if torch.cuda.is_available():
-                torch.cuda.empty_cache()  # here, where the error no longer keeps the tensors of the slice
+            torch.cuda.empty_cache()  # here, where the error no longer keeps the tensors of the slice
 
 
 @cache
@@ -83,7 +82,8 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
 def _free(device: torch.device) -> int | None:
     """Free bytes of a GPU, the machine or the container; None where the system does not say."""
     if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # by torch, for what comes
+        return torch.cuda.mem_get_info(device)[0] + cached
     try:
         free = 1024 * int(dict(line.split(":") for line in MEMORY.read_text().splitlines())["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):

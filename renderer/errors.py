@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 FACTOR = 1e5  # the largest that multiplies a light or an albedo, so that it stays below LARGEST
+OUT_OF_MEMORY = "out of memory", "can't allocate memory", "ALLOC", "unable to find an engine"
 LARGEST = 1e12  # products of three such float32 values do not overflow; infinity minus infinity would be NaN
 
 
@@ -28,8 +29,9 @@ def in_one_line(error: Exception) -> str:
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether memory ran out: a GPU's, that of torch's allocator on the CPU, or Python's."""
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
+    """Whether memory ran out: a GPU's, as torch, CUDA, cuDNN and cuBLAS say it, torch's on the CPU, or Python's."""
+    recognized = any(words in str(error) for words in OUT_OF_MEMORY)
+    return recognized or isinstance(error, torch.OutOfMemoryError | MemoryError)
 
 
 def as_device(device: torch.device | str) -> torch.device:

@@ -345,7 +345,7 @@ class Watched(nn.Module):
         torch.rand(7)
         self.calls += 1
         if self.calls == self.fails_at:
-            raise RuntimeError("out of memory")
+            raise RuntimeError("shapes differ")
         return self.network(images)
 
     def state(self) -> dict:

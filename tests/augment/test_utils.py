@@ -19,7 +19,12 @@ from augment.variation import CameraEffectSettings
 from renderer.errors import InputError
 from renderer.image import to_bytes
 
-ERRORS = [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you tried")]
+SAID = "can't allocate memory: you tried", "CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"
+SAID += (
+    "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
+    "GET was unable to find an engine to execute",
+)
+ERRORS = [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), *map(RuntimeError, SAID)]
 
 
 class Terminal(io.StringIO):
@@ -87,7 +92,7 @@ def assert_same(actual: DescentResult, expected: DescentResult) -> None:
         assert torch.equal(getattr(actual, item.name), getattr(expected, item.name)), item.name
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("error", ERRORS, ids=repr)
 def test_an_attack_without_memory_goes_on_in_smaller_batches_with_the_same_result(caplog, error):
     utils._warn_once.cache_clear()
     small = Small(3, error)
