@@ -18,11 +18,11 @@ from renderer.image import ImageSettings, background_term
 from renderer.transfer import TransferOperator, apply_transfer
 from renderer.transport.local import SparseTransfer, joined
 
-Rows = list[int] | None
+Rows = slice | Tensor
 
 
 class Layer(NamedTuple):
-    """Covered pixels (P,) of B images, which are `rows` of a batch; None for all of it in order.
+    """Covered pixels (P,) of B images, which are `rows` of a batch: a part of it or, on its device, indices (B,).
 
     composite: (B, 3, P) linear radiance and background.
     """
@@ -40,22 +40,17 @@ class InPlace(torch.autograd.Function):
     def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, covered, strict=True):
-            if rows is None:
-                canvas.index_copy_(2, pixels, values)
-            else:
-                for row, value in zip(rows, values, strict=True):
-                    canvas[row].index_copy_(1, pixels, value)
+            images = canvas[rows].index_copy_(2, pixels, values)
+            if isinstance(rows, Tensor):  # of which canvas[rows] is a copy
+                canvas.index_copy_(0, rows, images)
         return canvas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        def gathered(rows: Rows, pixels: Tensor) -> Tensor:
-            if rows is None:  # of two axes, torch selects ten times as fast as of three
-                return upstream.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, 3))
-            return torch.stack([upstream[row].index_select(1, pixels) for row in rows])
-
-        return None, None, *(gathered(*target) for target in ctx.targets)
+        # Of two axes, torch selects ten times as fast as of three.
+        covered = (upstream[rows].flatten(0, 1).index_select(1, pixels) for rows, pixels in ctx.targets)
+        return None, None, *(values.unflatten(0, (-1, 3)) for values in covered)
 
 
 class OperatorStack:
@@ -63,7 +58,7 @@ class OperatorStack:
 
     pixels: (P,) int64, covered by any of the operators. transfer: (O, 3 or 1, K, P), of the K coefficients that are
     nonzero in any of them, with a row of zeros if K is odd: with 32 rows instead of 31 the gradient's product is twice
-    as fast. albedo: (O, 3, P). coverage: (O, 1, P).
+    as fast. albedo: (O, 3, P). coverage: (O, 1, P). Which image shows which operator is known to the host.
     """
 
     def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
@@ -89,27 +84,30 @@ class OperatorStack:
             first.append(sum(len(part.function) for part in parts))
         sparse = joined(parts)
         self._sparse = sparse and sparse.to(device)
-        tensors = pixels, transfer, albedo, coverage, shown, coefficients, torch.tensor(first)
-        self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._coefficients, self._first = (
+        self.shown, self._first = shown, torch.tensor(first)
+        tensors = pixels, transfer, albedo, coverage, coefficients
+        self.pixels, self.transfer, self.albedo, self.coverage, self._coefficients = (
             tensor.to(device) for tensor in tensors
         )
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Linear radiance (A, 3, P) of images (A,), each in its light (A, size, 3); differentiable in the lights.
+        """Linear radiance (A, 3, P) of images (A,) on the host, each in its light (A, size, 3); differentiable in the
+        lights.
 
         Lights are laid out on a grid of operators × their images, with gaps where an operator has fewer than another.
         Operators that none of the images shows are left out.
         """
         used, row, counts = torch.unique(self.shown[images], return_inverse=True, return_counts=True)
         slots, order = max(counts.tolist(), default=0), row.argsort(stable=True)
-        rank = torch.arange(len(row), device=row.device) - (counts.cumsum(0) - counts)[row[order]]
+        rank = torch.arange(len(row)) - (counts.cumsum(0) - counts)[row[order]]
         cell = row * slots + torch.empty_like(row).index_copy_(0, order, rank)
+        no_gaps = len(cell) == len(used) * slots and bool((cell.diff() == 1).all())
+        used, cell = (indices.to(lights.device, non_blocking=True) for indices in (used, cell))
         nonzero = lights.index_select(1, self._coefficients)
         grid = nonzero.new_zeros(len(used) * slots, *nonzero.shape[1:]).index_copy(0, cell, nonzero)
         everything = len(used) == len(self.transfer)
         transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
         radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)
-        no_gaps = len(cell) == len(grid) and (cell.diff() == 1).all()
         radiance = radiance if no_gaps else radiance.index_select(0, cell)
         if self._sparse is None:
             return radiance
@@ -119,8 +117,9 @@ class OperatorStack:
     def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
         """(the sparse entries of operators (A,), one after the other; (N,) the row in A of each entry)."""
         first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
-        image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
-        entry = torch.arange(len(image), device=shown.device) + (first - count.cumsum(0) + count)[image]
+        image = torch.arange(len(shown)).repeat_interleave(count)
+        entry = torch.arange(len(image)) + (first - count.cumsum(0) + count)[image]
+        entry, image = (indices.to(self.pixels.device, non_blocking=True) for indices in (entry, image))
         return SparseTransfer(*(field[entry] for field in sparse)), image
 
 
@@ -147,7 +146,7 @@ class Relighting:
     def __post_init__(self) -> None:
         self._distinct = sorted(dict.fromkeys(self.views), key=itemgetter(0))  # (object, camera) of each operator
         number = {view: index for index, view in enumerate(self._distinct)}
-        self._operator = torch.tensor([number[view] for view in self.views], device=self.backgrounds.device)
+        self._operator = torch.tensor([number[view] for view in self.views])
         self._per_stack = max(1, STACKED // self.settings.size**2)
         self._count = -(-len(self._distinct) // self._per_stack)
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
@@ -160,15 +159,16 @@ class Relighting:
 
     def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
         """The layers of images (A,), each in its light (A, size, 3); differentiable in the light."""
-        whole, number = self._count == 1, self._operator[images] // self._per_stack
-        indices = [0] if whole else number.unique().tolist()
+        images = images.cpu()  # once, since the host waits here for a GPU
+        number = self._operator[images] // self._per_stack
+        indices = number.unique().tolist()
         self._require(indices)
         for index in indices:
-            rows: Any = slice(None) if whole else torch.nonzero(number == index).squeeze(1)
-            stack, rank, behind = self._stacks[index]
-            ranks = rank[images[rows]]
-            composite = stack.radiance(light[rows], ranks) + behind[ranks]
-            yield Layer(None if whole else rows.tolist(), stack.pixels, composite)
+            within, (stack, rank, behind) = torch.nonzero(number == index).squeeze(1), self._stacks[index]
+            ranks, first, end = rank[images[within]], int(within[0]), int(within[-1]) + 1
+            rows = slice(first, end) if end - first == len(within) else within.to(light.device, non_blocking=True)
+            on_device = ranks.to(light.device, non_blocking=True)
+            yield Layer(rows, stack.pixels, stack.radiance(light[rows], ranks) + behind[on_device])
 
     def _require(self, indices: Iterable[int]) -> None:
         missing = [index for index in indices if index not in self._stacks]

@@ -211,7 +211,7 @@ class Scene:
         rest[:, where] = 0
         for rows, pixels, composite in self._relit(rest, examples):
             added = []
-            for image in range(len(composite)) if rows is None else rows:
+            for image in torch.arange(len(light) * self.views, device=light.device)[rows].tolist():
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 shown = example.object, example.cameras[view]
@@ -235,4 +235,4 @@ class Scene:
             coverage = fragments.coverage.to(radiance)[None]
             behind = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
             composite = radiance + background_term(coverage, behind, self.settings.encoding)
-            yield Layer([image], fragments.pixels, composite[None])
+            yield Layer(slice(image, image + 1), fragments.pixels, composite[None])

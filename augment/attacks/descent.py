@@ -163,20 +163,20 @@ def _descend_once(
                 images, cost_before, success_before = rendered.detach().clone(), cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (gap >= settings.margin)
-            success_at[active[reached & ~success[active]]] = step
             # The next step starts from an accepted one; with `shorten`, from none that raised the cost.
             accepted = done | (cost < position_cost[active]) if settings.shorten else torch.ones_like(done)
-            moved = active[accepted]
-            position[moved], position_gradient[moved] = candidate[moved], gradient[accepted]
-            position_cost[moved] = cost[accepted]
-            length[active[~accepted]] /= 2
             # Kept is what would be returned if this step were the last one.
-            better = torch.where(success[active], reached & (cost < kept_cost[active]), reached | accepted)
-            rows = torch.nonzero(done | better).squeeze(1)
-            kept = active[rows]
+            better = done | torch.where(success[active], reached & (cost < kept_cost[active]), reached | accepted)
+            masks = torch.stack([accepted, better, ~done]).cpu()  # at once, since the host waits here for a GPU
+            on, rows, left = (mask.nonzero()[:, 0].to(values.device, non_blocking=True) for mask in masks)
+            success_at[active] = torch.where(reached & ~success[active], step, success_at[active])
+            length[active] /= 2 - accepted[:, None].to(length)
+            moved, kept = active[on], active[rows]
+            position[moved], position_gradient[moved] = candidate[moved], gradient[on]
+            position_cost[moved] = cost[on]
             values[kept], images[kept], kept_cost[kept] = candidate[kept], rendered.detach()[rows], cost[rows]
             predicted[kept], success[kept] = classes[rows], reached[rows]
-            active = active[~done]
+            active = active[left]
             if step == settings.max_steps or not len(active):
                 break
             stepped = position[active] - length[active] * problem.step(position_gradient[active])
