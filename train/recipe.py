@@ -167,7 +167,7 @@ def _transform_each(transform: nn.Module, images: Tensor, seed: int, step: int) 
     """torchvision's transforms draw once for a whole batch, and from the global generator."""
     first = utils.rank() * len(images)
     transformed = []
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
         for index, image in enumerate(images, first):
             torch.manual_seed(stream_seed(seed, step, index, "distortion"))
             transformed.append(transform(image))
