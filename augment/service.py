@@ -231,7 +231,8 @@ class AugmentationService:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"))
         make = self._random if self.settings.arm == "random" else self._adversarial
-        return make(model, self.settings.attack.problem(scene), number)
+        shard = utils.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
+        return make(model, self.settings.attack.problem(scene), number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The values (E, D) that the next attack begins with, with `warm_start`; otherwise empty."""
@@ -246,20 +247,22 @@ class AugmentationService:
             raise InputError(f"the checkpoint continues {counts}; resume with the settings of the run")
         self._last_values = state["values"].to(self.labels.device)
 
-    def _random(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
+    def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         values = self._random_values(problem, number)
-        images = problem.images(values)
+        images = problem.images(values, shard)
         with as_found(model), self.phases("attack_classifier"):
             preprocessed_model = self.settings.attack.preprocessed_model(model)
-            logits = logits_of(preprocessed_model, images, self.settings.attack.batch_size)[:, 0]
+            logits = logits_of(preprocessed_model, images, self.settings.attack.batch_size)
+        shards = images, logits
+        images, logits = (utils.merged(rows, shard, len(self.labels), self.world_size)[:, 0] for rows in shards)
         require_known(self.labels, logits)
         success = ~is_right(logits.argmax(1), self.labels)
         diagnostics = {"attack_success": _mean(success), "loss": _mean(label_loss(logits, self.labels))}
         examples = choose_attack_examples(model, problem, values, success, self.labels)
-        return Renders(images[:, 0], self.labels, diagnostics | _changes(problem, values), examples)
+        return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
 
-    def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
-        attack, total, goal = self.settings.attack, len(problem.start), Goal(self.labels[:, None])
+    def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
+        attack, goal = self.settings.attack, Goal(self.labels[:, None])
         if self.label is not None:
             source = torch.where(self.labels < 0, NO_CLASS, self.labels)
             target = torch.where(self.labels == self.label, NO_CLASS, self.label)
@@ -267,7 +270,6 @@ class AugmentationService:
         start = self._last_values
         if start is None:
             start = self._random_values(problem, number) if self.settings.init == "random" else problem.start
-        shard = utils.shard(total, self.rank, self.world_size).to(problem.start.device)
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = descend(
@@ -283,7 +285,7 @@ class AugmentationService:
             seed=stream_seed(self.seed, number),
         )
         shards = [getattr(result, item.name) for item in fields(result)]
-        result = DescentResult(*(utils.merged(rows, shard, total, self.world_size) for rows in shards))
+        result = DescentResult(*(utils.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
         if self.settings.warm_start:
             self._last_values = result.values
         diagnostics = {

@@ -89,6 +89,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self._number: int | None = None
+        self._asked: tuple[dist.Work, Tensor] | None = None  # what all processes noted by the last question
         self._handlers: dict[int, Any] = {}  # before it was entered
 
     def __enter__(self) -> "Interruption":
@@ -103,8 +104,13 @@ class Interruption:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:
-        """Whether to stop now, since any process of the run got a signal."""
-        return bool(summed(torch.tensor(float(self._number is not None))))  # on the CPU: no device has to catch up
+        """Whether to stop now, since any process of the run got a signal before it was asked: or, of several processes,
+        which tell each other meanwhile and do not wait, before it was asked the last time."""
+        if utils.world_size() == 1:
+            return self._number is not None
+        asked, noted = self._asked, torch.tensor(float(self._number is not None))  # on the CPU: no device catches up
+        self._asked = dist.all_reduce(noted, async_op=True), noted
+        return asked is not None and asked[0].wait() and bool(asked[1])
 
     def stop(self) -> None:
         """Raise `Interrupted`, after a batch system's own handler, which may queue the job again and exit."""

@@ -230,13 +230,14 @@ class AttackProblem:
         return self.scene.render(self.conditions(values, examples), examples)
 
     @torch.no_grad()
-    def images(self, values: Tensor) -> Tensor:
-        """(E, V, 3, size, size) of values (E, D), rendered by parts, so that little memory beside theirs is used."""
-        size = self.scene.settings.size
-        images = values.new_empty(len(values), self.scene.views, 3, size, size)
-        parts = self.everything.split(self.scene.at_once)
-        for part in progress(parts, "images") if len(parts) > 1 else parts:
-            images[part] = self.render(values[part], part)
+    def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
+        """(A, V, 3, size, size) of examples (A,), by default all, with values (E, D) of all; rendered by parts, so that
+        little memory beside theirs is used."""
+        size, examples = self.scene.settings.size, self.everything if examples is None else examples
+        images = values.new_empty(len(examples), self.scene.views, 3, size, size)
+        parts = [*zip(images.split(self.scene.at_once), examples.split(self.scene.at_once), strict=True)]
+        for part, rows in progress(parts, "images") if len(parts) > 1 else parts:
+            part.copy_(self.render(values[rows], rows))
         return images
 
     def step(self, gradient: Tensor) -> Tensor:

@@ -15,7 +15,8 @@ import torch.multiprocessing as multiprocessing
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment import utils
+from augment import AugmentationService, AugmentationSettings, utils
+from augment.scene import Scene
 from train import checkpoint, loop
 from train.processes import Interrupted, Interruption, process_group
 from train.run import load_data, run
@@ -38,6 +39,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, process_group():
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "two")
+        random_arm(folder / f"random_{index}.pt")
         run_until_a_signal(folder / "config.yaml", folder / "mixed")
 
 
@@ -46,8 +48,22 @@ def run_from_file(config: Path, folder: Path) -> None:
     run(settings, load_data(settings), folder)
 
 
+def random_arm(file: Path) -> None:
+    """Write the images, the diagnostics and how many images this process renders beside those that it shows."""
+    meshes, count = [("solid:table", 0), ("solid:plate", 1)], []
+    with pytest.MonkeyPatch.context() as patch:
+        render = Scene.render
+        patch.setattr(Scene, "render", lambda self, *args: (count.append(len(args[1])), render(self, *args))[1])
+        settings = AugmentationSettings(arm="random")
+        service = AugmentationService.from_meshes(meshes, 8, settings, views=3, samples=1, rasterizer="numpy")
+        service.rank, service.world_size = utils.rank(), utils.world_size()
+        torch.manual_seed(0)
+        made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0)
+    torch.save((made.images, made.diagnostics, count[0]), file)
+
+
 def run_until_a_signal(config: Path, folder: Path) -> None:
-    """The second process alone gets it, in the second step of the second epoch."""
+    """The second process alone gets it, in the second step of the second epoch, and both stop after the third."""
     training_batches = loop.training_batches
 
     def signalled(split, batch_size, seed, now, *rest):
@@ -77,7 +93,7 @@ def runs(tiny, tmp_path_factory) -> Path:
     multiprocessing.set_forkserver_preload(once_for_both)
     multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
     state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
-    assert (state["epoch"], state["under_way"]["step"]) == (1, 2)
+    assert (state["epoch"], state["under_way"]["step"]) == (1, 3)
     with pytest.MonkeyPatch.context() as patch:
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "one")
@@ -104,6 +120,16 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
     ]
     assert files[0] == files[1]
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
+
+
+def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one(runs):
+    random_arm(runs / "random.pt")
+    images, diagnostics, count = torch.load(runs / "random.pt")
+    assert count == len(images) == 30
+    for index in range(2):
+        shared, described, part = torch.load(runs / f"random_{index}.pt")
+        torch.testing.assert_close(shared, images, rtol=0, atol=1e-6)
+        assert part == 15 and described == pytest.approx(diagnostics, rel=1e-5)
 
 
 @pytest.mark.slow
