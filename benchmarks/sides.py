@@ -1,0 +1,184 @@
+"""Three sides that share nothing: training, choosing and reporting.
+
+Settings are chosen on the second. The third is looked at once per table, and docs/reporting.csv says when.
+
+pip download --no-deps -d packages robosuite genesis-world pybullet scikit-image scikit-learn
+npm pack --pack-destination packages @pmndrs/assets
+python -m benchmarks.sides make --data DATA --sides SIDES --packages packages
+python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides SIDES
+python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
+
+DATA has meshes/, hdri/, photos/ and cifar100.npz.
+"""
+
+import argparse
+import base64
+import csv
+import hashlib
+import subprocess
+import tarfile
+import zipfile
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from benchmarks.common import write_csv
+from renderer.light.environment import read_map
+from train.checkpoint import content_hash
+from train.data import load_npz, stratified_split
+from train.device import MixedPrecision, choose_precision
+from train.lab.laboratory import write_laboratory
+from train.lab.shots import LabSettings
+from train.loop import evaluate
+from train.networks import load_run
+from train.photographs.folder import TABLE
+from train.photographs.metrics import METRICS, find_metric, metric_title
+from train.photographs.scoring import evaluate_photographs
+from train.tables import Table, format_interval
+
+LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
+LABEL, VALIDATION, BY = "orange", 0.02, {"photographs": "source"}
+LEFT_OUT = ("turntable", "studio")  # photographs of few objects, whose two halves would show the same ones
+OUTSIDE = {  # meshes from no generator of ours and in no training, in DATA or in packages
+    "orange_scan.glb": "orange", "orange_leaf.glb": "orange", "apple_scan.glb": "apple", "banana.glb": "other_banana",
+    "golf_ball.glb": "other_golf_ball", "racquetball.glb": "other_racquetball", "lemon.obj": "other_lemon",
+    "soccerball.obj": "other_soccer_ball", "wooden_sphere.obj": "other_wooden_ball",
+}  # fmt: skip
+TEXTURES = ("lemon.mtl", "lemon.png", "wood_Mat_Diffuse.png", "wooden_sphere.mtl", "soccerball.mtl", "/colors16.png")
+PICTURES = ("astronaut", "chelsea", "coffee", "hubble_deep_field", "rocket", "motorcycle_left", "china", "flower")
+CHOSEN = ("city", "studio")
+OTHERS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "lemon", "peach")
+UNSEEN = {  # directions, surroundings and materials that no training has
+    "azimuth": [-180, 180], "elevation": [5, 85], "ambient": [0.03, 0.2], "albedo": [0.04, 0.5], "walls": 0.5,
+    "roughness": [0.1, 0.9], "brightness": [0.5, 4.0],
+}  # fmt: skip
+
+
+def solids(seed: int) -> list[str]:
+    """Eight oranges and as many others of the generator, of this seed on."""
+    others = [f"solid:{name}:{seed + n // 6}" for n, name in enumerate(OTHERS)]
+    return [f"solid:{LABEL}:{seed + n}" for n in range(8)] + others
+
+
+def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
+    """The settings of pnb-lab of each part; those ending in _seen repeat another with what training has seen."""
+    maps = {path.stem: str(path) for path in [*(extra / "hdri").glob("*.npy"), *(data / "hdri").glob("*.npy")]}
+    files = {path.name: str(path) for path in [*(data / "meshes").iterdir(), *extra.rglob("*.obj")]}
+    outside = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
+    scales = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}
+    trained = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in scales.items()]
+    slides = sorted(str(path) for path in (extra / "slides").iterdir())
+    unseen = {**UNSEEN, "patterns": ["window", "leaves", "text", "slides", "window+text"], "slides": slides, "seed": 3}
+    reported, roughness = [maps[name] for name in sorted(set(maps).difference(CHOSEN))], UNSEEN["roughness"]
+    skies = {"environments": reported, "patterns": [], "setups": 5 * len(reported), "seed": 4, "roughness": roughness}
+    chosen, seen = {"meshes": solids(2001)}, {"meshes": [*trained, *solids(0)]}
+    patterns = ["solid", "stripes", "checkers", "half", "spots"]
+    return {
+        "choosing/laboratory": {**chosen, "patterns": ["gradient", "rings", "colors"], "setups": 240, "seed": 1},
+        "choosing/hdri": {**chosen, "environments": [maps[x] for x in CHOSEN], "patterns": [], "setups": 80, "seed": 2},
+        "reporting/laboratory": {"meshes": outside, **unseen, "setups": 200},
+        "reporting/hdri": {"meshes": outside, **skies},
+        "reporting/laboratory_seen_objects": {**seen, **unseen, "setups": 100},
+        "reporting/hdri_seen_objects": {**seen, **skies},
+        "reporting/laboratory_seen_patterns": {"meshes": outside, "patterns": patterns, "setups": 100, "seed": 5},
+    }  # fmt: skip
+
+
+def unpack(packages: Path, extra: Path) -> None:
+    """What the wheels and the npm package bring: meshes with their textures, pictures, environment maps."""
+    for folder in (extra / "slides", extra / "hdri"):
+        folder.mkdir(parents=True)
+    for archive in map(zipfile.ZipFile, packages.glob("*.whl")):
+        for name in archive.namelist():
+            if name.endswith((*OUTSIDE, *TEXTURES)):
+                path = Path(archive.extract(name, extra))
+                if path.suffix == ".png":
+                    Image.open(path).convert("RGB").resize((1024, 1024)).save(path)
+                elif path.suffix == ".mtl":  # a gray factor of a texture, which would be painted anew for it
+                    path.write_text(path.read_text().replace("0.800000", "1.000000"))
+            elif Path(name).stem in PICTURES and Path(name).suffix in (".png", ".jpg"):
+                (extra / "slides" / Path(name).name).write_bytes(archive.read(name))
+    for package in map(tarfile.open, packages.glob("*.tgz")):
+        for name in package.getnames():
+            if name.endswith(".exr.js"):
+                path = extra / "hdri" / Path(name).stem
+                path.write_bytes(base64.b64decode(package.extractfile(name).read().split(b"base64,")[1].split(b"'")[0]))
+                np.save(path.with_suffix(".npy"), read_map(path).clamp(min=0).numpy())  # resampled with ringing
+
+
+def divide_photographs(photos: Path, sides: Path) -> None:
+    """Links to every other photograph of a class and source, by name, on either side."""
+    rows = [row for row in csv.DictReader((photos / TABLE).open()) if row["source_tag"] not in LEFT_OUT]
+    ordered = sorted(rows, key=lambda row: (row["class"], row["source_tag"], row["path"]))
+    for offset, side in enumerate(("choosing", "reporting")):
+        write_csv(sides / side / "photographs" / TABLE, ordered[offset::2])
+        for row in ordered[offset::2]:
+            link = sides / side / "photographs" / row["path"]
+            link.parent.mkdir(exist_ok=True)
+            link.symlink_to((photos / row["path"]).resolve())
+
+
+def make(args: argparse.Namespace) -> None:
+    extra = args.sides.resolve() / "packages"
+    if not extra.exists():
+        unpack(args.packages, extra)
+        divide_photographs(args.data / "photos", args.sides)
+    for name, settings in parts(args.data.resolve(), extra).items():
+        if not args.part or name in args.part:
+            print(name, write_laboratory(LabSettings(out=str(args.sides / name), **settings)), "renders")
+
+
+def log_looks(args: argparse.Namespace, folders: list[Path]) -> None:
+    """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
+    looks, images = list(csv.DictReader(LOG.open(encoding="utf-8"))), hashlib.sha256()
+    for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
+        images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout
+    for name in args.networks:
+        weights = content_hash(load_run(name).state_dict())[:12]
+        if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights)]:
+            print(f"{name} was looked at for {args.table!r} before, on {', '.join(days)}")
+        with LOG.open("a", encoding="utf-8", newline="") as file:
+            parts = " ".join(folder.name for folder in folders)
+            row = date.today(), commit.strip(), args.table, name, weights, parts, images.hexdigest()[:12]
+            csv.writer(file, lineterminator="\n").writerow(row)
+
+
+def score(args: argparse.Namespace) -> None:
+    """A table of the side's folders, of their sources and of their objects; with DATA of its part of CIFAR-100, too."""
+    side = {"choose": "choosing", "report": "reporting"}[args.command]
+    folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
+    folders = [folder for folder in folders if not args.part or folder.name in args.part]
+    if side == "reporting":
+        log_looks(args, folders)
+    lines = []
+    for path in args.networks:
+        network = load_run(path)
+        model = MixedPrecision(network, choose_precision("auto", torch.device("cpu")))
+        for folder in folders:
+            out, by = Path("runs/sides", side, path, folder.name), BY.get(folder.name, "mesh")
+            summary = evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by)
+            for name, group in {"all": summary, **summary["by_source"], **summary.get("by_mesh", {})}.items():
+                cells = (format_interval(find_metric(group, metric)) for metric in METRICS)
+                lines.append([path, folder.name, Path(name).stem, *cells])
+        if args.data:
+            data = load_npz(str(args.data / "cifar100.npz"))
+            split = data.test if side == "reporting" else stratified_split(data.train, VALIDATION, seed=0)[1]
+            lines.append([path, "CIFAR-100", "accuracy", evaluate(model, split)["accuracy"], *[""] * 5])
+    print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("command", choices=["make", "choose", "report"])
+    parser.add_argument("networks", nargs="*", help="run folders, or names under pretrained/")
+    for option in ("--data", "--sides", "--packages"):
+        parser.add_argument(option, type=Path, required=option == "--sides")
+    parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
+    parser.add_argument("--table", default="", help="of report: the name of the table that the scores are for")
+    arguments = parser.parse_args()
+    make(arguments) if arguments.command == "make" else score(arguments)
