@@ -109,7 +109,7 @@ class SceneObject:
     @property
     def lowest(self) -> float:
         """The height of the ground that it stands on."""
-        return float(self.mesh.vertices[np.unique(self.mesh.faces), 2].min())
+        return float(self.mesh.vertices[:, 2][self.mesh.faces].min())
 
     def joined(self, others: Sequence[Mesh]) -> SceneObject:
         """The object with other meshes in its own."""

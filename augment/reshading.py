@@ -21,6 +21,7 @@ from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.rendering import view_radiance
+from renderer.shading import normals_in_sight
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
@@ -45,7 +46,7 @@ class FrozenTransport:
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
         """Add a view of the mesh, with its albedo at the samples (S, 3)."""
-        surface = Surface.of(self.mesh, fragments.to("cpu"), self._settings)
+        surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
         change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
         self.views[camera] = None
         if change is not None:
@@ -72,9 +73,10 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 
 @dataclass(eq=False, repr=False)
 class Reshading:
-    """Views of objects, which are given by their numbers; views of the unmoved objects are cached.
+    """Views of objects, which are given by their numbers.
 
-    basis: of the lights' coefficients. like: has the dtype and the device of the images.
+    basis: of the lights' coefficients. like: has the dtype and the device of the images. cached: keep the views of the
+    unmoved objects, to be used again.
     """
 
     objects: Sequence[SceneObject]
@@ -82,6 +84,7 @@ class Reshading:
     rasterizer: Rasterizer
     basis: Basis
     like: Tensor
+    cached: bool = True
 
     def __post_init__(self) -> None:
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
@@ -102,9 +105,10 @@ class Reshading:
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
         """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
         key = number, camera
-        if key not in self._views:
-            self._views[key] = self._rasterized(number, camera, self.objects[number].mesh.vertices)
-        return self._views[key]
+        view = self._views.get(key) or self._rasterized(*key, self.objects[number].mesh.vertices)
+        if self.cached:
+            self._views[key] = view
+        return view
 
     def local_view(self, number: int, camera: Camera) -> LocalLightView:
         """An unmoved object in local light."""
@@ -139,7 +143,12 @@ class Reshading:
             fragments, albedo = self._rasterized(number, camera, shape)
         if added is not None:
             albedo = painted_albedo(item.mesh, fragments, settings.encoding, item.albedo_scale, added)
-        faces = self._faces[number] if settings.normals == "smooth" else None
+        if settings.normals == "flat":
+            normals = None
+        elif vertices is None:
+            normals = torch.from_numpy(item.mesh.vertex_normals).to(self.like.device)  # which all views share
+        else:
+            normals = normals_in_sight(fragments, corners, self._faces[number])
         lights = [(part, light[where]) for where, part in parts_of(self.basis)]
 
         @cache  # called only where the scene has local lights
@@ -154,7 +163,7 @@ class Reshading:
             return frozen.radiance(camera, fragments, albedo, light)
 
         extra = indirect if settings.global_illumination else None
-        return fragments, view_radiance(fragments, corners, albedo, lights, faces, local_view, extra, positions)
+        return fragments, view_radiance(fragments, corners, albedo, lights, normals, local_view, extra, positions)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""

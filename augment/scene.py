@@ -68,9 +68,10 @@ class Scene:
 
     While the light alone changes, nothing is rasterized after the first time: the transfer operators of many views are
     stacked (`Relighting`). Where vertices move, a view is rasterized each time (`Reshading`). lights: (E, size, 3), or
-    (size, 3) for all, where attacks begin; images have their dtype and device. operators: the cache of rendered views.
-    basis: of the lights' coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered
-    images (A, V, 3, size, size) and their examples (A,); see `CameraEffects`.
+    (size, 3) for all, where attacks begin; images have their dtype and device. operators: the cache of rendered views;
+    None: each view is shown in one light only, and is shaded without an operator in less time. basis: of the lights'
+    coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered images (A, V, 3, size,
+    size) and their examples (A,); see `CameraEffects`.
 
     >>> from augment.build import build_scene
     >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
@@ -85,7 +86,7 @@ class Scene:
     lights: Tensor
     settings: ImageSettings
     rasterizer: Rasterizer
-    operators: OperatorCache = field(default_factory=OperatorCache)
+    operators: OperatorCache | None = field(default_factory=OperatorCache)
     basis: Basis = HARMONICS
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
 
@@ -117,12 +118,13 @@ class Scene:
         require_memory(renders, needed, device)
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
-        build = partial(self.operators.operators, **shading, dtype=self.lights.dtype)
+        cache = self.operators or OperatorCache()
+        build = partial(cache.operators, **shading, dtype=self.lights.dtype)
         behind = self._background.repeat_interleave(self.views)
         self._relighting = Relighting(
             self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, needed
         )
-        self._reshading = Reshading(self.objects, like=self.lights, **shading)
+        self._reshading = Reshading(self.objects, like=self.lights, cached=self.operators is not None, **shading)
 
     @classmethod
     def grid(
@@ -192,7 +194,7 @@ class Scene:
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        if conditions.vertices is not None or conditions.albedo is not None:
+        if conditions.vertices is not None or conditions.albedo is not None or self.operators is None:
             return self._reshaded(light, conditions, examples)
         if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)

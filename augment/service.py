@@ -229,8 +229,9 @@ class AugmentationService:
         """
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
-        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"))
-        make = self._random if self.settings.arm == "random" else self._adversarial
+        once = self.settings.arm == "random"
+        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), once)
+        make = self._random if once else self._adversarial
         shard = utils.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
         return make(model, self.settings.attack.problem(scene), number, shard)
 

@@ -89,17 +89,18 @@ class VariationSettings:
         return self.shift > 0 or tuple(self.scale) != UNCHANGED or self.azimuth > 0 or self.instances
 
 
-def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
     """The scene with rows drawn anew around its own; the scene itself where nothing varies.
 
-    All views of a row are moved alike. InputError where the folder of backgrounds has no readable image.
+    All views of a row are moved alike. once: they are rendered in one light only. InputError where the folder of
+    backgrounds has no readable image.
     """
     if settings.moves or settings.backgrounds is not None:
-        scene = _with_moved_rows(scene, settings, draws)
+        scene = _with_moved_rows(scene, settings, draws, once)
     return scene if settings == VariationSettings() else _with_other_light(scene, settings, draws)
 
 
-def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool) -> Scene:
     shifts = _offsets(settings.shift, len(scene), draws)
     scales = _log_uniform(settings.scale, len(scene), draws)
     angles = _offsets(math.radians(settings.azimuth), len(scene), draws)
@@ -125,7 +126,8 @@ def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Gen
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     if settings.moves:  # views that never come again are not kept on the disk
-        changed["operators"] = OperatorCache()
+        has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
+        changed["operators"] = None if once and not has_rays else OperatorCache()
     return replace(scene, examples=rows, **changed)
 
 
@@ -178,13 +180,12 @@ def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSetti
     shape = (len(scene), 1, 1)
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
-    directionals = []
-    for row, angles in zip(scene.examples, _offsets(DIRECTIONAL_ANGLE, len(scene), draws), strict=True):
-        towards = torch.from_numpy(_turned(row.cameras[0], *angles).axes()[2])
-        if scene.objects[row.object].ground is not None:
-            towards[2].abs_()
-        directionals.append(directional(towards, torch.ones(3)).to(lights))
-    lit = torch.stack(directionals) + fill.to(lights) * lights
+    angles = _offsets(DIRECTIONAL_ANGLE, len(scene), draws)
+    cameras = [_turned(row.cameras[0], *turn) for row, turn in zip(scene.examples, angles, strict=True)]
+    towards = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
+    on_table = torch.tensor([scene.objects[row.object].ground is not None for row in scene.examples])
+    towards[on_table, 2] = towards[on_table, 2].abs()
+    lit = directional(towards, torch.ones(3)).to(lights) + fill.to(lights) * lights
     return torch.where(chosen.to(lights.device), lit, lights)
 
 
@@ -258,21 +259,25 @@ def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
     """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
     random colors, at a random angle, scale and position."""
     middles = (torch.arange(size) + 0.5) / size * 2 - 1
-    points = torch.stack(torch.meshgrid(middles, middles, indexing="xy"))  # (2, size, size)
-    return torch.stack([_pattern(points, draws) for _ in range(count)])
+    points = torch.stack(torch.meshgrid(middles, middles, indexing="xy"))[:, None]  # (2, 1, size, size)
+    rows = []
+    for _ in range(count):
+        place, family = torch.rand(4, generator=draws), torch.randint(len(FAMILIES), (), generator=draws)
+        rows.append((place, family, torch.rand(5, generator=draws)))
+    places, families, colors = (torch.stack(column) for column in zip(*rows, strict=True))
+    turn, period, *shift = places.T[:, :, None, None]
+    cosine, sine = (2 * math.pi * turn).cos(), (2 * math.pi * turn).sin()
+    x, y = points / (0.25 + 0.75 * period)
+    rotated, shifts = torch.stack([cosine * x - sine * y, sine * x + cosine * y]), torch.stack(shift)
+    weight = torch.empty(count, 1, *points.shape[2:])
+    for index, mask in enumerate(FAMILIES):
+        here = torch.nonzero(families == index).squeeze(1)
+        weight[here, 0] = mask(rotated[:, here], shifts[:, here]).float()
+    first, second = _colors(colors[:, :2]), _colors(colors[:, 2:4]) * colors[:, 4:, None, None]  # down to black
+    return second + weight * (first - second)
 
 
-def _pattern(points: Tensor, draws: torch.Generator) -> Tensor:
-    angle, period, *shift = torch.rand(4, generator=draws) * torch.tensor([2 * math.pi, 1.0, 1.0, 1.0])
-    rotation = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
-    rotated = torch.einsum("ij,jyx->iyx", rotation, points)
-    family = FAMILIES[int(torch.randint(len(FAMILIES), (), generator=draws))]
-    weight = family(rotated / (0.25 + 0.75 * period), torch.stack(shift)[:, None, None]).float()
-    first, second = _color(draws), _color(draws) * torch.rand(1, generator=draws)  # the darker one down to black
-    return second[:, None, None] + weight * (first - second)[:, None, None]
-
-
-FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points and a shift, both of x and y
+FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points and a shift, both of x and y first
     lambda points, shift: ((points + shift) % 1 < 0.5)[0],  # stripes
     lambda points, shift: ((points + shift) % 1 < 0.5).sum(0) == 1,  # checkers
     lambda points, shift: ((points + shift) % 1 - 0.5).norm(dim=0) < 0.4,  # spots on a square grid, over half its area
@@ -281,9 +286,9 @@ FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points 
 )
 
 
-def _color(draws: torch.Generator) -> Tensor:
-    """(3,) linear, of any hue, from white to pure; the largest channel is 1."""
-    hue, saturation = torch.rand(2, generator=draws)
+def _colors(draws: Tensor) -> Tensor:
+    """(N, 3, 1, 1) linear, of hues and saturations (N, 2): from white to pure; the largest channel is 1."""
+    hue, saturation = draws.split(1, dim=1)
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6  # of the hexcone (Smith 1978)
     pure = ((ramps - 3).abs() - 1).clamp(0, 1)
-    return decode(1 - saturation * (1 - pure), "srgb")
+    return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]

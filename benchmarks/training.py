@@ -2,12 +2,14 @@
 
     python -m benchmarks.training speed --data cifar100.npz --csv speed.csv
     python -m benchmarks.training renders --numbers 100 1000 10000 --csv renders.csv
+    python -m benchmarks.training moved --views 2 --rounds 5 --csv moved.csv
 
 `speed` lets three contestants take turns, so that a busy machine slows all alike: `python -m train` without renders and
 with adversarial ones, each a process whose second epoch counts, and the loop that one writes with torchvision: a
 DataLoader over PIL images and torch's own dropout, in float32, in bfloat16 with channels last, and without a network.
-`renders` measures one round of attacks over the number
-of renders and of meshes, at 32 pixels per side, each in a process of its own, whose peak memory is then its own.
+`renders` measures one round of attacks over the number of renders and of meshes, at 32 pixels per side, each in a
+process of its own, whose peak memory is then its own. `moved` measures rounds of `experiment=best`, where each render
+has a view and a light of its own, shaded directly and by operators.
 """
 
 import argparse
@@ -34,11 +36,15 @@ from torch.utils.data import DataLoader
 from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
+from augment.build import build_scene
 from augment.service import TrainingAttackSettings
+from augment.utils import generator
+from augment.variation import vary
 from benchmarks.common import Row, machine, write_csv
 from train import checkpoint
 from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
+from train.settings import ExperimentSettings, compose, read_settings
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
 GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -172,6 +178,33 @@ def renders(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+def moved(options: argparse.Namespace) -> list[Row]:
+    """Milliseconds of one core per render, by rounds; what one draws and shades, without the classifier's part."""
+    torch.set_num_threads(1)
+    meshes = ["solid:orange"] * 10
+    overrides = [
+        "experiment=best",
+        "train.init_from=-",
+        "run=-",
+        f"scene.meshes={meshes}",
+        f"scene.views={options.views}",
+    ]
+    settings = read_settings(ExperimentSettings, compose("train", overrides))
+    kept = {"scene": settings.scene, "renderer": settings.renderer, "cache": None}
+    scene, rows = build_scene(list(settings.objects.values()), 32, settings.views, **kept), list[Row]()
+    for number in range(options.rounds + 1):
+        row: Row = {"round": number, "renders": len(scene)}
+        for name, once in (("direct", True), ("operators", False)):
+            start = time.process_time()
+            varied, everything = vary(scene, settings.augment.vary, generator(number), once), torch.arange(len(scene))
+            varied.render(varied.conditions(everything), everything)
+            row[f"ms_per_render_{name}"] = 1e3 * (time.process_time() - start) / len(scene)
+        rows.append(row)
+        print(row, flush=True)
+    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0] if name != "round"}
+    return [*rows[1:], {"round": "median", **median}]  # the first warms up
+
+
 def main(arguments: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
@@ -192,6 +225,11 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     command.add_argument("--numbers", nargs="+", type=int, default=[100, 1000, 10_000], help="multiples of 5 × meshes")
     command.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
     command.add_argument("--steps", type=int, default=1)
+    command.add_argument("--csv", type=Path)
+    command = commands.add_parser("moved", help="renders of a view and a light each, directly and by operators")
+    command.set_defaults(measure=moved, device="cpu")
+    command.add_argument("--views", type=int, default=20, help="of each mesh")
+    command.add_argument("--rounds", type=int, default=3)
     command.add_argument("--csv", type=Path)
     options = parser.parse_args(arguments)
     print(machine(options.device))

@@ -62,7 +62,8 @@ class Camera(ABC):
         sin_azimuth, cos_azimuth = math.sin(self.azimuth), math.cos(self.azimuth)
         back = [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar]
         right = [-sin_azimuth, cos_azimuth, 0.0]
-        return np.array([right, np.cross(back, right), back])
+        up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, back[0] * cos_azimuth + back[1] * sin_azimuth]
+        return np.array([right, up, back])
 
     def pose(self) -> np.ndarray:
         """(4, 4) the axes and, last, the position of the camera, as columns in world coordinates."""

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from renderer.errors import LARGEST, InputError, require_choice, require_range
@@ -92,6 +93,13 @@ class Mesh:
         return np.linalg.norm(doubled_area_vectors(self.vertices, self.faces), axis=1) / 2
 
     @cached_property
+    def vertex_normals(self) -> np.ndarray:
+        """(V, 3) of `renderer.normals.vertex_normals`."""
+        from renderer.normals import vertex_normals  # which imports this module
+
+        return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
+
+    @cached_property
     def one_color_per_face(self) -> bool:
         """Whether the corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
@@ -105,23 +113,31 @@ class Mesh:
     def closed(self) -> bool:
         """Whether no face is ever seen from behind: every part is watertight, its faces counter-clockwise from outside.
         Then each edge occurs once in either direction, and the faces that edges connect enclose a positive volume."""
-        from trimesh.graph import connected_component_labels  # trimesh takes half a second
+        part = _closed_parts(self.faces.astype(np.int64).tobytes())
+        first = (self.vertices - self.vertices.mean(axis=0))[self.faces[:, 0]]
+        volumes = np.einsum("fi,fi->f", first, doubled_area_vectors(self.vertices, self.faces))
+        return part is not None and bool((np.bincount(part, volumes) > 0).all())
 
-        edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        forth, back = edges @ [len(self.vertices), 1], edges @ [1, len(self.vertices)]
-        by_forth, by_back = np.argsort(forth), np.argsort(back)
-        if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
-            return False
-        neighbors = np.stack([by_forth, by_back], axis=1) // 3
-        part = connected_component_labels(neighbors, node_count=len(self.faces))
-        a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
-        return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c))) > 0).all())
+
+@lru_cache(maxsize=1)  # for instances of a solid, which have the same faces
+def _closed_parts(faces: bytes) -> np.ndarray | None:
+    """(F,) the connected part of each face (F, 3) of int64, or None where an edge is not once in either direction."""
+    from trimesh.graph import connected_component_labels  # trimesh takes half a second
+
+    corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
+    edges, count = corners[:, _EDGES].reshape(-1, 2), corners.max(initial=0) + 1
+    forth, back = edges @ [count, 1], edges @ [1, count]
+    by_forth, by_back = np.argsort(forth), np.argsort(back)
+    if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
+        return None
+    return connected_component_labels(np.stack([by_forth, by_back], axis=1) // 3, node_count=len(corners))
 
 
 def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3): normal to each face, outward for counter-clockwise ones, twice as long as the face has area."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a)
+    corners = vertices.T.take(faces.T, axis=1)  # by components, since np.cross takes several times as long
+    (ax, ay, az), (bx, by, bz) = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
@@ -186,10 +202,11 @@ def normalize(mesh: Mesh) -> Mesh:
     >>> float(np.abs(normalize(renderer.solid("bottle")).vertices).max())
     1.0
     """
-    if not mesh.face_areas().sum() > 0:
+    areas = mesh.face_areas()
+    if not areas.sum() > 0:
         raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
-    centroids = mesh.vertices[mesh.faces].mean(axis=1)
-    centered = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
+    centroids = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
+    centered = mesh.vertices - np.average(centroids, axis=0, weights=areas)
     scaled = centered / np.abs(centered).max()
     return replace(mesh, vertices=scaled.astype(np.float32).astype(np.float64))
 

@@ -51,7 +51,7 @@ def corner_normals(mesh: Mesh, normals: str, crease: float = -2.0) -> np.ndarray
     require_choice("normals", normals, NORMALS)
     flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
     if normals == "smooth":
-        smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
+        smooth = mesh.vertex_normals[mesh.faces]
         is_flat = ~smooth.any(axis=-1) | ((smooth * flat).sum(axis=-1) < crease)
         flat = np.where(is_flat[..., None], flat, smooth)
     return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])

@@ -20,7 +20,7 @@ from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBas
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.shading import radiance
+from renderer.shading import normals_in_sight, radiance
 from renderer.shapes import sphere
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
@@ -80,7 +80,7 @@ def render(
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(rasterizer), closed=mesh.closed)
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
-    smooth_faces = torch.from_numpy(mesh.faces).to(like.device) if normals == "smooth" else None
+    smooth, faces = normals == "smooth" and light is not None, torch.from_numpy(mesh.faces).to(like.device)
     moved = replace(mesh, vertices=positions)
     emitters: list[tuple[Harmonics | LocalBasis, Tensor]] = [(basis, values.to(like)) for basis, values in local]
     if light is not None:
@@ -92,10 +92,11 @@ def render(
     for view, behind in zip(views, backgrounds, strict=True):
         fragments = view.to(like.device)
         colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
-        surface = Surface.of(moved, view, settings)
+        surface = Surface(moved, view, settings)
         indirect = partial(transport.radiance, surface) if transport else None
         in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices))
-        shade = view_radiance(fragments, vertices, colors, emitters, smooth_faces, in_local_light, indirect)
+        of_vertices = normals_in_sight(fragments, vertices, faces) if smooth else None
+        shade = view_radiance(fragments, vertices, colors, emitters, of_vertices, in_local_light, indirect)
         images.append(composite(shade, fragments.coverage.to(like), fragments.pixels, behind, encoding))
     return torch.stack(images)
 
@@ -105,22 +106,23 @@ def view_radiance(
     vertices: Tensor,
     albedo: Tensor,
     lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]],
-    smooth_faces: Tensor | None,
+    normals: Tensor | None,
     in_local_light: Callable[[], LocalLightView],
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
     positions: Tensor | None = None,
 ) -> Tensor:
     """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, and local lights.
 
-    albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). indirect: of albedo and coefficients of
-    environment light, the radiance that shadows and bounces add to it. positions: of lamps that moved, (L, 3).
+    albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). normals: as for `radiance`. indirect: of
+    albedo and coefficients of environment light, the radiance that shadows and bounces add to it. positions: of lamps
+    that moved, (L, 3).
     """
     radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not lights else []
     for basis, light in lights:
         if isinstance(basis, LocalBasis):
             radiances.append(in_local_light().radiance(basis, albedo, light, positions))
             continue
-        radiances.append(radiance(fragments, vertices, light, albedo, smooth_faces))
+        radiances.append(radiance(fragments, vertices, light, albedo, normals))
         if indirect is not None:
             radiances.append(indirect(albedo, light))
     return reduce(torch.add, radiances)

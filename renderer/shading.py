@@ -51,24 +51,23 @@ def radiance(
     vertices: Float[Tensor, "V 3"],
     light: Float[Tensor, "coefficients 3"],
     albedo: Float[Tensor, "S 3"],
-    smooth_faces: Int[Tensor, "F 3"] | None = None,
+    normals: Float[Tensor, "V 3"] | None = None,
 ) -> Float[Tensor, "3 P"]:
     """Linear radiance of the P covered pixels, weighted with coverage, in the dtype of `vertices`.
 
-    light: of any degree. albedo: linear, at the S samples (`renderer.albedo`). smooth_faces: all faces of the mesh, to
-    shade with interpolated vertex normals; None: a normal per face. InputError: NaN in any of them.
+    light: of any degree. albedo: linear, at the S samples (`renderer.albedo`). normals: of the vertices, to shade with
+    them interpolated (`normals_in_sight`); None: a normal per face. InputError: NaN in any of them.
     """
     require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
     wide = torch.promote_types(vertices.dtype, torch.float32)
     albedo = albedo.to(wide)
-    if smooth_faces is None:
+    if normals is None:
         pixel, face, weights = fragments.merge(albedo)
-        normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shade = irradiance(normals, light, wide).index_select(1, face)
+        planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
+        shade = irradiance(planes, light, wide).index_select(1, face)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-        normals = smooth_normals(fragments, vertices.to(wide), smooth_faces)
-        shade = irradiance(normals.T, light, wide)
+        shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
     seen = shade * weights.T
     if fragments.samples > 1:  # a sample is a pixel otherwise
         seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
@@ -172,13 +171,17 @@ def _nonzero_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
     return nonzero, torch.stack(select_rows(unit, nonzero)) * lambertian_factors(degree).to(unit)[nonzero, None]
 
 
-def smooth_normals(
+def normals_in_sight(
     fragments: Fragments, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, "S 3"]:
-    """Vertex normals interpolated to the S samples, on the side that the camera sees; not of unit length."""
-    corners = fragments.corners.T.flatten()
+) -> Float[Tensor, "V 3"]:
+    """`vertex_normals`, in float32 or wider, of the vertices of faces in sight; the others touch no sample."""
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    near[corners] = True
-    around = faces[near.index_select(0, faces.T.flatten()).view(3, -1).any(0)]  # the others touch no vertex in sight
-    normals = vertex_normals(vertices, around).T.index_select(1, corners).unflatten(1, (3, -1))
-    return fragments.interpolate((normals * fragments.facing.T.to(normals)).permute(2, 1, 0))
+    near[fragments.corners.T.flatten()] = True
+    around = faces[near.index_select(0, faces.T.flatten()).view(3, -1).any(0)]
+    return vertex_normals(vertices.to(torch.promote_types(vertices.dtype, torch.float32)), around)
+
+
+def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
+    """Vertex normals interpolated to the S samples, on the side that the camera sees; not of unit length."""
+    at_corners = normals.T.index_select(1, fragments.corners.T.flatten()).unflatten(1, (3, -1))
+    return fragments.interpolate((at_corners * fragments.facing.T.to(normals)).permute(2, 1, 0))

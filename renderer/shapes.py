@@ -9,8 +9,10 @@ RGB in [0, 1], sRGB-encoded.
 import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from renderer.errors import require_choice, require_range
@@ -266,6 +268,7 @@ SOLIDS: dict[str, Maker] = {
 HARD_NEGATIVES: dict[str, Maker] = {make.__name__: make for make in (lemon, peach, ball, fruit)}
 
 
+@cache
 def sphere(subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (F, 3) of a unit sphere of 20·4^subdivisions faces."""
     from trimesh.creation import icosphere  # trimesh takes half a second
@@ -348,7 +351,7 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
     directions = rng.normal(size=(3, 32))
     directions *= 2 * np.pi / wavelength / np.linalg.norm(directions, axis=0)
     phases = rng.uniform(0, 2 * np.pi, 32)
-    return np.cos(points @ directions + phases).sum(axis=1) / 4
+    return torch.from_numpy(points @ directions + phases).cos().numpy().sum(axis=1) / 4  # in NumPy it takes long
 
 
 def choose(rng: np.random.Generator, *colors: tuple[float, float, float]) -> np.ndarray:

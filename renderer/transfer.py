@@ -176,7 +176,7 @@ def build_operators(
     rays = transport.rays if transport else Rays(mesh)
 
     def build(fragments: Fragments) -> TransferOperator:
-        surface, pixels = Surface.of(mesh, fragments, settings), len(fragments.pixels)
+        surface, pixels = Surface(mesh, fragments, settings), len(fragments.pixels)
         albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
         factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
         if factor is None:
@@ -223,8 +223,8 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
     """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64."""
-    fragments, smooth = surface.fragments, surface.smooth_faces is not None
-    pixels = len(fragments.pixels)
+    fragments, pixels = surface.fragments, len(surface.fragments.pixels)
+    smooth = surface.settings.normals == "smooth"
     if smooth:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
     else:

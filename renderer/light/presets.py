@@ -139,10 +139,10 @@ def ambient(color: Tensor) -> Tensor:
 
 
 def directional(direction: Tensor, color: Tensor) -> Tensor:
-    """Coefficients (49, 3) of parallel light from a unit direction (3,), of irradiance color (3,) where it meets a
-    surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
+    """Coefficients (..., 49, 3) of parallel light from a unit direction (..., 3), of irradiance color (3,) where it
+    meets a surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
     require_bounded(color=color)
-    return basis(direction, DEGREE)[:, None] * color
+    return basis(direction, DEGREE)[..., None] * color
 
 
 def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:

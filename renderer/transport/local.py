@@ -101,7 +101,7 @@ class LocalLightView:
         self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
     ):
         vertices = None if vertices is None else vertices.cpu()
-        self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
+        self._rays, self._surface = rays, Surface(mesh, fragments.to("cpu"), settings, vertices)
         self._fixed: dict[LocalBasis, LightPaths] = {}
 
     def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None = None) -> Tensor:

@@ -167,7 +167,7 @@ def _radiosity(patches: Patches, rays: Rays, settings: ImageSettings, albedo_sca
 
 def _first_bounce(patches: Patches, rays: Rays, basis: Harmonics) -> tuple[Tensor, Tensor, csr_matrix]:
     """S (N, size, 1), the irradiance of the patches from the sky; the M patches that see others; their F (M, N)."""
-    surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
+    surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
     from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
     from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
     directions = sphere(PATCH_DIRECTIONS)

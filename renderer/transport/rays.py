@@ -22,7 +22,7 @@ from renderer.image import ImageSettings
 from renderer.light.harmonics import per_degree, unit
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
-from renderer.shading import smooth_normals
+from renderer.shading import normals_in_sight, smooth_normals
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
@@ -33,19 +33,18 @@ BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 
 @dataclass(frozen=True)
 class Surface:
-    """Points and normals at the S samples of a view, in float64, as they are needed; differentiable in vertices (V, 3).
-    smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals."""
+    """Points and normals at the S samples of a view, in float64, as they are needed. moved: vertices (V, 3) in place
+    of the mesh's; points and normals are differentiable in them."""
 
+    mesh: Mesh
     fragments: Fragments
-    vertices: Tensor
-    smooth_faces: Tensor | None = None
+    settings: ImageSettings
+    moved: Tensor | None = None
 
-    @staticmethod
-    def of(mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None) -> "Surface":
-        """vertices: (V, 3), in place of the mesh's."""
-        smooth_faces = torch.from_numpy(mesh.faces) if settings.normals == "smooth" else None
-        vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
-        return Surface(fragments, vertices.double(), smooth_faces)
+    @cached_property
+    def vertices(self) -> Tensor:
+        """(V, 3)"""
+        return torch.from_numpy(self.mesh.vertices) if self.moved is None else self.moved.double()
 
     @cached_property
     def planes(self) -> Tensor:
@@ -60,9 +59,12 @@ class Surface:
     @cached_property
     def normals(self) -> Tensor:
         """(S, 3) unit normals to shade with."""
-        if self.smooth_faces is None:
+        if self.settings.normals == "flat":
             return self.planes
-        return unit(smooth_normals(self.fragments, self.vertices, self.smooth_faces).T).T
+        normals = torch.from_numpy(self.mesh.vertex_normals)  # which all views of the mesh share
+        if self.moved is not None:
+            normals = normals_in_sight(self.fragments, self.vertices, torch.from_numpy(self.mesh.faces))
+        return unit(smooth_normals(self.fragments, normals).T).T
 
     @cached_property
     def points(self) -> Tensor:

@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from torch import Tensor
 
 import augment
 from augment.build import load_background
-from augment.scene import Scene
+from augment.scene import Conditions, Scene
 from augment.utils import generator
 from augment.variation import CameraEffects, VariationSettings, draw_camera_effects, draw_patterns, vary
 from renderer.errors import InputError
@@ -105,6 +106,25 @@ def test_instances_are_drawn_of_solids_without_a_seed_only():
     for index in (0, 2):
         colors = [objects[index].mesh.corner_colors for objects in (mixed.objects, first, second)]
         assert not any(np.array_equal(a, b) for a, b in itertools.combinations(colors, 2))
+
+
+@pytest.mark.parametrize(
+    "options", [{"normals": "smooth", "encoding": "srgb"}, {"fov": 40.0, "ground": [0.5, 0.4, 0.3]}]
+)
+def test_views_that_are_shown_once_are_shaded_as_their_operators_shade_them(options):
+    """Irradiance by a polynomial of each normal, against a box filter of 31 coefficients; with the light's gradient."""
+    still, shown = built("solid:cup", "solid:orange", views=2, **options), []
+    for once in (True, False):
+        scene = vary(still, VariationSettings(shift=0.1, instances=True, azimuth=30.0), generator(0), once)
+        assert (scene.operators is None) == once
+        lights = scene.lights.clone().requires_grad_()
+        rendered = scene.render(Conditions(lights), torch.arange(len(scene)))
+        shown.append((rendered, *torch.autograd.grad(rendered.square().sum(), lights)))
+    torch.testing.assert_close(shown[0][0], shown[1][0], rtol=0, atol=2e-6)  # of float32, and sRGB's slope of 13
+    torch.testing.assert_close(shown[0][1], shown[1][1], rtol=1e-4, atol=1e-4)
+    assert vary(
+        replace(still, settings=replace(still.settings, shadows=True)), VariationSettings(shift=0.1), generator(0), True
+    ).operators
 
 
 def test_each_view_shows_another_instance_before_all_backgrounds():

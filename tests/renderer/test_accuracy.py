@@ -290,7 +290,7 @@ def with_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     """`by_operator` with one sample per pixel, which then casts all rays, whose origins are the renderer's."""
     mesh, setup = setup.mesh, replace(setup, settings=replace(setup.settings, samples=1, shadows=True))
     view, directions = setup.view(), extended(rays.sphere(rays.DIRECTIONS).numpy())
-    surface = Surface.of(mesh, setup.fragments(), setup.settings)
+    surface = Surface(mesh, setup.fragments(), setup.settings)
     points = extended((surface.points + rays.Rays(mesh).offset * surface.planes).numpy())
     lost = wide.shadow(view, points, extended(mesh.vertices[mesh.faces]), directions, setup.degree)
     return by_operator(setup, dtype, lost)

@@ -140,7 +140,7 @@ def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(na
     expected, hits = first_hits(mesh, rays(64))
     assert (expected >= 0).sum() > 1000 and (ids != expected).sum() <= 4
     same = torch.from_numpy(ids == expected)[view.sample]
-    points = Surface.of(mesh, view, settings).points
+    points = Surface(mesh, view, settings).points
     np.testing.assert_allclose(points[same], hits[view.sample[same]], rtol=0, atol=1e-12)
 
     a, b, c = mesh.vertices[view.corners].swapaxes(0, 1)

@@ -15,7 +15,7 @@ from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
 from renderer.rasterizer import choose
-from renderer.shading import irradiance, radiance
+from renderer.shading import irradiance, normals_in_sight, radiance
 from renderer.transfer import build_operators
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -30,8 +30,11 @@ GOOD = {
 }
 
 
-def lit(smooth_faces: torch.Tensor | None, name: str, spoiled: torch.Tensor) -> torch.Tensor:
-    return radiance(FRAGMENTS, **{**GOOD, name: spoiled}, smooth_faces=smooth_faces)
+def lit(name: str, spoiled: torch.Tensor, smooth: bool = False) -> torch.Tensor:
+    parts = {**GOOD, name: spoiled}
+    return radiance(
+        FRAGMENTS, **parts, normals=normals_in_sight(FRAGMENTS, parts["vertices"], FACES) if smooth else None
+    )
 
 
 def painted(corner_colors: torch.Tensor) -> Mesh:
@@ -47,17 +50,17 @@ FINITE = [  # the tensor's name, a good one, who takes it: positions and directi
     ("vertices", torch.ones(4, 3), lambda x: face_normals(x, FACES)),
     ("vertices", torch.ones(4, 3), lambda x: vertex_normals(x, FACES)),
     ("vertices", torch.ones(4, 3), lambda x: build_fragments(x.numpy(), MESH.faces, [CAMERA], SETTINGS, RASTERIZER)),
-    ("vertices", GOOD["vertices"], lambda x: lit(None, "vertices", x)),
-    ("vertices", GOOD["vertices"], lambda x: lit(FACES, "vertices", x)),
+    ("vertices", GOOD["vertices"], lambda x: lit("vertices", x)),
+    ("vertices", GOOD["vertices"], lambda x: lit("vertices", x, smooth=True)),
 ]  # fmt: skip
 BOUNDED = [  # what is multiplied with each other
     ("texture", torch.ones(2, 2, 3), lambda x: surface_albedo(MESH, FRAGMENTS, "linear", [torch.ones(3, 3, 3), x])),
     ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
     ("corner_colors", torch.ones(2, 3, 3), lambda x: surface_albedo(painted(x), FRAGMENTS, "srgb")),
     ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(3, 2), x, x.dtype)),
-    ("light", GOOD["light"], lambda x: lit(None, "light", x)),
-    ("albedo", GOOD["albedo"], lambda x: lit(None, "albedo", x)),
-    ("albedo", GOOD["albedo"], lambda x: lit(FACES, "albedo", x)),
+    ("light", GOOD["light"], lambda x: lit("light", x)),
+    ("albedo", GOOD["albedo"], lambda x: lit("albedo", x)),
+    ("albedo", GOOD["albedo"], lambda x: lit("albedo", x, smooth=True)),
     ("albedo_scale", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER, x.item())),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),

@@ -96,8 +96,8 @@ class Scene:
     def vertices(self) -> torch.Tensor:
         return torch.from_numpy(self.mesh.vertices.copy())
 
-    def all_faces(self, smooth: bool) -> torch.Tensor | None:
-        return torch.from_numpy(self.mesh.faces) if smooth else None
+    def normals(self, vertices: torch.Tensor, smooth: bool) -> torch.Tensor | None:
+        return shading.normals_in_sight(self.fragments, vertices, torch.from_numpy(self.mesh.faces)) if smooth else None
 
 
 SCENES = {
@@ -130,7 +130,7 @@ class Image:
         """What `tonemap` takes."""
         fragments = self.scene.fragments
         albedo = surface_albedo(self.scene.mesh, fragments, self.encoding, textures)
-        lit = radiance(fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
+        lit = radiance(fragments, vertices, light, albedo, self.scene.normals(vertices, self.smooth))
         background = torch.tensor([[0.3], [0.6], [0.1]], dtype=lit.dtype)
         return fragments, (lit, fragments.coverage[None].to(lit), background, self.encoding)
 
@@ -205,7 +205,7 @@ def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surfac
     scene = Scene(Mesh.plain(hull.vertices, hull.faces), size=24, samples=1)
     fragments, light = scene.fragments, draw(49, 3)
     albedo = surface_albedo(scene.mesh, fragments, "linear").double()
-    lit = radiance(fragments, scene.vertices(), light, albedo, scene.all_faces(smooth=True))
+    lit = radiance(fragments, scene.vertices(), light, albedo, scene.normals(scene.vertices(), smooth=True))
     right, up, back = scene.camera.axes()
     across = fragments.positions().numpy() * scene.camera.width / 2
     # The faces' planes are n · p = 1.

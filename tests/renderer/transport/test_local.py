@@ -121,7 +121,7 @@ def moved_image(
     """The operator of the lamps, and (3, P) of its pixels under these at other positions."""
     settings = ImageSettings(size, samples)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
-    surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
+    surface, albedo = Surface(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
     paths = unoccluded(Rays(mesh), surface, basis, positions)
     return operator(mesh, basis, size, samples), local_radiance(view, albedo, paths, powers)
 
@@ -154,7 +154,7 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences_at_fixed_visi
     rays = Rays(mesh)
 
     def image(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
-        surface = Surface.of(mesh, view, settings, vertices)
+        surface = Surface(mesh, view, settings, vertices)
         return local_radiance(view, albedo, unoccluded(rays, surface, basis), powers)
 
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
