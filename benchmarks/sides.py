@@ -29,7 +29,7 @@ from PIL import Image
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoint import content_hash
-from train.data import load_npz, stratified_split
+from train.data import held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.lab.laboratory import write_laboratory
 from train.lab.shots import LabSettings
@@ -167,7 +167,7 @@ def score(args: argparse.Namespace) -> None:
                 lines.append([path, folder.name, Path(name).stem, *cells])
         if args.data:
             data = load_npz(str(args.data / "cifar100.npz"))
-            split = data.test if side == "reporting" else stratified_split(data.train, VALIDATION, seed=0)[1]
+            split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
             lines.append([path, "CIFAR-100", "accuracy", evaluate(model, split)["accuracy"], *[""] * 5])
     print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
 
