@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks import common, lights, renderer, scene, training
+from benchmarks import common, gpu, lights, renderer, scene, training
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transport import precomputed
@@ -131,3 +131,10 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert loads == [(10, 1, 2), (20, 2, 4)]
     assert all(row["attack_seconds"] > 0 and row["ms_per_render_and_pass"] > 0 for row in rows)
     assert len(read(path)) == 2
+
+
+def test_the_questions_to_a_gpu_have_a_dry_run_on_a_cpu(monkeypatch):
+    monkeypatch.setattr(common, "BURST", 0.0)
+    tiny = ["--device=cpu", "--pixels=8", "--views=1", "--depth=10", "--rounds=1", "--steps=1"]
+    rows = gpu.main([*tiny, "--questions", "attack", "synchronizations", "memory", "agreement"])
+    assert [row["value"] for row in rows if row["question"].startswith("difference")] == [0, 0]
