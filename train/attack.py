@@ -251,8 +251,8 @@ def format_attack(
     if checks is not None:
         by_steps = ", ".join(f"{rate:.0%} in {steps}" for steps, rate in checks["success_by_steps"].items())
         text += [
-            "log-probability of the right class, less that of a target: {cost_before:.2f} before, {cost:.2f} after; "
-            "lower in {cost_fell:.0%} of examples; no gradient to begin with: {zero_gradient:.0%}".format(**checks),
+            "log-probability of the right class over all views (less a target's): {cost_before:.2f} before, {cost:.2f} "
+            "after; lower in {cost_fell:.0%}, without a gradient at the start in {zero_gradient:.0%}".format(**checks),
             f"random changes of the same size, one for each step, succeed on {checks['random_search']:.0%}; "
             f"attacks of more steps: {by_steps}",
             *(f"warning: {warning}" for warning in warnings(checks)),
