@@ -114,15 +114,15 @@ class Scene:
         self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
         renders = f"{len(views)} renders of {size} pixels per side (meshes × views × backgrounds)"
         kept = KEPT * len(self) + RENDERED[self.camera_effects is not None] * min(len(self), self.at_once)
-        needed = self.lights.element_size() * (kept * self.views * size**2 + LIGHTS * self.lights.numel())
-        require_memory(renders, needed, device)
+        self.attack_bytes = self.lights.element_size() * (kept * self.views * size**2 + LIGHTS * self.lights.numel())
+        require_memory(renders, self.attack_bytes, device)
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
         cache = self.operators or OperatorCache()
         build = partial(cache.operators, **shading, dtype=self.lights.dtype)
         behind = self._background.repeat_interleave(self.views)
         self._relighting = Relighting(
-            self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, needed
+            self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, self.attack_bytes
         )
         self._reshading = Reshading(self.objects, like=self.lights, cached=self.operators is not None, **shading)
 

@@ -163,7 +163,9 @@ def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     row = {"renders": renders, "meshes": meshes, "views": views * meshes, "steps": steps}
     row |= {"precompute_seconds": built - start, "attack_seconds": attack}
     row["ms_per_render_and_pass"] = 1e3 * attack / (renders * (steps + 1))
-    return row | {"memory_mb": (peak_memory() - before) / 1e6}
+    operators = sum(stack.transfer.nbytes for stack in service.scene.stacks)
+    estimated = service.scene.attack_bytes + operators
+    return row | {"memory_mb": (peak_memory() - before) / 1e6, "estimated_mb": estimated / 1e6}
 
 
 def renders(options: argparse.Namespace) -> list[Row]:

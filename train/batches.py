@@ -76,7 +76,7 @@ def training_batches(
     order, shifts, flipped = (draws[..., first:, columns].flatten(-2) for draws in (order, shifts, flipped))
     rendered, device = order >= len(data), split.images.device
     places = [part.nonzero().squeeze(1).to(device) for part in rendered.split(at_once)]
-    draws = data[order.clamp(max=len(data) - 1)], order - len(data), shifts, flipped, rendered
+    draws = [data[order.clamp(max=len(data) - 1)], order - len(data), shifts, flipped, rendered]
     draws = [part.to(device) for part in draws]
     for begin, place in zip(range(0, len(order), at_once), places, strict=False):
         row, number, shift, flip, is_render = (part[..., begin : begin + at_once] for part in draws)
