@@ -80,28 +80,18 @@ def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last
 
 @pytest.mark.parametrize("flips", ["random", "alternating"])
 @pytest.mark.parametrize("images_at_once", [1, 20])
-def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, images_at_once):
-    split = numbered(noise(50, 3, 8, 8))
-    whole = list(training_batches(split, 8, 0, epoch_round(50, 1), flips))
+def test_an_epoch_goes_on_from_any_batch_as_if_one_split_held_its_rows_and_renders(monkeypatch, flips, images_at_once):
+    split, rows = Split(noise(90, 3, 8, 8), torch.arange(90)), torch.arange(0, 90, 2)
+    renders = Split(255 - noise(5, 3, 8, 8), torch.arange(-5, 0))
+    mixed = numbered(torch.cat([split.images[rows], renders.images]))
+    whole = list(training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
     monkeypatch.setattr(batches, "CHUNK_BYTES", images_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
-        rest = list(training_batches(split, 8, 0, epoch_round(50, 1), flips, first))
+        rest = list(training_batches(TrainingImages(split, rows, renders), 8, 0, epoch_round(50, 1), flips, first))
         assert len(rest) == len(whole) - first
-        for batch, expected in zip(rest, whole[first:], strict=True):
-            assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
-
-
-def test_rows_and_renders_are_drawn_as_from_one_split_that_holds_them_in_this_order(monkeypatch):
-    split, rows = Split(noise(40, 3, 16, 16), torch.arange(40)), torch.tensor([3, 5, 8, 21, 38])
-    renders = Split(255 - noise(2, 3, 16, 16), torch.tensor([-1, 77]))
-    mixed = numbered(torch.cat([split.images[rows], renders.images]))
-    expected = list(training_batches(mixed, 3, 0, epoch_round(7, 0)))
-    monkeypatch.setattr(batches, "CHUNK_BYTES", 4 * 3 * 16 * 16)
-    drawn = training_batches(TrainingImages(split, rows, renders), 3, 0, epoch_round(7, 0))
-    for (images, labels, rendered), (whole, numbers, _) in zip(drawn, expected, strict=True):
-        assert torch.equal(images, whole) and torch.equal(labels, torch.cat([rows, renders.labels])[numbers])
-        assert torch.equal(rendered, numbers >= 5)
-    assert torch.equal(split.images, noise(40, 3, 16, 16))
+        for (images, labels, rendered), (expected, numbers, _) in zip(rest, whole[first:], strict=True):
+            assert torch.equal(images, expected) and torch.equal(rendered, numbers >= 45)
+            assert torch.equal(labels, torch.cat([rows, renders.labels])[numbers])
 
 
 def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
