@@ -61,8 +61,9 @@ class Surface:
         """(S, 3) unit normals to shade with."""
         if self.settings.normals == "flat":
             return self.planes
-        normals = torch.from_numpy(self.mesh.vertex_normals)  # which all views of the mesh share
-        if self.moved is not None:
+        if self.moved is None:
+            normals = torch.from_numpy(self.mesh.vertex_normals)  # which all views of the mesh share
+        else:
             normals = normals_in_sight(self.fragments, self.vertices, torch.from_numpy(self.mesh.faces))
         return unit(smooth_normals(self.fragments, normals).T).T
 
