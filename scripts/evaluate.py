@@ -17,8 +17,8 @@ from renderer.errors import InputError, require_choice
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
 from train.networks import load_run, published
+from train.photographs import scoring
 from train.photographs.metrics import GROUPS
-from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder import sole_writer
 
 
@@ -31,6 +31,8 @@ class Settings:
     photos: str = MISSING  # a folder of class folders, or of images of `label`; pretrained/laboratory is installed
     label: str = "orange"  # the class whose recall and false positives count, and that of a flat folder's images
     out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
+    false_positive_rate: float | None = None  # for a threshold on the log-odds of `label`, chosen on calibrate
+    calibrate: str | None = None  # a folder like photos; null: the threshold that a published network carries, if any
     by: str = "source"  # source | mesh: the groups of the tables, columns of photos.csv
     skip_unreadable: bool = False  # skip broken photographs
     precision: str = "auto"  # auto (bfloat16 where the hardware has it) | bfloat16 | float32
@@ -38,6 +40,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_choice("by", self.by, GROUPS)
+        scoring.require_calibration(self.false_positive_rate, self.calibrate)
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
         if self.classifier and self.model:
@@ -54,11 +57,16 @@ def main(settings: Settings) -> None:
     network.label(settings.label)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
-    photos, label, skip = published(Path(settings.photos)), settings.label, settings.skip_unreadable
+    label, point, options = settings.label, network.operating_point, (network.size, settings.skip_unreadable, device)
     with sole_writer("out", out):
-        arguments = model, network.classes, photos, label, out, network.size, skip, device
-        summary = evaluate_photographs(*arguments, settings.by)
-    print(f"{format_summary(summary, settings.by)}\n\ntable, scores and image: {out}")
+        if settings.calibrate and settings.false_positive_rate:
+            folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
+            scored = scoring.predict_folder(model, network.classes, folder, label, *options)
+            point = scoring.choose_operating_point(scored, folder, label, rate)
+        point = point if point and point.label == label else None
+        photos, by = published(Path(settings.photos)), settings.by
+        summary = scoring.evaluate_photographs(model, network.classes, photos, label, out, *options, by, point)
+    print(f"{scoring.format_summary(summary, settings.by)}\n\ntable, scores and image: {out}")
 
 
 if __name__ == "__main__":

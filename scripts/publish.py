@@ -1,10 +1,11 @@
 """Write a run's network as half-precision safetensors: pnb-publish run=runs/a out=published/a
 
-The file's metadata holds the run's settings and scores as JSON.
+The file's metadata holds the run's settings and scores as JSON. A published network gets an operating point by
+pnb-publish run=published/a out=published/a calibrate=lab false_positive_rate=0.05
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,23 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 
 from omegaconf import MISSING
 
-from train import checkpoint
 from train.errors import writable_folder
-from train.networks import PUBLISHED, PYTHON, load_run, publish
+from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish, published
+from train.photographs import scoring
 from train.report.summary import summarize
 
 
 @dataclass
 class Settings:
-    run: str = MISSING  # a finished run folder
+    run: str = MISSING  # a finished run folder, or a published network
     out: str = MISSING  # the folder of the weights
+    false_positive_rate: float | None = None  # for a threshold on the log-odds of `label`, chosen on calibrate
+    calibrate: str | None = None  # a folder of photographs as for pnb-evaluate; null: the threshold it has, if any
+    label: str = "orange"  # the class of the threshold
+    model: str | None = None  # python:package.module:function, if such a function made the run's network
+
+    def __post_init__(self) -> None:
+        scoring.require_calibration(self.false_positive_rate, self.calibrate)
 
 
 def without_folders(value: Any) -> Any:
@@ -39,18 +47,23 @@ def without_folders(value: Any) -> Any:
 
 @cli.command()
 def main(settings: Settings) -> None:
-    out, run = writable_folder(settings.out, "out"), summarize(Path(settings.run))
-    state = checkpoint.load(run.folder / checkpoint.BEST)
-    if not str(state["architecture"].get("name")).startswith(PYTHON):  # only its user runs that code
-        load_run(run.folder / checkpoint.BEST)  # or InputError, since nobody could use it
+    out, given = writable_folder(settings.out, "out"), Path(settings.run)
+    path, state = load_selected(given)
+    if path.suffix != Path(PUBLISHED).suffix:  # a run of pnb-train
+        run = summarize(given)
+        state["settings"], state["versions"] = without_folders(run.settings), dict(run.config.versions)
+        state["scores"] = {**run.scores, **run.photographs}
+    if settings.calibrate or not str(state["architecture"].get("name")).startswith(PYTHON):  # its user runs that code
+        network = load_run(path, model=settings.model)  # or InputError, since nobody could use it
+    if settings.calibrate and settings.false_positive_rate:
+        network.half().float()  # as it is published
+        folder, label = published(Path(settings.calibrate)), settings.label
+        scored = scoring.predict_folder(network, network.classes, folder, label, network.size, False, "cpu")
+        point = scoring.choose_operating_point(scored, folder, label, settings.false_positive_rate)
+        state["operating_point"] = asdict(point)
+        print(f"threshold {point.threshold:.3f} for {scoring.describe_point(state['operating_point'])}")
     out.mkdir(parents=True, exist_ok=True)
-    publish(
-        out / PUBLISHED,
-        state,
-        settings=without_folders(run.settings),
-        scores={**run.scores, **run.photographs},
-        versions=dict(run.config.versions),
-    )
+    publish(out / PUBLISHED, state)
     print(f"published in {settings.out}")
 
 

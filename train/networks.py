@@ -15,12 +15,12 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import utils
-from augment.classifiers import SOURCES, Classifier
+from augment.classifiers import SOURCES, Classifier, OperatingPoint
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
-from train.checkpoint import BEST, VERSION, checked, load
+from train.checkpoint import BEST, VERSION, checked, load, write_whole
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
@@ -28,6 +28,7 @@ DROPOUT_LEVELS = 2**16
 Color = Sequence[float]  # (3,) RGB
 MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are not given
 PUBLISHED = "model.safetensors"
+META = ("architecture", "settings", "scores", "versions", "operating_point")  # of a published network's file
 FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
 _OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
@@ -206,7 +207,11 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
         size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
         network = build_network(classes, size, **shape)
         network.load_state_dict(state["model"])
-        return Classifier(network, size, classes, f"run:{run}")
+        classifier = Classifier(network, size, classes, f"run:{run}")
+        if point := state.get("operating_point"):
+            classifier.operating_point = OperatingPoint(**point)
+            classifier.label(classifier.operating_point.label)  # or InputError
+        return classifier
 
 
 SOURCES["run:"] = load_run  # a classifier's name in the commands
@@ -256,12 +261,11 @@ def start_from(network: nn.Module, description: Mapping[str, Any], path: Path, s
         network.load_state_dict(state["model"])
 
 
-def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:
+def publish(path: Path, state: Mapping[str, Any]) -> None:
     """Write a checkpoint's network as half-precision safetensors, with its architecture and other facts as metadata."""
-    model, facts = state["model"], {"architecture": state["architecture"], **facts}
+    model, metadata = state["model"], {key: json.dumps(state[key], ensure_ascii=False) for key in META if key in state}
     weights = {name: value.half().contiguous() if value.is_floating_point() else value for name, value in model.items()}
-    metadata = {name: json.dumps(value, ensure_ascii=False) for name, value in facts.items()}
-    path.write_bytes(safetensors.torch.save(weights, metadata))
+    write_whole(path, safetensors.torch.save(weights, metadata))
 
 
 def _load_published(path: Path) -> dict[str, Any]:

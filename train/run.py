@@ -87,7 +87,7 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
         for name, summary in summaries.items():
             console.info("%s: %s", name, format_summary(summary))
-            metrics = {metric: find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
+            metrics = {metric: find_metric(summary, metric).get("value") for metric in ("top5", *METRICS)}
             scores |= {f"{name}/{metric}": value for metric, value in metrics.items() if value is not None}
         if log:
             log.scalars(scores)

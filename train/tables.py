@@ -19,6 +19,13 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[object]]
 
+    @property
+    def known(self) -> "Table":
+        """Without the columns in which every cell is unknown, "-"."""
+        kept = [index for index in range(len(self.header)) if any(row[index] != "-" for row in self.rows)]
+        rows = [[row[index] for index in kept] for row in self.rows]
+        return Table(self.title, [self.header[index] for index in kept], rows)
+
     def __str__(self) -> str:
         room = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from augment.classifiers.adapter import Classifier, load_python
+from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
 from augment.classifiers.imagenet import (
     SQUEEZENET_CAFFE,
     load_efficientnet_lite,
@@ -17,7 +17,7 @@ from augment.classifiers.imagenet import (
 from augment.utils import announced
 from renderer.errors import InputError
 
-__all__ = ["SOURCES", "Classifier", "load_classifier"]
+__all__ = ["SOURCES", "Classifier", "OperatingPoint", "load_classifier"]
 
 # A name that ends in a colon is followed by the source's own name for the model, the loader's first argument.
 # `train.networks` adds `run:`, the networks that this project trains.

@@ -10,17 +10,35 @@ import importlib
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor, nn
 
+from augment.losses import log_odds
 from renderer.errors import InputError, in_one_line, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """A threshold on the log-odds of the class `label`: images above it are taken for the class.
+
+    It is the lowest that at most the fraction `false_positive_rate` of the `negatives` images of other things exceed in
+    a folder of this name, whose `images` have this hash.
+    """
+
+    label: str
+    threshold: float
+    false_positive_rate: float
+    folder: str
+    images: str
+    negatives: int
 
 
 class Classifier(nn.Module):
@@ -28,7 +46,10 @@ class Classifier(nn.Module):
 
     name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
     the C names, each once. The parameters need no gradient and the mode stays eval, also after `train()`.
+    operating_point: of a published network that carries one, for `detect`.
     """
+
+    operating_point: OperatingPoint | None = None
 
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
@@ -66,6 +87,15 @@ class Classifier(nn.Module):
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
             raise InputError(f"{name} returned logits without a gradient: compute them in torch")
         return logits
+
+    def detect(self, images: Float[Tensor, "N 3 size size"]) -> Bool[Tensor, " N"]:
+        """Whether images, RGB in [0, 1], show the class of the operating point, by its threshold instead of argmax.
+
+        InputError without an operating point, and as of `forward`.
+        """
+        if (point := self.operating_point) is None:
+            raise InputError(f"classifier={self.name} has no operating point: publish it with pnb-publish calibrate=")
+        return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
     def train(self, mode: bool = True) -> Self:
         """Stays in eval mode: running batch statistics, no dropout."""

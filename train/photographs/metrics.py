@@ -13,8 +13,10 @@ from train.tables import fraction
 
 RATES = ("0.05", "0.10", "0.20")  # the false positive rates at which recall is reported
 RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
-METRICS = ("recall", "false_positive_rate", *RANKED)  # the main metrics, by their place in a summary or its sources
-TITLES = {"recall": "recall", "false_positive_rate": "FPR", "auc": "AUC"}
+AT_THRESHOLD = ("recall_at_threshold", "false_positive_rate_at_threshold")  # of an operating point, where there is one
+METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD)  # by their place in a summary or its sources
+TITLES = {"recall": "recall", "top5": "top-5", "false_positive_rate": "FPR", "auc": "AUC"}
+TITLES |= {"recall_at_threshold": "recall at threshold", "false_positive_rate_at_threshold": "FPR at threshold"}
 OVERALL = ""  # in the place of a source: all images
 GROUPS = ("source", "mesh")
 
@@ -150,13 +152,15 @@ def resampled(auc: Mapping[str, Any]) -> str:
 class Pool:
     """Predictions that are scored together: of the class under study, `label`, and of everything else.
 
-    ranked: the positives and the negatives of the ROC curve, which may be of other sources or meshes.
+    ranked: the positives and the negatives of the ROC curve, which may be of other sources or meshes. threshold: on the
+    log-odds, for AT_THRESHOLD.
     """
 
     label: str
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
     ranked: tuple[Sequence[Prediction], Sequence[Prediction]]
+    threshold: float | None = None
 
     @property
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
@@ -166,23 +170,27 @@ class Pool:
 
     @property
     def outcomes(self) -> dict[str, tuple[Sequence[Prediction], list[bool]]]:
-        """The images of recall, top5 and false_positive_rate, and whether each counts."""
+        """The images of recall, top5, false_positive_rate and AT_THRESHOLD, and whether each counts."""
         ranks = [item.true_rank or np.inf for item in self.positives]
-        return {
+        outcomes = {
             "recall": (self.positives, [rank == 1 for rank in ranks]),
             "top5": (self.positives, [rank <= 5 for rank in ranks]),
             "false_positive_rate": (self.negatives, [item.predicted == self.label for item in self.negatives]),
         }
+        if self.threshold is not None:
+            for name, group in zip(AT_THRESHOLD, (self.positives, self.negatives), strict=True):
+                outcomes[name] = group, [item.log_odds > self.threshold for item in group]
+        return outcomes
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
-        """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
+        """Fractions of `outcomes`, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
         counted = {name: fraction(sum(hits), len(hits)) for name, (_, hits) in self.outcomes.items()}
         return counted | roc_metrics(*self.scores, *map(_objects, self.ranked))
 
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
-        """METRICS and top5 in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
+        """METRICS and `outcomes` in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
         replicates = {
             name: bootstrap(partial(_weighted_mean, np.array(hits)), _objects(group))
             for name, (group, hits) in self.outcomes.items()
@@ -205,23 +213,25 @@ def _objects(predictions: Sequence[Prediction]) -> np.ndarray:
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
-def pool(predictions: Sequence[Prediction], label: str) -> Pool:
+def pool(predictions: Sequence[Prediction], label: str, threshold: float | None = None) -> Pool:
     """All predictions, the positives ranked against all negatives."""
     positives = [item for item in predictions if item.photograph.label == label]
     negatives = [item for item in predictions if item.photograph.label != label]
-    return Pool(label, positives, negatives, (positives, negatives))
+    return Pool(label, positives, negatives, (positives, negatives), threshold)
 
 
-def pool_by(predictions: Sequence[Prediction], label: str, by: str, exclude: Sequence[str] = ()) -> dict[str, Pool]:
+def pool_by(
+    predictions: Sequence[Prediction], label: str, by: str, exclude: Sequence[str] = (), threshold: float | None = None
+) -> dict[str, Pool]:
     """OVERALL, without the sources to exclude, and a pool per source or, of what is in OVERALL, per mesh.
 
     A source's positives are ranked against its own negatives and those of the sources that the positives name as hard
     negatives, as far as those could be read; a mesh's images against all of the other kind.
     """
-    whole = pool([item for item in predictions if item.photograph.source not in exclude], label)
+    whole = pool([item for item in predictions if item.photograph.source not in exclude], label, threshold)
     pools, items = {OVERALL: whole}, predictions if by == "source" else [*whole.positives, *whole.negatives]
     for name in sorted({getattr(item.photograph, by) for item in items} - {None}):
-        group = pool([item for item in items if getattr(item.photograph, by) == name], label)
+        group = pool([item for item in items if getattr(item.photograph, by) == name], label, threshold)
         ranked = group.positives or whole.positives, group.negatives or whole.negatives
         if by == "source":
             named = {source for item in group.positives for source in item.photograph.hard_negatives} - {name}

@@ -40,8 +40,11 @@ class Prediction:
 def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str | torch.device) -> torch.Tensor:
     """The model's logits, (N, classes) float32 on the CPU, for images (N, 3, H, W) uint8 sRGB.
 
-    A module is called in eval mode and left in its own. InputError: logits of another shape, NaN or infinite.
+    A module is called in eval mode and left in its own. InputError: logits of another shape, NaN or infinite, or of one
+    class.
     """
+    if classes < 2:
+        raise InputError("the model has a single class, whose odds are infinite: evaluate one with other classes, too")
     with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
         batches = [model(to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
         logits = torch.cat(batches).float().cpu()
@@ -73,15 +76,19 @@ def predict(
     return predictions
 
 
-def write_predictions(path: Path, predictions: Sequence[Prediction], label: str) -> None:
-    """Write a row per photograph; None becomes an empty cell."""
+def write_predictions(
+    path: Path, predictions: Sequence[Prediction], label: str, threshold: float | None = None
+) -> None:
+    """Write a row per photograph, with whether it exceeds a threshold on the log-odds; None becomes an empty cell."""
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *_columns(label)])
+        columns = [*_columns(label), f"{label}_above_threshold"]
+        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
         for prediction in predictions:
             photograph, *cells = vars(prediction).values()
-            path, label, source, hard_negatives, mesh = vars(photograph).values()
-            writer.writerow([path, label, source, SEPARATOR.join(hard_negatives), mesh, *cells])
+            names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
+            above = None if threshold is None else prediction.log_odds > threshold
+            writer.writerow([*names.values(), *cells, above])
 
 
 def read_predictions(path: Path, label: str) -> list[Prediction]:

@@ -2,24 +2,53 @@
 
 import hashlib
 import json
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
+from augment.classifiers import OperatingPoint
 from augment.utils import progress
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
-from train.photographs.metrics import OVERALL, RANKED, Pool, find_metric, metric_title, pool_by, resampled
+from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by, resampled, thresholds
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
 from train.photographs.sheet import contact_sheet, write_roc
 from train.tables import Table, format_fraction, format_interval, fraction
 
 SUMMARY = "summary.json"
 WRONG_CLASSES = 5  # the most common ones, which are named
-COUNTED, BY_CLASS = ("recall", "top5", "false_positive_rate"), ("recall", "top5", "predicted_label")
+COUNTED = ("recall", "top5", "false_positive_rate", "recall_at_threshold", "false_positive_rate_at_threshold")
+BY_CLASS = ("recall", "top5", "predicted_label")
+
+
+class Scored(NamedTuple):
+    """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all."""
+
+    predictions: list[Prediction]
+    images: torch.Tensor
+    unreadable: list[str]
+    hash: str
+
+
+def predict_folder(
+    model: Model, classes: Sequence[str], folder: Path, label: str, size: int, skip: bool, device: str | torch.device
+) -> Scored:
+    """The predictions for a folder's photographs; arguments and errors as of `evaluate_photographs`."""
+    found = find_photographs(folder, classes, label)
+    photographs, images, unreadable = load_photographs(folder, found, size, skip)
+    logits = compute_logits(model, images, len(classes), device)
+    digest = hashlib.sha256(label.encode())
+    for photograph in photographs:
+        content = (folder / photograph.path).read_bytes()
+        digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
+    return Scored(predict(photographs, logits, classes, label), images, unreadable, digest.hexdigest())
 
 
 def evaluate_photographs(
@@ -32,6 +61,7 @@ def evaluate_photographs(
     skip_unreadable: bool = False,
     device: str | torch.device = "cpu",
     by: str = "source",
+    point: OperatingPoint | None = None,
 ) -> dict[str, Any]:
     """Evaluate the model on every photograph of a folder; write the results, and return the summary.
 
@@ -46,6 +76,8 @@ def evaluate_photographs(
     - recall, top5: of the photographs of class `label`, and their most common wrong classes, most_common_wrong;
     - false_positive_rate: the fraction of all others that are predicted as `label`;
     - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`roc_metrics`);
+    - recall_at_threshold, false_positive_rate_at_threshold: at an operating point of `label`, where one is given; and
+      operating_point, its fields, and in_sample: whether it was chosen on these very images;
     - by_source, and by_mesh with by="mesh": n, and the metrics above of each known source or mesh (`pool_by`);
     - by_class: n, recall, top5, predicted_label (the fraction predicted as `label`) and most_common_wrong.
 
@@ -54,32 +86,32 @@ def evaluate_photographs(
     `compute_logits`, for `out` inside `folder`, and for by="mesh" where no mesh is known.
     """
     require_outside(out, folder)
-    found = find_photographs(folder, classes, label)
-    if by == "mesh" and not any(photograph.mesh for photograph in found):
+    scored = predict_folder(model, classes, folder, label, size, skip_unreadable, device)
+    predictions, images, unreadable, images_hash = scored
+    if by == "mesh" and not any(item.photograph.mesh for item in predictions):
         raise InputError(f"by=mesh: {folder} has no {TABLE} with a column mesh: leave it out")
-    photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
-    logits = compute_logits(model, images, len(classes), device)
-    predictions = predict(photographs, logits, classes, label)
-    pools = {key: pool_by(predictions, label, key) for key in dict.fromkeys(("source", by))}
+    threshold = point.threshold if point else None
+    pools = {key: pool_by(predictions, label, key, threshold=threshold) for key in dict.fromkeys(("source", by))}
     whole = pools["source"][OVERALL]
     metrics = {
-        f"by_{key}": {name: _pool_metrics(group) for name, group in progress(groups.items(), "intervals") if name}
+        f"by_{key}": {
+            name: {"n": len(group.positives) + len(group.negatives), **group.metrics}
+            for name, group in progress(groups.items(), "intervals")
+            if name != OVERALL
+        }
         for key, groups in pools.items()
     }
     others = [str(path) for path in left_out(folder)]
-    images_hash = hashlib.sha256(label.encode())
-    for photograph in photographs:
-        content = (folder / photograph.path).read_bytes()
-        images_hash.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
-
+    chosen = {"operating_point": asdict(point) | {"in_sample": point.images == images_hash}} if point else {}
     labels = sorted({item.photograph.label for item in predictions})
     by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
     counts = {"positives": len(whole.positives), "negatives": len(whole.negatives)}
     summary = {
         "label": label,
         "size": size,
-        "images": images_hash.hexdigest(),
+        "images": images_hash,
         **whole.metrics,
+        **chosen,
         "n": {"photographs": len(predictions), **counts, "unreadable": len(unreadable), "left_out": len(others)},
         "most_common_wrong": _most_common_wrong(whole.positives),
         **metrics,
@@ -89,7 +121,7 @@ def evaluate_photographs(
     }
 
     out.mkdir(parents=True, exist_ok=True)
-    write_predictions(out / PREDICTIONS, predictions, label)
+    write_predictions(out / PREDICTIONS, predictions, label, threshold)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     contact_sheet(predictions, images, label).save(out / "contact_sheet.png")
@@ -98,8 +130,32 @@ def evaluate_photographs(
     return summary
 
 
-def _pool_metrics(group: Pool) -> dict[str, Any]:
-    return {"n": len(group.positives) + len(group.negatives), **group.metrics}
+def choose_operating_point(scored: Scored, folder: Path, label: str, rate: float) -> OperatingPoint:
+    """The lowest of the log-odds of `label` that at most the fraction `rate` of a folder's other images exceed.
+
+    An image that ties with it does not exceed it. InputError for fewer than 1 / rate images of other things.
+    """
+    negatives, exact = pool_by(scored.predictions, label, "source")[OVERALL].scores[1], Fraction(str(rate))
+    if len(negatives) * exact < 1:
+        fault = f"calibrate={folder} has {len(negatives)} images of other things than {label}"
+        raise InputError(f"{fault}: give at least {math.ceil(1 / exact)} for false_positive_rate={rate}")
+    threshold = float(thresholds(negatives, np.ones(len(negatives), int), [str(rate)])[0])
+    return OperatingPoint(label, threshold, rate, folder.resolve().name, scored.hash, len(negatives))
+
+
+def require_calibration(rate: float | None, calibrate: str | None) -> None:
+    """InputError for one of the keys false_positive_rate and calibrate without the other, or a rate beyond (0, 1)."""
+    if (rate is None) != (calibrate is None):
+        raise InputError("give false_positive_rate=RATE and calibrate=FOLDER together, or neither")
+    require_range("false_positive_rate", rate, 1e-6, 1 - 1e-6)
+
+
+def describe_point(point: Mapping[str, Any]) -> str:
+    """How the `operating_point` of a summary was chosen."""
+    where = (
+        "these very images, in-sample" if point.get("in_sample") else f"{point['folder']}, {point['negatives']} others"
+    )
+    return f"{point['false_positive_rate']:.1%} FPR on {where}"
 
 
 def _class_metrics(predictions: Sequence[Prediction], label: str) -> dict[str, Any]:
@@ -125,7 +181,8 @@ def format_summary(summary: dict[str, Any], by: str = "source") -> str:
     over = resampled(auc := summary["auc"])
     if over != "images":
         over += f" ({auc['positive_objects']} of {label} and {auc['negative_objects']} others)"
-    counts = [[name, *(format_fraction(metrics[key]) for key in COUNTED)] for name, metrics in pools.items()]
+    counted = [key for key in COUNTED if key in summary]
+    counts = [[name, *(format_fraction(metrics[key]) for key in counted)] for name, metrics in pools.items()]
     ranked = [[name, *(format_interval(find_metric(metrics, k)) for k in RANKED)] for name, metrics in pools.items()]
     by_class = []
     for name, metrics in summary["by_class"].items():
@@ -133,10 +190,12 @@ def format_summary(summary: dict[str, Any], by: str = "source") -> str:
         by_class.append([name, *(format_fraction(metrics[key]) for key in BY_CLASS), wrong])
     paragraphs: list[object] = [
         f"{n['positives']} images of {label}, {n['negatives']} of other things",
-        Table("95 % intervals over images", ["", "recall", "top-5", "FPR"], counts),
+        Table("95 % intervals over images", ["", *map(metric_title, counted)], counts),
         Table(f"95 % intervals over {over}", ["", *map(metric_title, RANKED)], ranked),
         Table("", ["class", "recall", "top-5", f"predicted {label}", "most common wrong classes"], by_class),
     ]
+    if point := summary.get("operating_point"):
+        paragraphs.append(f"threshold {point['threshold']:.3f} on the log-odds, chosen for {describe_point(point)}")
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
     if files:

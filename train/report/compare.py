@@ -40,7 +40,8 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
             path, label = run.folder / name / PREDICTIONS, run.photographs[name]["label"]
             if path.is_file():
                 predictions = read_predictions(path, label)
-                pools = metrics.pool_by(predictions, label, by, exclude)
+                point = run.photographs[name]["operating_point"] or {}
+                pools = metrics.pool_by(predictions, label, by, exclude, point.get("threshold"))
                 arms.setdefault(arm, []).append(Evaluation(run, pools))
                 if by == "mesh" and len(pools) == 1:
                     raise InputError(f"by=mesh: {path} names no mesh: leave it out")
@@ -135,7 +136,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     groups = by_images(arms)
     tables = run_tables(arms, groups) + [overall_differences(read_evaluations(group)) for group in groups.values()]
     sheets = [f"image: {run.folder / name / 'contact_sheet.png'}" for run in runs for name in run.photographs]
-    return "\n\n".join(filter(None, [*(str(table) for table in tables if table.rows), "\n".join(sheets)]))
+    return "\n\n".join(filter(None, [*(str(table.known) for table in tables if table.rows), "\n".join(sheets)]))
 
 
 def format_comparison(
@@ -167,4 +168,4 @@ def format_comparison(
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
         evaluations = read_evaluations(group, exclude, by)
         tables += [group_table(evaluations, pooled, by), *difference_tables(evaluations, pooled, by=by)]
-    return "\n\n".join(str(table) for table in [*tables, seconds_table(arms)] if table.rows)
+    return "\n\n".join(str(table.known) for table in [*tables, seconds_table(arms)] if table.rows)

@@ -187,6 +187,7 @@ def _photographs(title: str, group: Scored) -> dict[str, Any]:
                 tables.append(compare.group_table(evaluations))
     except InputError as error:
         content["sentences"] = [str(error)]
+    content["tables"] = [table.known for table in tables]
     return content
 
 

@@ -17,7 +17,7 @@ from renderer.errors import InputError, in_one_line
 from train import checkpoint, run_folder
 from train.networks import PUBLISHED, load_selected, published
 from train.photographs.metrics import METRICS, find_metric, metric_title, resampled
-from train.photographs.scoring import SUMMARY
+from train.photographs.scoring import SUMMARY, describe_point
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.tables import Table, format_interval
 
@@ -121,7 +121,8 @@ def _metrics(summaries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any
             if metric.get("value") is not None:
                 metric |= {end: float(metric[end]) for end in ("value", "low", "high")}
         images, label = str(summary.get("images") or summary), str(summary.get("label", ""))
-        photographs[name] = {"images": images, "label": label, **metrics}
+        chosen = {"operating_point": summary.get("operating_point")}
+        photographs[name] = {"images": images, "label": label, **metrics, **chosen}
     return photographs
 
 
@@ -201,6 +202,9 @@ def score_table(title: str, group: Scored) -> Table:
         arm: [(run.seed, [run.photographs[name][metric] for metric in METRICS]) for run, name in scored]
         for arm, scored in group.items()
     }
+    points = [run.photographs[name]["operating_point"] for scored in group.values() for run, name in scored]
+    if chosen := sorted({describe_point(point) for point in points if point}):
+        title += f"; threshold for {' or '.join(chosen)}"
     return _run_table(title, [metric_title(name) for name in METRICS], metrics)
 
 

@@ -2,10 +2,14 @@ import json
 from pathlib import Path
 from shutil import copytree
 
+import numpy as np
 import pytest
+import torch
 from safetensors import safe_open
 
 from renderer.errors import InputError
+from renderer.io.images import read_square
+from scripts import evaluate
 from scripts.publish import Settings, main
 from train import checkpoint
 from train.networks import PUBLISHED, load_run, load_selected
@@ -26,6 +30,29 @@ def test_a_published_network_loads_and_its_file_holds_settings_and_scores_withou
     scored, run = summarize(out), summarize(finished)
     assert (scored.accuracy, scored.photographs) == (run.accuracy, run.photographs)
     assert str(finished.parent) not in str(metadata) and str(tmp_path) not in str(metadata)
+
+
+def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_path):
+    """The threshold of a rate of 1/2 on four others, tomatoes and apples, is the third of their log-odds."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    with pytest.raises(InputError, match="together, or neither"):
+        Settings(str(finished), str(first), false_positive_rate=0.5)
+    main.__wrapped__(Settings(str(finished), str(first)))
+    with pytest.raises(InputError, match="has no operating point"):
+        load_run(first).detect(torch.zeros(1, 3, 16, 16))
+    main.__wrapped__(Settings(str(first), str(first), 0.5, str(photos)))
+    main.__wrapped__(Settings(str(first), str(second)))
+    hashes = [checkpoint.content_hash(sorted(load_selected(folder)[1].items())) for folder in (first, second)]
+    assert hashes[0] == hashes[1]
+    network = load_run(second)
+    files = [path for path in sorted(photos.rglob("*.png")) if path.parent.name != "orange"]
+    images = torch.stack([torch.from_numpy(np.array(read_square(path, 16))).permute(2, 0, 1) / 255 for path in files])
+    odds = torch.logit(network(images).double().softmax(1)[:, 1])
+    assert network.operating_point.threshold == pytest.approx(float(odds.sort().values[1]), rel=1e-5)
+    assert network.detect(images).sum() == 2
+    evaluate.main.__wrapped__(evaluate.Settings(str(second), photos=str(photos), out=str(tmp_path / "scores")))
+    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
+    assert summary["operating_point"] == vars(network.operating_point) | {"in_sample": True}
 
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
