@@ -160,7 +160,8 @@ def score(args: argparse.Namespace) -> None:
         network = load_run(path)
         model = MixedPrecision(network, choose_precision("auto", torch.device("cpu")))
         for folder in folders:
-            out, by = Path("runs/sides", side, path, folder.name), BY.get(folder.name, "mesh")
+            out = Path("runs/sides", side, path.strip("/").replace("/", "_"), folder.name)
+            by = BY.get(folder.name, "mesh")
             summary = evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by)
             for name, group in {"all": summary, **summary["by_source"], **summary.get("by_mesh", {})}.items():
                 cells = (format_interval(find_metric(group, metric)) for metric in METRICS)
