@@ -13,7 +13,6 @@ from torch import Tensor
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from augment.utils import progress
-from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
 from renderer.image import ImageSettings
@@ -117,7 +116,7 @@ class RendererSettings:
     """How `build_scene` renders; the schema of a command's `renderer`, too.
 
     rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples: per pixel side. encoding,
-    normals, shadows, bounces: as for `renderer.render`. cache: the folder of rendered views, "auto", or None.
+    normals, shadows, bounces: as for `renderer.render`.
     """
 
     rasterizer: str = "auto"
@@ -126,7 +125,6 @@ class RendererSettings:
     normals: str = "smooth"
     shadows: bool = False
     bounces: int = 0
-    cache: str | None = "auto"
 
     def __post_init__(self) -> None:
         self.image(size=1)  # which checks most
@@ -157,8 +155,7 @@ def build_scene(
 
     meshes: pairs of a file, solid:NAME or `Mesh`, and the name of its class; or `ObjectSettings`. shared: the views of
     an example share one light, shape or color; otherwise each view is an example. scene, renderer: all further choices
-    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence. Without `renderer`,
-    views are cached on the disk only where options have a `cache`.
+    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
 
     >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
@@ -168,7 +165,7 @@ def build_scene(
     """
     of_scene = {name: options.pop(name) for name in SCENE & options.keys()}
     shown = replace(scene or SceneSettings(), views=views, **of_scene)
-    drawn = replace(renderer or RendererSettings(cache=None), **options)
+    drawn = replace(renderer or RendererSettings(), **options)
     environment: Any = load_light(shown.light) if isinstance(shown.light, str) else shown.light
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
@@ -180,7 +177,6 @@ def build_scene(
         lights.to(as_device(device)),
         drawn.image(size),
         choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
-        OperatorCache(cache_folder(drawn.cache)),
         shared=shared,
         basis=basis,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,6 @@ from augment.objects import SceneObject
 from augment.relighting import InPlace, Layer, OperatorStack, Relighting
 from augment.reshading import Reshading
 from augment.utils import progress, require_memory
-from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.image import ImageSettings, background_term, clamp, tonemap_composite
@@ -23,6 +22,7 @@ from renderer.light.basis import HARMONICS, Basis, parts_of
 from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
+from renderer.transfer import build_operators
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -68,10 +68,10 @@ class Scene:
 
     While the light alone changes, nothing is rasterized after the first time: the transfer operators of many views are
     stacked (`Relighting`). Where vertices move, a view is rasterized each time (`Reshading`). lights: (E, size, 3), or
-    (size, 3) for all, where attacks begin; images have their dtype and device. operators: the cache of rendered views;
-    None: each view is shown in one light only, and is shaded without an operator in less time. basis: of the lights'
+    (size, 3) for all, where attacks begin; images have their dtype and device. basis: of the lights'
     coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered images (A, V, 3, size,
-    size) and their examples (A,); see `CameraEffects`.
+    size) and their examples (A,); see `CameraEffects`. one_light: each view is shown in one light only, and is shaded
+    without an operator in less time.
 
     >>> from augment.build import build_scene
     >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
@@ -86,9 +86,9 @@ class Scene:
     lights: Tensor
     settings: ImageSettings
     rasterizer: Rasterizer
-    operators: OperatorCache | None = field(default_factory=OperatorCache)
     basis: Basis = HARMONICS
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
+    one_light: bool = False
 
     def __post_init__(self) -> None:
         size, device = self.settings.size, self.lights.device
@@ -118,13 +118,12 @@ class Scene:
         require_memory(renders, self.attack_bytes, device)
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
-        cache = self.operators or OperatorCache()
-        build = partial(cache.operators, **shading, dtype=self.lights.dtype)
+        build = partial(build_operators, **shading, dtype=self.lights.dtype)
         behind = self._background.repeat_interleave(self.views)
         self._relighting = Relighting(
             self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, self.attack_bytes
         )
-        self._reshading = Reshading(self.objects, like=self.lights, cached=self.operators is not None, **shading)
+        self._reshading = Reshading(self.objects, like=self.lights, cached=not self.one_light, **shading)
 
     @classmethod
     def grid(
@@ -194,7 +193,7 @@ class Scene:
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        if conditions.vertices is not None or conditions.albedo is not None or self.operators is None:
+        if conditions.vertices is not None or conditions.albedo is not None or self.one_light:
             return self._reshaded(light, conditions, examples)
         if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)

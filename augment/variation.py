@@ -13,7 +13,6 @@ from torch import Tensor
 from augment.objects import another_instance
 from augment.scene import Example, Scene
 from augment.utils import progress
-from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
@@ -125,9 +124,9 @@ def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Gen
         ]
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
-    if settings.moves:  # views that never come again are not kept on the disk
+    if settings.moves:
         has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
-        changed["operators"] = None if once and not has_rays else OperatorCache()
+        changed["one_light"] = once and not has_rays
     return replace(scene, examples=rows, **changed)
 
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import torch
 from matplotlib.figure import Figure
@@ -24,17 +23,13 @@ from benchmarks import reference, scene
 from benchmarks.common import Row, machine, medians, write_csv
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
 from renderer import shading
-from renderer.cache import OperatorCache
-from renderer.camera import orbit_cameras
 from renderer.fragments import Fragments
-from renderer.image import ImageSettings, tonemap
+from renderer.image import tonemap
 from renderer.rasterizer import NAMES, choose
-from renderer.shapes import solid
 from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator
 
 BACKGROUND = 0.5
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
-VIEWS = 10  # of each of the paper's two meshes
 DEGREES = (2, 4, 6, 8, 10, 12)  # of the harmonics
 PER_SIDE = (1, 2, 4, 8, 16)  # samples per side of a pixel
 
@@ -217,8 +212,8 @@ def error_of(row: Row) -> float:
 # ---------------------------------------------------------------------------- what a scene does not need
 
 
-def savings(view: View, folder: Path) -> Iterator[tuple[str, Call, Call]]:
-    """What is skipped, the work with everything, and with what is needed. folder: for a cache."""
+def savings(view: View) -> Iterator[tuple[str, Call, Call]]:
+    """What is skipped, the work with everything, and with what is needed."""
     operator, size = view.operator(), view.size
     _, nonzero, pixels = operator.transfer.shape
 
@@ -227,12 +222,6 @@ def savings(view: View, folder: Path) -> Iterator[tuple[str, Call, Call]]:
         shapes = (count, pixels), (3, count), (3, pixels)
         transfer, light, upstream = (torch.rand(shape, device=view.device) for shape in shapes)
         return lambda: (light @ transfer, upstream @ transfer.T)
-
-    def paper_operators(cache: OperatorCache) -> None:
-        """Of two meshes from ten views."""
-        cameras, settings = orbit_cameras(VIEWS, 2.2), ImageSettings(size, SAMPLES)
-        for seed in (0, 1):
-            cache.operators(solid("orange", seed), cameras, settings, view.rasterizer)
 
     unlit = f"{COEFFICIENTS - nonzero} of {COEFFICIENTS} coefficients reach no surface"
     yield unlit, products(COEFFICIENTS, pixels), products(nonzero, pixels)
@@ -243,9 +232,6 @@ def savings(view: View, folder: Path) -> Iterator[tuple[str, Call, Call]]:
     yield f"back faces of a closed mesh are not drawn, {view.rasterizer.name}", draw, partial(draw, closed=True)
     step = light_step(view, operator, coefficients(DEGREE, torch.float32, view.device))
     yield "a step by the light does not rasterize", lambda: (view.operator(), step()), step
-    load = partial(paper_operators, OperatorCache(folder))
-    load()
-    yield f"{2 * VIEWS} operators are loaded, not built", partial(paper_operators, OperatorCache(None)), load
 
 
 # ---------------------------------------------------------------------------- results
@@ -288,10 +274,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for size in options.sizes:
         view = View(mesh, size, choose(options.rasterizer), options.device)
         panels += [measure(panel, view, options) for panel in PANELS]
-        with TemporaryDirectory() as folder:
-            for name, everything, needed in savings(view, Path(folder)):
-                slow, fast = medians({0: everything, 1: needed}, options.rounds, options.device).values()
-                skipped += [{"panel": f"skipped, {size}²", "setting": name, "time_ms": fast, "saved": slow / fast}]
+        for name, everything, needed in savings(view):
+            slow, fast = medians({0: everything, 1: needed}, options.rounds, options.device).values()
+            skipped += [{"panel": f"skipped, {size}²", "setting": name, "time_ms": fast, "saved": slow / fast}]
     write_csv(options.out / "renderer_pareto.csv", [*chain.from_iterable(panels), *skipped])
     draw(options.out / "renderer_pareto.png", panels)
 

@@ -60,6 +60,7 @@ class TrainSettings:
     deterministic: bool = False
     checkpoint_every: int = 1
     resume: bool = False
+    cache: str | None = "auto"
 
     def __post_init__(self) -> None:
         choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS, "compile": COMPILE}

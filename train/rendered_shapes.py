@@ -13,12 +13,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 import augment
+import renderer
 from augment.build import load_backgrounds
 from augment.classifiers.adapter import class_index
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import generator, progress
-from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
 from renderer.light.presets import ambient, directional
@@ -26,12 +26,14 @@ from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
 from renderer.shapes import SOLIDS, solid
 from train import console
+from train.cache import TensorCache, source_key
+from train.checkpoint import content_hash
 from train.data import DataSet, Split
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
 VIEWS, BACKGROUNDS = 5, 4  # images per instance: every view on every background, each in a light of its own
-CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
+CODE = source_key(*(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__)))
 
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
@@ -60,7 +62,7 @@ def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 def _cached_images(part: str, per_class: int, size: int, seed: int, cache: TensorCache | None) -> Tensor:
     cache, settings = cache or TensorCache(), replace(SETTINGS, size=size)
-    key = content_key(CODE, CLASSES, per_class, seed, part, settings)
+    key = content_hash([CODE, CLASSES, per_class, seed, part, settings])
     cached = cache.read(key)
     if cached is None:
         cached = {"images": _render(part, per_class, seed, settings)}

@@ -13,10 +13,10 @@ from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
-from renderer.cache import TensorCache, cache_folder, content_key
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
+from train.cache import TensorCache, cache_folder
 from train.data import DataSet, Split, channel_statistics, held_out_rows, load_cifar100, load_folder, load_npz
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
@@ -98,7 +98,7 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
-    data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
+    data, cache = settings.data, TensorCache(cache_folder(settings.train.cache))
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
@@ -194,11 +194,11 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
     if not model or utils.rank():
         return {}
     is_foreign = settings.model.name.startswith(PYTHON)  # whose code may change unseen
-    cache = TensorCache(None if is_foreign else cache_folder(settings.renderer.cache))
+    cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
     key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
 
     def predict(images: torch.Tensor) -> torch.Tensor:
-        batch = content_key(key, images.cpu().numpy())
+        batch = checkpoint.content_hash([key, images])
         if (stored := cache.read(batch)) is None:
             stored = {"logits": model(images).cpu().contiguous()}
             cache.write(batch, stored)

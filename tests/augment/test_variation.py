@@ -116,15 +116,14 @@ def test_views_that_are_shown_once_are_shaded_as_their_operators_shade_them(opti
     still, shown = built("solid:cup", "solid:orange", views=2, **options), []
     for once in (True, False):
         scene = vary(still, VariationSettings(shift=0.1, instances=True, azimuth=30.0), generator(0), once)
-        assert (scene.operators is None) == once
+        assert scene.one_light == once
         lights = scene.lights.clone().requires_grad_()
         rendered = scene.render(Conditions(lights), torch.arange(len(scene)))
         shown.append((rendered, *torch.autograd.grad(rendered.square().sum(), lights)))
     torch.testing.assert_close(shown[0][0], shown[1][0], rtol=0, atol=2e-6)  # of float32, and sRGB's slope of 13
     torch.testing.assert_close(shown[0][1], shown[1][1], rtol=1e-4, atol=1e-4)
-    assert vary(
-        replace(still, settings=replace(still.settings, shadows=True)), VariationSettings(shift=0.1), generator(0), True
-    ).operators
+    shadowed = replace(still, settings=replace(still.settings, shadows=True))
+    assert not vary(shadowed, VariationSettings(shift=0.1), generator(0), True).one_light
 
 
 def test_each_view_shows_another_instance_before_all_backgrounds():

@@ -74,7 +74,7 @@ def test_a_script_appends_records_whose_table_has_all_rows(small, tmp_path, caps
 def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path, capsys):
     out = tmp_path / "records.jsonl"
     small = ["--attacks", "lighting", "--examples", "1", "--classifier", "run:pretrained/none"]
-    short = ["attack.max_steps=1", "scene.search=0", "renderer.shadows=false", "renderer.cache=null"]
+    short = ["attack.max_steps=1", "scene.search=0", "renderer.shadows=false"]
     short += ["attack.verify=reload"]  # without Mitsuba
     meshes = ["solid:orange:0", "{mesh: 'solid:orange:0', label: lamp}"]  # which is not predicted to be a lamp
     survival.main(["--out", str(out), *small, "--meshes", *meshes, "--overrides", *short])

@@ -23,7 +23,7 @@ from renderer.light.presets import probe
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 300  # seconds for a process that should end
-RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1", "renderer.cache=null")
+RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1")
 TRAINING = (
     *(
         "experiment=paper",
@@ -36,6 +36,7 @@ TRAINING = (
     *("model.depth=10", "model.width=1", "model.dropout=0.3", "train.batch_size=16", "train.precision=float32"),
     *("train.device=cpu", "train.threads=1", "train.learning_rate=0.02", "augment.examples=4"),
     *("augment.attack.max_steps=2", "scene.meshes=[mesh.obj]", "scene.backgrounds=[0.2,0.8]", *RENDERER),
+    "train.cache=null",
 )
 
 Process = subprocess.Popen[str]

@@ -44,11 +44,3 @@ def call(*command: str, folder: Path) -> tuple[int, str]:
 def test_an_output_that_is_read_only_is_refused_by_its_key(folder, command, reported):
     status, errors = call(*command, folder=folder)
     assert status == 2 and errors.startswith(f"error: {reported}") and errors.count("\n") == 1
-
-
-def test_a_read_only_cache_stops_no_run(folder):
-    overrides = [word for word in TRAIN if not word.startswith("renderer.cache=")]
-    status, errors = call(*overrides, "run=out", "renderer.cache=../locked/cache", folder=folder)
-    assert status == 0, errors
-    assert "not kept: [Errno 13] Permission denied: '../locked/cache'" in (folder / "out" / "train.log").read_text()
-    assert not list(folder.with_name("locked").iterdir())

@@ -23,7 +23,7 @@ CLASSES = ("orange", "lime", "sky")
 
 def configured(*arguments: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
-    small = ["renderer.rasterizer=numpy", "renderer.cache=null", "renderer.shadows=false", "attack.max_steps=8"]
+    small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
     return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.margin=0", *arguments]))
 
 

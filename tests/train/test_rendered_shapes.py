@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from renderer.cache import TensorCache
 from renderer.errors import InputError
 from train import rendered_shapes
+from train.cache import TensorCache
 from train.rendered_shapes import load_shapes, relabeled
 
 SIZE = 8

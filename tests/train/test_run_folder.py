@@ -61,7 +61,7 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     here, there = (
         decisive_settings(tiny("evaluate.photos=${run}/images", *overrides))
-        for overrides in (["run=here"], ["run=there/a", "sweep=x", "train.resume=true", "renderer.cache=null"])
+        for overrides in (["run=here"], ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"])
     )
     assert here == there and here["evaluate.photos"] == "<run>/images" and here["augment.attack.max_steps"] == 3
 

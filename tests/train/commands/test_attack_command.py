@@ -17,7 +17,7 @@ USER_ERROR = 2
 ROOT = Path(__file__).parents[3]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",
-    "renderer.rasterizer=numpy", "renderer.cache=null", "renderer.shadows=false", "attack.allow_negative=true",
+    "renderer.rasterizer=numpy", "renderer.shadows=false", "attack.allow_negative=true",
 ]  # fmt: skip
 
 
