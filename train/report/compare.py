@@ -40,8 +40,8 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
             path, label = run.folder / name / PREDICTIONS, run.photographs[name]["label"]
             if path.is_file():
                 predictions = read_predictions(path, label)
-                point = run.photographs[name]["operating_point"] or {}
-                pools = metrics.pool_by(predictions, label, by, exclude, point.get("threshold"))
+                threshold = run.photographs[name].get("threshold")
+                pools = metrics.pool_by(predictions, label, by, exclude, threshold)
                 arms.setdefault(arm, []).append(Evaluation(run, pools))
                 if by == "mesh" and len(pools) == 1:
                     raise InputError(f"by=mesh: {path} names no mesh: leave it out")

@@ -121,7 +121,8 @@ def _metrics(summaries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any
             if metric.get("value") is not None:
                 metric |= {end: float(metric[end]) for end in ("value", "low", "high")}
         images, label = str(summary.get("images") or summary), str(summary.get("label", ""))
-        chosen = {"operating_point": summary.get("operating_point")}
+        point = summary.get("operating_point")
+        chosen = {"threshold": float(point["threshold"]), "operating_point": describe_point(point)} if point else {}
         photographs[name] = {"images": images, "label": label, **metrics, **chosen}
     return photographs
 
@@ -202,9 +203,9 @@ def score_table(title: str, group: Scored) -> Table:
         arm: [(run.seed, [run.photographs[name][metric] for metric in METRICS]) for run, name in scored]
         for arm, scored in group.items()
     }
-    points = [run.photographs[name]["operating_point"] for scored in group.values() for run, name in scored]
-    if chosen := sorted({describe_point(point) for point in points if point}):
-        title += f"; threshold for {' or '.join(chosen)}"
+    points = {run.photographs[name].get("operating_point", "") for scored in group.values() for run, name in scored}
+    if chosen := " or ".join(sorted(points - {""})):
+        title += f"; threshold for {chosen}"
     return _run_table(title, [metric_title(name) for name in METRICS], metrics)
 
 
