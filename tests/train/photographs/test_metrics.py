@@ -76,14 +76,6 @@ def test_the_spread_over_objects_and_their_images_is_that_of_a_two_level_bootstr
     assert means.var() == pytest.approx(variance, rel=0.13)  # four standard errors of 2,000 replicates
 
 
-@pytest.mark.slow
-def test_95_percent_of_the_intervals_cover_the_true_auc():
-    """Normal scores one standard deviation apart have an AUC of Φ(1/√2) = 0.760; 3 % is two standard errors of 200."""
-    generator = np.random.default_rng(5)
-    intervals = [roc_metrics(generator.normal(1, 1, 150), generator.normal(0, 1, 150))["auc"] for _ in range(200)]
-    assert 0.92 <= np.mean([auc["low"] <= 0.7602 <= auc["high"] for auc in intervals]) <= 0.98
-
-
 def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the_auc(scores):
     positives, negatives = scores
     rates, recalls, thresholds = roc_curve(positives, negatives)
