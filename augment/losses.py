@@ -35,11 +35,11 @@ def adversarial_cost(
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """The lead (E,) of the target's logit over all others or, without a target, of the best other class over the
-    source; negative where the goal is not reached. Shapes as in `adversarial_cost`."""
+    """The lead (...) of the target's logit over all others or, without a target, of the best other class over the
+    source; negative where the goal is not reached. logits: (..., C)."""
     wanted = torch.full_like(source, NO_CLASS) if target is None else target
-    chosen = torch.where(wanted == NO_CLASS, source, wanted)[:, None]
-    gap = logits.gather(1, chosen)[:, 0] - logits.scatter(1, chosen, -torch.inf).amax(1)
+    chosen = torch.where(wanted == NO_CLASS, source, wanted)[..., None]
+    gap = logits.gather(-1, chosen)[..., 0] - logits.scatter(-1, chosen, -torch.inf).amax(-1)
     return torch.where(wanted == NO_CLASS, -gap, gap)
 
 

@@ -13,7 +13,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalize, subdivide
 from renderer.shapes import solid
 
-TABLE = 1.2  # half a table's width: its corners are within the depth that cameras see
+TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
 FARTHEST = 10.0  # position and size of props, in world units
 
 
@@ -136,14 +136,16 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
 
 
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], or None for no table.
+    """The object on a table under everything, as one mesh; color: RGB, sRGB-encoded in [0, 1], or None for no table.
 
     The table's albedo is scaled, too. InputError: not a color.
     """
     if color is None:
         return item
     _require_color("ground", color)
-    corners = [[x * TABLE, y * TABLE, item.lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    across = item.mesh.vertices[np.unique(item.mesh.faces), :2]
+    (left, near), (right, far) = np.minimum(across.min(0) - RIM, -TABLE), np.maximum(across.max(0) + RIM, TABLE)
+    corners = [[x, y, item.lowest] for x, y in ((left, near), (right, near), (right, far), (left, far))]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
     return replace(item.joined([table]), ground=color)
 

@@ -36,7 +36,7 @@ class Mesh:
     texture_ids    (F,) int32, index into `textures`, -1 where there is none
     textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
 
-    InputError: arrays of other shapes, faces of vertices that are not there.
+    InputError: arrays of other shapes, no faces, faces of vertices that are not there.
 
     >>> square = Mesh.plain([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
     >>> square.face_areas().tolist(), square.face_normals()[0].tolist(), square.closed
@@ -62,7 +62,8 @@ class Mesh:
             values = getattr(self, name)
             if values.shape != shape or values.dtype.kind not in kinds:
                 raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
-        if count and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
+        require_range("the number of faces", count, 1, np.inf)
+        if not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
             raise InputError(f"faces name vertices that are not there: give indices from 0 to {len(self.vertices) - 1}")
 
     @staticmethod
@@ -247,6 +248,8 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     large = mesh.face_areas() > area
     if not large.any():
         return mesh
+    if large.all():
+        return refine(_quartered(mesh), area)
     small, finer = _select(mesh, ~large), refine(_quartered(_select(mesh, large)), area)
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in (small, finer)]) for name in PER_FACE

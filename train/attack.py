@@ -257,14 +257,16 @@ def format_attack(
             f"attacks of more steps: {by_steps}",
             *(f"warning: {warning}" for warning in warnings(checks)),
         ]
-    adversaries = [line["versions"] for line in lines if line["success"] and line["clean_correct"]]
-    for version in adversaries[0] if adversaries else ():
-        numbers = [versions[version] for versions in adversaries]
+    adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
+    for version in adversaries[0]["versions"] if adversaries else ():
+        numbers = [line["versions"][version] for line in adversaries]
+        by_margin = [line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]]
         largest = 255 * max(line["largest_difference"] for line in numbers)
         mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
         text.append(
             f"images as {NAMES.get(version, version)}: {sum(line['success'] for line in numbers)} of {len(numbers)} "
-            f"still succeed; pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+            f"still succeed, {sum(by_margin)} of the {len(by_margin)} with the margin; pixels differ by "
+            f"{mean:.3g}/255 on average, {largest:.3g}/255 at most"
         )
     return "\n".join(text)
 
@@ -276,7 +278,8 @@ def _success(result: AttackResult) -> str:
     if not rate["n"]:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
     views, wrong = result.success_in_views[clean], int((~clean).sum())
-    text = f"success on {format_fraction(rate)} examples"
+    text, by_margin = f"success on {format_fraction(rate)} examples", int(result.success_with_margin[clean].sum())
+    text += f", {by_margin} with the margin of {result.settings.margin:g}" if result.settings.margin else ""
     text += f", {int(views.sum())} of {views.numel()} views" if views.shape[1] > 1 else ""
     return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
 

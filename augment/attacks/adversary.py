@@ -22,7 +22,7 @@ from renderer.io.export import export_mesh
 from renderer.io.images import read_numbers
 from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
 from renderer.io.texture_bake import with_added_albedo
-from renderer.light.basis import Basis, parts_of, with_local_lights
+from renderer.light.basis import Basis, LocalBasis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light, read_light, save_light
@@ -104,11 +104,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     shown, settings = adversary.shown, adversary.settings
     export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
-    (where, sky), *others = parts_of(adversary.basis)
-    light, local = adversary.light[where], [(basis, adversary.light[rows]) for rows, basis in others]
-    save_light(folder / LIGHT, light, sky)
-    for basis, coefficients in local:
-        save_light(folder / f"{basis.name}.json", coefficients, basis)
+    (_, light), *local = save_lights(folder, adversary.light, adversary.basis)
     description = {
         "label": shown.label,
         "name": Path(shown.name).name,
@@ -135,6 +131,15 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.albedo_scale, cameras, settings, "light.exr", local)
     write_map(folder / MITSUBA / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
     return {"negative_light": negative_fraction(radiance)}
+
+
+def save_lights(folder: Path, light: Tensor, basis: Basis, when: str = "") -> list[tuple[Any, Tensor]]:
+    """Write light.json and NAME.json of each local light, `when` after the name; returns bases and coefficients."""
+    lights = [(part, light[rows]) for rows, part in parts_of(basis)]
+    for part, coefficients in lights:
+        name = part.name if isinstance(part, LocalBasis) else Path(LIGHT).stem
+        save_light(folder / f"{name}{when}.json", coefficients, part)
+    return lights
 
 
 def reload(folder: str | Path) -> Adversary:

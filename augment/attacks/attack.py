@@ -17,6 +17,7 @@ from augment.attacks.eot import EOTSettings, Rounded
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings, lighting
 from augment.classifiers.adapter import Classifier
+from augment.losses import logit_gap
 from augment.scene import Conditions, Scene
 from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
@@ -100,8 +101,8 @@ class AttackResult:
 
     images_before, images: (E, V, 3, size, size), not rounded, with the shadows and bounces of each shape in its own
     colors. logits_before, logits: (E, V, C), of the preprocessed images. success: (E,) bool, whether the goal is
-    reached in every view by these logits. descent: where the descent ended; while shape and colors change, it holds
-    shadows and bounces fixed. seconds: of the descent.
+    reached in every view by these logits; success_with_margin: by `settings.margin` or more. descent: where the descent
+    ended; while shape and colors change, it holds shadows and bounces fixed. seconds: of the descent.
     """
 
     problem: AttackProblem
@@ -125,6 +126,12 @@ class AttackResult:
     def success(self) -> Tensor:
         """(E,) bool: whether the criterion is met in every view."""
         return self.success_in_views.all(1)
+
+    @property
+    def success_with_margin(self) -> Tensor:
+        """(E,) bool: whether the logits lead by `settings.margin`, too, in every view."""
+        gaps = logit_gap(self.logits, self.goal.source, self.goal.target)
+        return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_in_views(self) -> Tensor:

@@ -28,8 +28,8 @@ def check(result: AttackResult) -> dict[str, Any]:
     """Compare an attack with random search, and with a descent of ten times as many steps.
 
     Returns fractions of the examples and mean costs. cost_fell: of the examples without success before. success,
-    random_search, success_by_steps: of the clean-correct examples, the last one by descents of 1, 3 and 10 times as
-    many steps.
+    success_with_margin, random_search, success_by_steps: of the clean-correct examples, the last one by descents of 1,
+    3 and 10 times as many steps.
 
     >>> checks = augment.check(result)
     >>> checks["success"], checks["cost"] < checks["cost_before"]
@@ -48,6 +48,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         "cost_fell": _fraction(fell[open_cases]) if open_cases.any() else 1.0,
         "zero_gradient": _fraction(descent.zero_gradient),
         "success": _fraction(result.success[clean]),
+        "success_with_margin": _fraction(result.success_with_margin[clean]),
         "random_search": _fraction(random_search(result)[clean]),
         "success_by_steps": {limit: _fraction((success & (end.success_at <= limit))[clean]) for limit in limits},
     }

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.adversary import MITSUBA, Adversary, reload, write_adversary
+from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
 from augment.attacks.attack import AttackResult, logits_of, predictions
 from augment.attacks.eot import as_jpeg
 from augment.attacks.evaluate import warnings
@@ -50,14 +50,16 @@ def save(
     ['float', '8 bits', 'JPEG 90', 'reload']
     """
     require_renderers(verify)
-    folder = Path(folder)
+    folder, problem, scene = Path(folder), result.problem, result.problem.scene
     folder.mkdir(parents=True, exist_ok=True)
-    after, lines = result.conditions, []
+    before, after, lines = problem.conditions(problem.start, problem.everything), result.conditions, []
     stems = [folder / f"example_{example:03d}" for example in range(len(result.images))]
     for example, stem in enumerate(progress(stems, "saving")):
         figure(result, example).save(stem.with_suffix(".png"))
         images = result.images_before[example], result.images[example]
-        light = write_adversary(Adversary.of(result.problem.scene, example, after, *images), stem)
+        light = write_adversary(Adversary.of(scene, example, after, *images), stem)
+        started = before.light[example].cpu() * scene.examples[example].exposure
+        save_lights(stem, started, scene.basis_under(before, example), "_before")
         lines.append({"example": example, **_numbers(result, example), **light, **_damage(result, after, example)})
     versions = _versions(result, stems, verify)
     for example, line in enumerate(lines):
@@ -84,6 +86,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
         "success": bool(result.success[example]),
+        "success_with_margin": bool(result.success_with_margin[example]),
         "success_in_views": result.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
         "cost_before": float(descent.cost_before[example]),

@@ -18,6 +18,7 @@ from benchmarks.common import Row
 from benchmarks.paper import common
 
 ATTACKS = ("lighting", "projector", "lamps", "geometry", "albedo", "lighting+geometry+albedo", "projector+geometry")
+KEPT = ("refusal", "steps", "success", "success_with_margin", "versions")
 ROOT = Path(__file__).parents[2]
 
 
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
         shown = [f"attack={attack}", f"scene.meshes=[{{{','.join(given)}}}]", *view]
         result = run_attack([*shown, *chosen, *args.overrides], args.threads)
-        result = {name: result[name] for name in ("refusal", "steps", "success", "versions") if name in result}
+        result = {name: result[name] for name in KEPT if name in result}
         common.append(args.out, {"mesh": Path(item.mesh).stem, "attack": attack, "example": example, **result})
 
 

@@ -17,13 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import InputError, require_file
+from renderer.errors import LARGEST, InputError, require_file
 from renderer.io.images import read_numbers
 from renderer.light.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
 FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
 BLOCK = 2**12  # directions at a time: they stay in the cache
+NEGATIVE = 1e-4  # of the brightest radiance: what filters that scale maps leave
 LARGEST_MAP = 4096  # MB, which a damaged header may exceed
 
 
@@ -55,7 +56,7 @@ def read_map(path: Path) -> Tensor:
 
     Alpha is dropped and gray repeated; an .npy array is (H, W, C) with 1, 3 or 4 channels. Of an .exr file with
     layers, the unnamed one counts, or else the first that has red, green and blue.
-    InputError where the file is missing, unreadable, no such map, or holds NaN or infinity.
+    InputError: missing, unreadable, no such map, NaN, infinity or radiance beyond 1e12 (the sun has 1.6e9 cd/m²).
     """
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
@@ -64,20 +65,22 @@ def read_map(path: Path) -> Tensor:
     except Exception as error:  # both libraries raise many kinds for a damaged header
         message = str(error).partition("\n")[0]
         raise InputError(f"environment map {path} cannot be read: {message}") from error
-    if not np.isfinite(radiance).all():
-        raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")
+    if not (np.abs(radiance) <= LARGEST).all():  # NaN is not
+        raise InputError(f"environment map {path} holds NaN, infinity or radiance beyond {LARGEST:g}: mend its texels")
     return torch.from_numpy(radiance)
 
 
 def read_panorama(path: Path) -> Tensor:
-    """`read_map` of a map that can be one of the whole sphere. InputError where its shape says that it is another kind,
-    a mirror ball's or a cube's, say, or where it is too small to be told from its midpoints."""
+    """`read_map` of a map that can be one of the whole sphere, with zero for radiance from -NEGATIVE of the largest on.
+    InputError: less; another shape, such as a mirror ball's; too few texels to be told from its midpoints."""
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
         advice = f"give an equirectangular one, twice as wide as high, of {FEWEST_ROWS} rows or more"
         raise InputError(f"environment map {path} has {width} × {height} texels: {advice}")
-    return radiance
+    if radiance.min() < -NEGATIVE * radiance.max():
+        raise InputError(f"environment map {path} has negative radiance, down to {radiance.min():.3g}: mend its texels")
+    return radiance.clamp(min=0)
 
 
 def check_map_name(path: Path) -> None:

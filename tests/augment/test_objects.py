@@ -44,6 +44,16 @@ def test_props_stand_on_the_objects_ground_shifted_and_turned():
     assert on_ground(item, (0.5, 0.5, 0.5)).lowest == item.lowest == apple.vertices[:, 2].min()
 
 
+@pytest.mark.parametrize("at", [[0.1, 0.0], [-3.0, 0.4], [0.7, 2.0]])
+def test_a_table_reaches_under_everything_that_stands_on_it(at):
+    item = load_object(ObjectSettings("solid:apple", "apple", props=[PropSettings("solid:cup", at, scale=0.5)]))
+    table = on_ground(item, (0.5, 0.5, 0.5)).mesh.vertices[len(item.mesh.vertices) :]
+    (low, high), others = (table.min(0), table.max(0)), item.mesh.vertices
+    assert (low[2] == high[2] == others[:, 2].min()) and len(table) == 4
+    assert (low[:2] <= others[:, :2].min(0) - 0.19).all() and (high[:2] >= others[:, :2].max(0) + 0.19).all()
+    assert (low[:2] <= -1.2).all() and (high[:2] >= 1.2).all() and np.ptp(table, axis=0).max() < 5
+
+
 def test_another_instance_has_the_same_props():
     props, color = [PropSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
     items = [ObjectSettings(name, "apple", props=props) for name in ("solid:apple", "solid:apple:5")]

@@ -99,9 +99,13 @@ def test_normalize_centers_on_the_centroid_of_the_surface_and_fits_the_unit_cube
 # Errors
 
 
-@pytest.mark.parametrize("faces", [[[0, 1, 9]], [[0, 1, -1]]])
-def test_faces_of_vertices_that_are_not_there_are_refused(faces):
-    with pytest.raises(InputError, match="faces name vertices that are not there: give indices from 0 to 2"):
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [*(([[0, 1, last]], "faces name vertices that are not there: give indices from 0 to 2") for last in (9, -1)),
+     (np.zeros((0, 3)), "the number of faces=0 must be at least 1")],
+)  # fmt: skip
+def test_no_faces_and_faces_of_vertices_that_are_not_there_are_refused(faces, message):
+    with pytest.raises(InputError, match=message):
         Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], faces)
 
 

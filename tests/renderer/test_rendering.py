@@ -122,6 +122,16 @@ def test_bad_input_is_refused_in_one_sentence(stone, light, wrong, message):
         renderer.render(**{"mesh": stone, "cameras": CAMERAS, "light": light.float(), **SMALL, **wrong})
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_an_image_of_few_pixels_is_the_mean_of_those_of_a_finer_one(stone, light, size):
+    few, finer = (
+        renderer.render(stone, CAMERAS, light, pixels, samples=12 // pixels, rasterizer="numpy")
+        for pixels in (size, 12)
+    )
+    expected = finer.unflatten(3, (size, -1)).mean(4).unflatten(2, (size, -1)).mean(3)
+    torch.testing.assert_close(few, expected, rtol=0, atol=64 * EPS)
+
+
 @pytest.mark.parametrize("light", [None, load_light("grace")], ids=["alone", "beside"])
 @pytest.mark.parametrize("samples", [1, 2])
 def test_lamps_and_projectors_are_added_as_by_operators(light, samples):

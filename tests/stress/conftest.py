@@ -73,7 +73,7 @@ def write_data(folder: Path) -> None:
 
 def write_scene_files(folder: Path) -> None:
     """Meshes, lights, lamps, a projector's pattern and a background."""
-    light = probe("grace")
+    light = probe("st_peters")  # positive, as maps are
     for name in ("mesh.glb", "mesh.ply"):
         export_mesh(solid("lemon", 0), folder / name)
     for name in ("mesh.stl", "mesh.off"):

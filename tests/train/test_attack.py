@@ -115,8 +115,9 @@ def test_bad_input_is_refused_in_one_sentence(arguments, message):
 
 def test_success_is_printed_of_clean_correct_examples_and_of_their_views():
     """No light makes both views' images green and blue, so that of two views with a target each one remains."""
-    result = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true")
+    result = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.margin=0.5")
     text = format_attack("mesh", result, None)
+    assert f", {int(result.success_with_margin)} with the margin of {result.settings.margin:g}" in text
     assert text.startswith("mesh: lighting against by_color: ") and len(text.splitlines()) == 1
     assert f"{int(result.success)} of 1 [" in text and f", {int(result.success_in_views.sum())} of 2 views" in text
     wrong = attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")

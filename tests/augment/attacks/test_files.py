@@ -24,8 +24,9 @@ CLASSES = ("orange", "lime", "sky", "night")
 # ------------------------------------------------------------------------------------- numbers
 
 
-def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_color, tmp_path):
-    result = attacked("lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=2)
+@pytest.mark.parametrize("margin", [0.0, 0.5, 100.0])
+def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_color, tmp_path, margin):
+    result = attacked("lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=4, margin=margin)
     checks = augment.check(result)
     augment.save(result, tmp_path, checks)
     *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
@@ -38,6 +39,8 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_co
             probabilities = logits[example].softmax(1)
             assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
             assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
+        lead = result.logits[example, 0, 1] - result.logits[example, 0, [0, 2, 3]].max()
+        assert line["success_with_margin"] is bool(lead >= margin) is result.success_with_margin[example].item()
         assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
         change = (result.descent.values[example] - result.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
@@ -66,6 +69,7 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positiv
     (line,) = augment.save(result, tmp_path)
     folder, values = tmp_path / "example_000", result.descent.values[0].unflatten(0, (49, 3))
     assert torch.equal(load_light(str(folder / "light.json")), values)
+    assert torch.equal(load_light(str(folder / "light_before.json")), 2 * load_light(light))
     assert (line["negative_light"] < 1e-6) == positive == (to_map(values, MAP_HEIGHT).min() >= 0).item()
     assert (folder / "light.hdr").is_file() == (folder / "light.exr").is_file() == positive
     in_mitsuba = mitsuba_map(values, MAP_HEIGHT).float().clamp(min=0)

@@ -121,7 +121,7 @@ def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, ex
     ("values", "message"),
     [
         (np.array([None, "pickled"], dtype=object), "cannot be read: "),
-        (np.full((4, 8, 3), 1e300), "holds NaN or infinity"),
+        (np.full((4, 8, 3), 1e300), "holds NaN, infinity or radiance beyond 1e+12"),
         (np.ones((49, 3)), "its shape is (49, 3), give (height, width, channels)"),
         (np.ones((4, 8, 2)), "its shape is (4, 8, 2), give"),
     ],

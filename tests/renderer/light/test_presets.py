@@ -8,7 +8,7 @@ from oracles import random_directions
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import write_map
-from renderer.light.harmonics import basis, nonzero_coefficients
+from renderer.light.harmonics import basis, equirectangular, nonzero_coefficients
 from renderer.light.presets import PROBES, ambient, directional, load_light, perturb, probe
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -76,15 +76,29 @@ def test_a_saved_map_comes_back_at_graces_luminance(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("factor", "message"),
-    [(math.inf, "holds NaN or infinity"), (-1.0, "a mean luminance of -"), (0.0, "luminance of 0")],
+    ("factor", "texel", "message"),
+    [
+        *((1.0, texel, "holds NaN, infinity or radiance beyond 1e") for texel in (math.inf, math.nan, 1e30)),
+        (1.0, -3.0, "has negative radiance, down to -3: "),
+        (0.0, 0.0, "is black: "),
+    ],
 )
-def test_a_map_without_physical_light_is_refused_by_name(tmp_path, factor, message):
-    path = tmp_path / "map.exr"
-    write_map(path, factor * torch.from_numpy(smooth_map(8, 16)))
+def test_a_map_without_physical_light_is_refused_by_name(tmp_path, factor, texel, message):
+    path, radiance = tmp_path / "map.exr", factor * torch.from_numpy(smooth_map(8, 16))
+    radiance[3, 5] = texel
+    write_map(path, radiance)
     with pytest.raises(InputError, match=message) as refused:
         load_light(str(path))
     assert str(path) in str(refused.value)
+
+
+def test_a_map_whose_brightest_texel_is_a_million_times_the_others_is_light_from_there(tmp_path):
+    radiance = torch.full((64, 128, 3), 1e-3)
+    radiance[20, 30], radiance[40, 50] = 1e3, -1e-2  # so little below zero counts as zero
+    write_map(tmp_path / "map.exr", radiance)
+    light = load_light(str(tmp_path / "map.exr"))
+    there = basis(equirectangular(64, 128)[0][20, 30], 6)
+    torch.testing.assert_close(light / light[0], (there / there[0]).float()[:, None].expand(-1, 3), rtol=0, atol=0.02)
 
 
 def test_ambient_light_gives_every_normal_pi_times_its_color():

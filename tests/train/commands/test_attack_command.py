@@ -29,7 +29,7 @@ def run(call) -> Callable[..., int]:
 
 ALWAYS = {
     "adversary.json", "mesh.glb", "light.json", "before_0.png", "after_0.png", "before.npy", "after.npy",
-    "mitsuba/scene.xml", "mitsuba/part_0.ply", "mitsuba/light.exr",
+    "mitsuba/scene.xml", "mitsuba/part_0.ply", "mitsuba/light.exr", "light_before.json",
 }  # fmt: skip
 
 
