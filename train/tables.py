@@ -11,8 +11,7 @@ from typing import Any
 class Table:
     """A table with a title, which may be empty. As text: Markdown below the title, aligned on a console, too.
 
-    On a terminal that is too narrow, its rows and columns change places or, where that is too wide as well, columns go
-    on in further tables, which repeat the first one.
+    On a terminal that is too narrow, columns go on in further tables, which repeat the first one.
     """
 
     title: str
@@ -29,8 +28,7 @@ class Table:
     def __str__(self) -> str:
         room = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
-        upright, turned = ([_aligned(cells) for cells in columns] for columns in (zip(*lines, strict=True), lines))
-        first, *others = turned if _width(upright) > room >= _width(turned) else upright
+        first, *others = (_aligned(cells) for cells in zip(*lines, strict=True))
         parts = [[first]]
         for column in others:
             if len(parts[-1]) > 1 and _width([*parts[-1], column]) > room:

@@ -62,16 +62,14 @@ def mean_metric(group: Sequence[Evaluation], source: str, name: str) -> Mapping[
     return {"value": fmean(values), "low": min(values), "high": max(values)}
 
 
-def group_table(arms: Evaluations, pooled: str | None = None, by: str = "source") -> Table:
-    """METRICS by source or mesh and arm, as of `mean_metric`. pooled: OVERALL's name; None leaves it out."""
+def group_table(arms: Evaluations, pooled: str = "all", by: str = "source") -> Table:
+    """METRICS by source or mesh and arm, as of `mean_metric`. pooled: OVERALL's name."""
     sources = dict.fromkeys(source for group in arms.values() for run in group for source in run.pools)
-    if pooled is None:
-        del sources[OVERALL]
     rows: list[list[str]] = []
     for source in progress(sources, "intervals"):
         for arm, group in arms.items():
             means = (format_interval(mean_metric(group, source, name)) for name in METRICS)
-            rows.append([source or str(pooled), arm, *means])
+            rows.append([source or pooled, arm, *means])
     over = metrics.resampled(next(iter(arms.values()))[0].pools[OVERALL].metrics["auc"])
     title = f"by {by}" if over == "images" else f"by {by}, AUC and recall at FPR over {over}"
     return Table(title, [by, "network", *TITLES], rows)
@@ -87,7 +85,7 @@ def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
 
 
 def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
-    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high, means.
+    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high.
 
     The interval is a 95 % bootstrap interval over objects and images (`resample`), the same ones for all runs, and over
     seeds, which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n, the
@@ -99,23 +97,21 @@ def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], sou
     value, base = (fmean(find_metric(pool.metrics, name)["value"] for pool in seeds) for seeds in pools)
     one, other = (np.stack([pool.replicates[name] for pool in seeds]) for seeds in pools)
     replicates = metrics.replicate_difference(one, other, _paired(group, reference))
-    return {"value": value - base, "means": (value, base), **metrics.interval(replicates)}
+    return {"value": value - base, **metrics.interval(replicates)}
 
 
 def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
     return [evaluation.run.seed or 0 for evaluation in group] == [evaluation.run.seed or 0 for evaluation in reference]
 
 
-def difference_tables(
-    arms: Evaluations, pooled: str, groups: Sequence[str] | None = None, by: str = "source"
-) -> list[Table]:
-    """The differences by group and metric of each of `pairs_of`. pooled: OVERALL's name. groups: None for all."""
+def difference_tables(arms: Evaluations, pooled: str = "all", by: str = "source") -> list[Table]:
+    """The differences by source or mesh and metric of each of `pairs_of`. pooled: OVERALL's name."""
     tables = []
     for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]
-            for source in (reference[0].pools if groups is None else groups)
+            for source in reference[0].pools
         ]
         paired = ", paired" if _paired(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
@@ -125,8 +121,7 @@ def difference_tables(
 
 def overall_differences(arms: Evaluations) -> Table:
     """The rows for all images of `difference_tables`."""
-    tables = difference_tables(arms, "all", [OVERALL])
-    rows = [[table.title, *table.rows[0][1:]] for table in tables]
+    rows = [[table.title, *table.rows[0][1:]] for table in difference_tables(arms)]
     return Table("differences on the same images", ["networks", *TITLES], rows)
 
 

@@ -1,15 +1,11 @@
 """A page of runs and attacks, report.html, which loads nothing else."""
 
-import os
-import re
 import shlex
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import datetime
 from itertools import islice
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -20,20 +16,19 @@ from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.loop import attack_success
-from train.photographs.metrics import OVERALL, metric_title
+from train.photographs.metrics import OVERALL
 from train.photographs.sheet import evenly
 from train.report import compare, plots, summary
 from train.report.plots import Picture
-from train.report.summary import Arms, RunSummary, Scored
+from train.report.summary import RunSummary, Scored
 from train.run_folder import CONFIG, read_config
-from train.tables import as_text, format_interval
+from train.tables import as_text
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
 MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with images
 ATTACK_EXAMPLES = 4  # with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
-HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")  # of METRICS, in the first sentences
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
@@ -51,18 +46,14 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     for folder, _, lines in [run for run in unfinished if run[2]][:MOST_UNFINISHED]:
         epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
     trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
-    read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
-    times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
     options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
     environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
-        title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
+        title=f"Trained with renders: {', '.join(arms)}" if arms else "Attacks" if attacks else "Unfinished runs",
         networks=len(runs),
         place=", ".join(map(str, folders)),
-        date=f"{datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "",
-        lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
         curves=_curves(epochs),
@@ -73,9 +64,6 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         attacks=attacks,
         shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
-    here = rf"(?<![\w./-]){re.escape(os.getcwd())}/"  # paths are relative, except in commands, which work anywhere
-    parts = re.split(r"(<summary>command.*?</pre>)", page, flags=re.DOTALL)
-    page = "".join(part if index % 2 else re.sub(here, "", part) for index, part in enumerate(parts))
     out.mkdir(parents=True, exist_ok=True)
     (out / PAGE).write_text(page, encoding="utf-8", errors="replace")
     return out / PAGE
@@ -151,60 +139,24 @@ def _side(label: str, when: str, side: Side) -> Picture:
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
-def _title(arms: Arms) -> str:
-    labels = dict.fromkeys(group[0].label for group in arms.values() if group[0].label)
-    names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
-    return f"{' and '.join(labels)}, trained with renders: {', '.join(names)}"
-
-
-def _accuracy_sentences(arms: Arms) -> list[str]:
-    """How the test accuracy of each arm compares with that of the network that it began with."""
-    sentences = []
-    for arm, group in arms.items():
-        bases = [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]
-        if bases:
-            after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
-            verb = "rose" if after > before else "fell" if after < before else "stayed"
-            data = OmegaConf.select(group[0].config, "data.name")
-            sentences.append(f"{arm}: accuracy on the test images of {data} {verb} from {before:.1%} to {after:.1%}.")
-    return sentences
-
-
 def _photographs(title: str, group: Scored) -> dict[str, Any]:
     """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
     paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
     sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}
     tables = [summary.score_table("", group)]
-    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "sentences": []}
+    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "error": ""}
     try:
         if evaluations := compare.read_evaluations(group):
             first = next(iter(evaluations.values()))[0]
             scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
             content["roc"] = plots.roc(scores, first.pools[OVERALL].label)
-            content["sentences"] = _difference_sentences(evaluations, title)
             tables.append(compare.overall_differences(evaluations))
             if len(first.pools) > 1:
                 tables.append(compare.group_table(evaluations))
     except InputError as error:
-        content["sentences"] = [str(error)]
+        content["error"] = str(error)
     content["tables"] = [table.known for table in tables]
     return content
-
-
-def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
-    """How far each of HEADLINES is from that of the arm that an arm is compared with."""
-    sentences = []
-    for arm, base in compare.pairs_of(arms):
-        parts = []
-        for metric in HEADLINES:
-            if result := compare.difference(arms[arm], arms[base], OVERALL, metric):
-                after, before = result["means"]
-                doubtful = result["low"] <= 0 <= result["high"]
-                difference = "no difference is shown" if doubtful else format_interval(result, "+")
-                parts.append(f"{metric_title(metric)} {before:.2f} and {after:.2f} ({difference})")
-        if parts:
-            sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
-    return sentences
 
 
 def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,8 +25,6 @@ DEPTH = 4  # folders below the one that is named
 MOST_NAMED, LONGEST_NAME = 30, 56  # arms named by their settings, and characters of such a name
 INITIAL = "the initial network"  # in place of an arm, of a network that runs of the tables began with
 
-# ------------------------------------------------------------------------------------- runs
-
 
 @dataclass(frozen=True)
 class RunSummary:
@@ -39,7 +37,6 @@ class RunSummary:
 
     folder: Path
     arm: str
-    label: str
     settings: Mapping[str, object]
     photographs: dict[str, dict[str, Any]]
     accuracy: float | None
@@ -73,11 +70,12 @@ def summarize(folder: Path) -> RunSummary:
         if is_finished(folder):
             return _read_run(folder)
         if (folder / SUMMARY).is_file():
-            return _network(whole.parent, name, settings, {whole.name: read_json(folder / SUMMARY)}, None)
+            scores = _metrics({whole.name: read_json(folder / SUMMARY)})
+            return RunSummary(whole.parent, name, settings, scores, None)
         if (folder / PUBLISHED).is_file():
             scores = load_selected(folder)[1].get("scores", {})
             photographs = {key: value for key, value in scores.items() if isinstance(value, dict)}
-            return _network(folder, name, settings, photographs, scores.get("test/accuracy"))
+            return RunSummary(folder, name, settings, _metrics(photographs), scores.get("test/accuracy"))
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
     except InputError:
         raise
@@ -92,24 +90,15 @@ def _read_run(folder: Path) -> RunSummary:
     config, before = read_config(folder / CONFIG), None
     if "test/accuracy_before" in scores:
         start = {"train.init_from": config.train.init_from}
-        summaries = _read_summaries(folder / BEFORE)
-        before = _network(folder / BEFORE, INITIAL, start, summaries, scores["test/accuracy_before"])
-    arm, label, settings = str(config.augment.arm), str(config.label), run_folder.decisive_settings(config)
-    accuracy, photographs, seed = scores["test/accuracy"], _metrics(_read_summaries(folder)), int(config.seed)
-    return RunSummary(folder, arm, label, settings, photographs, accuracy, seed, config, epochs, scores, before)
-
-
-def _network(
-    folder: Path, name: str, settings: Mapping[str, object], summaries: Mapping[str, Any], accuracy: float | None
-) -> RunSummary:
-    """A network that no run of the tables trained."""
-    photographs = _metrics(summaries)
-    label = next((scores["label"] for scores in photographs.values()), "")
-    return RunSummary(folder, name, label, settings, photographs, accuracy)
+        path, accuracy = folder / BEFORE, scores["test/accuracy_before"]
+        before = RunSummary(path, INITIAL, start, _read_summaries(path), accuracy)
+    arm, settings, seed = str(config.augment.arm), run_folder.decisive_settings(config), int(config.seed)
+    accuracy, photographs = scores["test/accuracy"], _read_summaries(folder)
+    return RunSummary(folder, arm, settings, photographs, accuracy, seed, config, epochs, scores, before)
 
 
 def _read_summaries(folder: Path) -> dict[str, dict[str, Any]]:
-    return {path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))}
+    return _metrics({path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))})
 
 
 def _metrics(summaries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -125,9 +114,6 @@ def _metrics(summaries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any
         chosen = {"threshold": float(point["threshold"]), "operating_point": describe_point(point)} if point else {}
         photographs[name] = {"images": images, "label": label, **metrics, **chosen}
     return photographs
-
-
-# ------------------------------------------------------------------------------------- arms
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
@@ -173,9 +159,6 @@ def by_images(arms: Arms) -> dict[str, Scored]:
             title += "" if resampled(auc) == "images" else "; AUC and recall at FPR over objects, too"
         titled[f"{title} ({len(titled) + 1})" if title in titled else title] = group
     return titled
-
-
-# ------------------------------------------------------------------------------------- tables
 
 
 def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
@@ -239,9 +222,6 @@ def _run_table(
 def _spread(metrics: Sequence[Metric]) -> str:
     values = [metric["value"] for metric in metrics if metric.get("value") is not None]
     return f"{fmean(values):.3f} ± {stdev(values):.3f}" if len(values) == len(metrics) else "-"
-
-
-# ------------------------------------------------------------------------------------- attacks and folders
 
 
 def read_attack(folder: Path) -> dict[str, Any]:

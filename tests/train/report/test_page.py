@@ -105,17 +105,6 @@ def test_a_line_is_drawn_where_it_has_points_that_differ():
     assert plots.curves({"a": [[(1, 0.5)]], "b": [[(1, 0), (2, 1)]]}, "x") is not None
 
 
-def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monkeypatch):
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
-    paths = [here / "a" / "data.npz", tmp_path / "there" / "orange.glb", f"/else{here}/data.glb"]
-    made_up_run(here / "run", "none", None, f"data.path={paths[0]}", f"scene.meshes=['{paths[1]}','{paths[2]}']")
-    text = write_report([here / "run"], here).read_text()
-    assert "path: a/data.npz" in text and str(paths[1]) in text and paths[2] in text
-    assert str(here) not in text.replace(paths[2], "")
-
-
 def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
     """A run that cannot be read beside one that can is named in the page."""
     with pytest.raises(InputError, match="holds no run and no attack"):
