@@ -37,8 +37,6 @@ NAMES = {"float": "computed", "reload": "rendered again from the saved files", "
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
 LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
-# ------------------------------------------------------------------------------------- settings
-
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
@@ -129,9 +127,6 @@ class AttackExperimentSettings:
             self.scene.lamps = LampsSettings(start=LAMP_POWER)
 
 
-# ------------------------------------------------------------------------------------- the run
-
-
 def run(settings: AttackExperimentSettings) -> None:
     """Attack each mesh or the reloaded adversary, write what came of it, and print a summary."""
     adversary = reload(settings.reload) if settings.reload else None
@@ -201,11 +196,7 @@ def attacks(
 
 
 def build_attacked(
-    item: ObjectSettings,
-    settings: AttackExperimentSettings,
-    size: int,
-    device: torch.device,
-    scene: AttackSceneSettings,
+    item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device, scene: SceneSettings
 ) -> Scene:
     """An example per view and background at `size` pixels per side, or per background where views share the attack."""
     options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
@@ -227,9 +218,6 @@ def load_others(settings: AttackExperimentSettings, attacked: Classifier, device
     objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
     arguments = {"classifiers": classifiers, "azimuths": others.azimuths, "objects": objects}
     return {name: argument for name, argument in arguments.items() if argument}
-
-
-# ------------------------------------------------------------------------------------- output
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:

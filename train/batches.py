@@ -28,14 +28,11 @@ class TrainingImages(NamedTuple):
 
 
 class Round(NamedTuple):
-    """The training between two regenerations of the renders: an epoch, or a part of one.
+    """The training between two regenerations of the renders: an epoch, or a part of one."""
 
-    number: counts a run's rounds from 0. epoch: from 0. rows: (N,) int64, ascending, the training images that it shows.
-    """
-
-    number: int
-    epoch: int
-    rows: Tensor
+    number: int  # of the run's rounds, from 0
+    epoch: int  # from 0
+    rows: Tensor  # (N,) int64, ascending, the training images that it shows
 
 
 def rounds_of_epoch(

@@ -1,8 +1,7 @@
 """Checkpoints: written atomically with a hash of their content, read without pickle.
 
 A file holds a dictionary of plain values and tensors. best.pt has `model`, the network's state dict; `architecture`,
-what rebuilds it: version, classes, size, encoding, mean, std and the network's settings (`train.networks.describe`);
-and the `epoch`. last.pt adds what a run needs to go on: `train.loop.Trainer.state_dict`.
+what rebuilds it (`train.networks.describe`); and the `epoch`. last.pt has all of `train.loop.Trainer.state_dict`.
 """
 
 import hashlib

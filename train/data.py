@@ -1,7 +1,6 @@
 """Labeled images as uint8 arrays: CIFAR-100, an .npz file, or a folder of class folders."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from torch import Tensor
 from augment.classifiers.adapter import class_index
 from augment.utils import generator, progress
 from renderer.errors import InputError, in_one_line
-from train import checkpoint, console
+from train import console
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
@@ -29,11 +28,6 @@ class Split:
 
     def to(self, device: torch.device) -> "Split":
         return Split(self.images.to(device), self.labels.to(device))
-
-    @cached_property
-    def content_hash(self) -> str:
-        """`checkpoint.content_hash` of images and labels as they first were."""
-        return checkpoint.content_hash([self.images, self.labels])
 
     def __getitem__(self, rows: Tensor | slice) -> "Split":
         return Split(self.images[rows], self.labels[rows])

@@ -28,10 +28,8 @@ RECOMPILE_LIMIT = 4 * len(SIZES)  # each with and without gradients, which torch
 
 
 def choose_device(name: str) -> torch.device:
-    """auto (CUDA where there is a GPU, else the CPU) or any name torch knows; InputError where it is not available.
-
-    Each process that torchrun starts takes a GPU of its own for "auto" and "cuda".
-    """
+    """auto (CUDA where there is a GPU, else the CPU) or any name torch knows; "cuda" is a GPU for each process of
+    torchrun. InputError where it is not available."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and "LOCAL_RANK" in os.environ:
@@ -51,11 +49,10 @@ def most_threads() -> int:
 
 
 def choose_threads(network: nn.Module, images: Tensor) -> int:
-    """1, or all threads where they take the network over a part of images (N, 3, H, W) in clearly less time: on cores
-    that others use, too, threads wait for each other.
+    """1, or all threads where a trial on images (N, 3, H, W) shows them clearly faster; on cores in use they are not.
 
-    Takes about a second, once for a network and images, so that arms agree. All threads for a GPU and for torchrun's
-    processes, which have one each. The network and the random state are left as they were.
+    The trial takes about a second, once for a network and images, so that arms agree. All threads for a GPU and for
+    torchrun's processes, which have one each. The network and the random state are left as they were.
     """
     most, before, parameters = most_threads(), torch.get_num_threads(), list(network.parameters())
     key = f"{network} {tuple(images.shape)}"
@@ -103,10 +100,7 @@ def choose_precision(precision: str, device: torch.device) -> str:
 
 
 class MixedPrecision(nn.Module):
-    """A network run in channels-last layout under autocast: float32 images in, float32 logits out.
-
-    Only the network computes in the precision; the renderer's products and the loss stay in float32.
-    """
+    """A network in channels-last layout under autocast: float32 images in, float32 logits out."""
 
     def __init__(self, network: nn.Module, precision: str):
         super().__init__()
@@ -121,11 +115,8 @@ class MixedPrecision(nn.Module):
 
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Whether to compile.
-
-    "auto" does on one GPU where torch.compile works, which needs a C compiler and Python's headers; several processes
-    wait for each other inside a pass. InputError for "always" on a CPU, which has no graphs to replay.
-    """
+    """Whether to compile: for "auto" on one GPU where torch.compile works, which needs a C compiler; several processes
+    wait for each other inside a pass. InputError for "always" on a CPU, which has no graphs to replay."""
     if choice == "always" and device.type == "cpu":
         raise InputError("train.compile=always is for a GPU, whose graphs it replays: use auto or never")
     if choice != "auto" or device.type != "cuda" or utils.world_size() > 1:

@@ -34,16 +34,12 @@ SHOWN = ("attack_success_before", "attack_success", "steps")  # of each round's 
 
 @dataclass
 class EpochState:
-    """How far an epoch has come.
+    """How far an epoch has come."""
 
-    renders: of the current round. sums: loss and hits over the images that this process has trained on, (2,).
-    diagnostics: of the renders of each round so far. step: steps taken, in all rounds.
-    """
-
-    renders: Renders
-    sums: Tensor
-    diagnostics: list[Mapping[str, float]]
-    step: int = 0
+    renders: Renders  # of the current round
+    sums: Tensor  # (2,) loss and hits over the images that this process has trained on
+    diagnostics: list[Mapping[str, float]]  # of the renders of each round so far
+    step: int = 0  # steps taken, in all rounds
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors, over all processes; the renders as bytes, as they are trained on."""
@@ -55,8 +51,8 @@ class EpochState:
 class Trainer:
     """One run's network, optimizer, augmentation service and folder. `fit` trains; `resume` goes on with the folder.
 
-    model: the network that is trained. initial: a copy as the run began, where that was with another's weights. ema,
-    soup: its averages, if any. selected: the network that is validated and kept: the soup, the average or the model.
+    model: the network that is trained. initial: a copy as the run began, where that was with another's weights: the
+    teacher, and where a soup's epochs begin. ema, soup: averages, if any. selected: that which is validated and kept.
     """
 
     def __init__(
@@ -67,8 +63,7 @@ class Trainer:
         service: AugmentationService,
         folder: Path,
     ):
-        """architecture: what rebuilds the network from a checkpoint, classes included. The model as it begins is the
-        teacher of a distillation, and each epoch of a soup begins with it.
+        """architecture: what rebuilds the network from a checkpoint, classes included.
 
         InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
         """
@@ -112,8 +107,7 @@ class Trainer:
         """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
 
         split: on the trainer's device. held_out: (N,) bool on the CPU, which of its images validate. log: of the
-        process that writes. InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked
-        for it.
+        process that writes. InputError where training diverges; `Interrupted`, after a checkpoint, by a signal.
         """
         train, validation = (torch.nonzero(chosen).squeeze(1) for chosen in (~held_out, held_out))
         with Interruption() as interruption:
@@ -173,10 +167,9 @@ class Trainer:
         return renders
 
     def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
-        """Learn from uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool; returns (2,) the sum of
-        their losses, and how many predictions were correct.
+        """Learn from a batch of `training_batches` at a fraction of the epoch, in the run's step of that number.
 
-        progress: the fraction of the epoch that is over. number: the run's step.
+        Returns (2,) the sum of the losses, and how many predictions were correct.
         """
         settings = self.settings
         if not settings.soup:
@@ -314,10 +307,7 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
 
 @torch.no_grad()
 def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
-    """Mean cross entropy and top-1 accuracy on a split, or its rows, in eval mode; the model's mode is restored.
-
-    Every process of a run scores its shard of the images; all get the result.
-    """
+    """Mean cross entropy and top-1 accuracy in eval mode on a split, or its rows; each process scores a shard."""
     rows = (torch.arange(len(split)) if rows is None else rows).to(split.images.device)
     loss_sum, hits = totals = torch.zeros(2, device=split.images.device)
     batches = rows[utils.rank() :: utils.world_size()].split(EVALUATION_BATCH)

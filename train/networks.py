@@ -33,8 +33,6 @@ FACTS = ("version", "encoding", "validation")  # stored with a network, which is
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
 _OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
 
-# ------------------------------------------------------------------------------------- wide residual networks
-
 
 class WideResNet(nn.Module):
     """WRN-depth-width (Zagoruyko and Komodakis 2016) for small images; WRN-16-4 has 2.77 M parameters for 100 classes.
@@ -133,9 +131,6 @@ class Dropout(nn.Dropout):
         return factors
 
 
-# ------------------------------------------------------------------------------------- building
-
-
 def build_network(
     classes: Sequence[str], size: int, name: str = WIDERESNET, mean: Color = MEAN, std: Color = STD, **shape: Any
 ) -> nn.Module:
@@ -176,15 +171,10 @@ def build_network(
 
 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
-    """The description that is stored with the weights, so that a network can be used without its run's configuration.
-
-    shape: the network's own settings. Its normalization is a part of it, unless the network's own code has it.
-    """
+    """The description that is stored with the weights, so that a network can be used without its run's configuration:
+    with `shape`, the network's own settings, and its normalization, unless the network's own code has it."""
     statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
     return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
-
-
-# ------------------------------------------------------------------------------------- loading and publishing
 
 
 def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:

@@ -84,12 +84,11 @@ class TrainSettings:
 
 
 def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None) -> Loss:
-    """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and the number
-    of correct predictions.
+    """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and how many
+    predictions are correct.
 
-    The loss is the mean `label_loss`; plus, by their weights in the settings, the `ranking_loss` of the class `label`
-    and the `divergence` from the teacher's predictions: on renders, of all classes but `label`, which are to change
-    in nothing; none without a label.
+    The loss is the mean `label_loss` plus, by their weights, the `ranking_loss` of the class `label` and the
+    `divergence` from the teacher's predictions: on renders, of all classes but `label`, or none without a label.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,12 +129,8 @@ class MovingAverage(AveragedModel):
 
 
 def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
-    """One of `AUGMENTATIONS`, the usual ways to robustness: PGD against the model, or a transform of torchvision's, the
-    jitter at half the strengths of Chen et al. 2020, as is usual for small images.
-
-    Every image is changed by draws of its own, which depend on the seed, the step and its index in the global batch
-    alone.
-    """
+    """One of `AUGMENTATIONS`: PGD against the model, or a transform of torchvision's, the jitter at half the strengths
+    of Chen et al. 2020, as is usual for small images. The draws for an image depend on seed, step and its index."""
     if name == "none":
         return lambda images, labels, step: images
     if name == "pgd":

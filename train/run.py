@@ -30,19 +30,16 @@ from train.rendered_shapes import load_shapes, relabeled
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
+Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_selected` gives it
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
 
 
-def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> dict[str, float]:
-    """Train one arm into `folder` and score it; the scores, which are in the folder's files, too.
-
-    command: the one that was given, to be recorded.
-    """
-    return prepare(settings, data, folder, command)()
-
-
 def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], dict]:
-    """All of `run` that comes before the first epoch, where wrong input shows; returns a function for the rest."""
+    """Begin a run of one arm: all that comes before the first epoch, where wrong input shows.
+
+    Returns a function that trains and scores, and gives the scores, which are in the folder's files, too. command: the
+    one that was given, to be recorded.
+    """
     base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
     if base and settings.data.name == "shapes":
         data = relabeled(data, base[1]["architecture"]["classes"])
@@ -114,9 +111,7 @@ def load_data(settings: ExperimentSettings) -> DataSet:
     return loaded
 
 
-def _validation(
-    settings: ExperimentSettings, split: Split, base: tuple[Path, dict[str, Any]] | None
-) -> tuple[float, dict[str, Any] | None]:
+def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
     """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
     its fraction and seed, and a hash of the images. None where `base`, the network begun with, does not know its own.
 
@@ -124,7 +119,7 @@ def _validation(
     """
     asked, init_from = settings.data.validation, settings.train.init_from
     fraction = VALIDATION if asked is None else asked
-    own = {"fraction": fraction, "seed": 0, "images": split.content_hash}
+    own = {"fraction": fraction, "seed": 0, "images": checkpoint.content_hash([split.images, split.labels])}
     if base is None:
         return fraction, own
     stored = base[1]["architecture"].get("validation")
@@ -139,17 +134,11 @@ def _validation(
 
 
 def build_trainer(
-    settings: ExperimentSettings,
-    data: DataSet,
-    folder: Path,
-    base: tuple[Path, dict[str, Any]] | None,
-    left_out: dict[str, Any] | None,
-    threads: int | None,
+    settings: ExperimentSettings, data: DataSet, folder: Path, base: Base, left_out: dict | None, threads: int | None
 ) -> Trainer:
     """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before.
 
-    base: the network to begin with, as `load_selected` gives it. left_out: the training images that validate it, to be
-    stored with its architecture. threads: None where a trial is to choose.
+    left_out: the part that validates the network, stored with it. threads: None where a trial is to choose.
     """
     device, shape = choose_device(settings.train.device), settings.model.shape
     precision = choose_precision(settings.train.precision, device)
@@ -226,10 +215,7 @@ def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
 def _score_photographs(
     settings: ExperimentSettings, model: Model, data: DataSet, folder: Path, device: torch.device
 ) -> dict[str, Any]:
-    """Score a model on each folder of photographs, in a sub-folder of its name; the summaries by name.
-
-    The first process does so alone; the others get {}.
-    """
+    """Score a model on each folder of photographs, in a sub-folder of its name; the summaries of the first process."""
     label, skip = settings.label, settings.evaluate.skip_unreadable
     return {
         name: evaluate_photographs(model, data.classes, photographs, label, folder / name, data.size, skip, device)

@@ -45,8 +45,6 @@ INPUTS = (
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
 )
 
-# ------------------------------------------------------------------------------------ one writer
-
 
 @contextmanager
 def locked(folder: Path) -> Iterator[bool]:
@@ -90,9 +88,6 @@ def state(folder: Path) -> str:
     return "interrupted"
 
 
-# ------------------------------------------------------------------------------------ files
-
-
 @contextmanager
 def _text_of(path: Path) -> Iterator[str]:
     """A file's text; InputError naming the file for whatever reading it, or using its text inside, raises."""
@@ -105,11 +100,8 @@ def _text_of(path: Path) -> Iterator[str]:
 
 
 def read_config(path: Path) -> DictConfig:
-    """A config.yaml that a run or an attack wrote; InputError naming a damaged file.
-
-    Files with aliases or interpolations are refused: a short alias can stand for more than memory holds, and an
-    interpolation would show the reader's environment.
-    """
+    """A config.yaml that a run or an attack wrote; InputError naming a file that is damaged, or has an alias, which can
+    stand for more than memory holds, or an interpolation, which would show the reader's environment."""
     with _text_of(path) as text:
         if "${" in text or any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
             raise ValueError("it holds an alias or an interpolation")
@@ -120,11 +112,8 @@ def read_config(path: Path) -> DictConfig:
 
 
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
-    """Write config.yaml: a command's settings, a dataclass; facts found at the start; hashes of inputs; versions.
-
-    With a command, also the folder that it was first given in, to which its paths may be relative. Facts with an
-    interpolation, which `read_config` refuses, are left out.
-    """
+    """Write config.yaml: a command's settings, a dataclass; hashes of inputs; versions; facts found at the start, but
+    none with an interpolation, which `read_config` refuses; with a command, the folder that it was first given in."""
     folder.mkdir(parents=True, exist_ok=True)
     packages = {name: version(name) for name in ("torchvision", "numpy")}
     versions = {"python": platform.python_version(), "torch": str(torch.__version__), **packages}
@@ -165,9 +154,6 @@ def _object(text: str) -> dict[str, Any]:
     if not isinstance(parsed, dict) or not parsed:
         raise ValueError("it holds no object of keys and values")
     return parsed
-
-
-# ------------------------------------------------------------------------------------ resuming
 
 
 def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
@@ -256,14 +242,10 @@ def _content_hash(path: Path, size: int, modified: int) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
-# ------------------------------------------------------------------------------------ logs
-
-
 class RunLog:
     """Writes a run folder's metrics.jsonl, TensorBoard events, renders and attack examples; OSError on a full disk.
 
-    history: the epochs' lines of the checkpoint that a run resumes from. They replace the file's lines, since later
-    epochs are trained again; TensorBoard is told to forget those, too.
+    history: the lines of the epochs before, in place of those of the files, since a resumed run repeats some.
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
@@ -274,9 +256,9 @@ class RunLog:
         self._board = SummaryWriter(str(folder), purge_step=self._epochs + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
-        """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores.
+        """Log plain numbers; `group/name` keys become TensorBoard's groups.
 
-        TensorBoard shows the final scores, which end the log, one step after the last epoch.
+        epoch: None for the final scores, which end the log, in TensorBoard one step after the last epoch.
         """
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:

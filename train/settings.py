@@ -167,9 +167,6 @@ def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "
     return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
 
 
-# ------------------------------------------------------------------------------------- reading configurations
-
-
 def quoted(text: str) -> str:
     """The text as a value that Hydra reads as it is."""
     escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)

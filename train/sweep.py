@@ -24,7 +24,7 @@ from train.errors import one_sentence, writable_folder
 from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import is_finished, summarize
-from train.run import load_data, run
+from train.run import load_data, prepare
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, quoted, read_settings
 
@@ -110,7 +110,7 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
             settings = read_settings(ExperimentSettings, config)
             settings.train.resume = checkpoint.exists(folder)
             command = given_command([*map(_unescaped, HydraConfig.get().overrides.task)])
-            run(settings, load_data(settings), folder, command)
+            prepare(settings, load_data(settings), folder, command)()
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()

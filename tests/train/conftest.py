@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from train.run import load_data, run
+from train.run import load_data, prepare
 from train.run_folder import write_config
 from train.settings import ExperimentSettings, compose, read_settings
 
@@ -74,7 +74,7 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
     """The folder of a finished adversarial run, scored on photographs."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     settings = tiny(f"evaluate.photos={photos}")
-    run(settings, load_data(settings), folder)
+    prepare(settings, load_data(settings), folder)()
     return folder
 
 

@@ -5,14 +5,14 @@ import torch
 
 from train import checkpoint
 from train.loop import Trainer
-from train.run import load_data, run
+from train.run import load_data, prepare
 from train.run_folder import read_metrics
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
 def weights_of(config, folder) -> dict[str, torch.Tensor]:
-    run(config, load_data(config), folder)
+    prepare(config, load_data(config), folder)()
     return checkpoint.load(folder / checkpoint.LAST)["model"]
 
 

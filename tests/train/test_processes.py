@@ -19,7 +19,7 @@ from augment import AugmentationService, AugmentationSettings, utils
 from augment.scene import Scene
 from train import checkpoint, loop
 from train.processes import Interrupted, Interruption, process_group
-from train.run import load_data, run
+from train.run import load_data, prepare
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings, read_settings
 
@@ -45,7 +45,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
 
 def run_from_file(config: Path, folder: Path) -> None:
     settings = read_settings(ExperimentSettings, OmegaConf.load(config))
-    run(settings, load_data(settings), folder)
+    prepare(settings, load_data(settings), folder)()
 
 
 def random_arm(file: Path) -> None:

@@ -19,13 +19,13 @@ from train.errors import one_sentence
 from train.networks import load_run
 from train.processes import Interrupted
 from train.report.summary import summarize
-from train.run import load_data, prepare, run
+from train.run import load_data, prepare
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
 
 
 def train(settings: ExperimentSettings, folder: Path) -> dict[str, float]:
-    return run(settings, load_data(settings), folder)
+    return prepare(settings, load_data(settings), folder)()
 
 
 def weights(folder: Path) -> list[str]:
@@ -76,7 +76,7 @@ def test_the_training_set_lies_in_memory_once(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(batches, "CHUNK_BYTES", 1)
     act_at(monkeypatch, 0, 2, lambda: after.append(large()))
     before = large()
-    run(tiny("augment=none", "train.epochs=1"), data, tmp_path)
+    prepare(tiny("augment=none", "train.epochs=1"), data, tmp_path)()
     assert after == [before] and data.train.images.data_ptr() in before
 
 
@@ -84,7 +84,7 @@ def test_more_epochs_stretch_the_schedule_and_a_jump_of_its_rate_is_said(tiny, t
     """One cycle's rate ends at zero; half way through, it is .5 / .8 of the highest."""
     keys = "augment=none", "train.schedule=one_cycle", "train.resume=true"
     data = load_data(tiny())
-    run(tiny(*keys, "train.epochs=1"), data, tmp_path)
+    prepare(tiny(*keys, "train.epochs=1"), data, tmp_path)()
     prepare(tiny(*keys, "train.epochs=1"), data, tmp_path)
     assert not any(record.levelname == "WARNING" for record in caplog.records)
     prepare(tiny(*keys, "train.epochs=2"), data, tmp_path)
@@ -284,7 +284,7 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
             looks.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
             return data.test
 
-    run(tiny("augment=none"), GuardedData(), tmp_path)
+    prepare(tiny("augment=none"), GuardedData(), tmp_path)()
     assert looks == [3]
     *epochs, scores = read_metrics(tmp_path)
     accuracies = [line["validation/accuracy"] for line in epochs]
