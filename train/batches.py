@@ -54,9 +54,8 @@ def training_batches(
     """This process's shard of a round's batches: images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
 
     Shuffles, reflect-pads by 4 and crops, then flips half: "random" ones, or "alternating", each image in every
-    other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
-    first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
-    any number of processes. first: the batch to begin with.
+    other epoch. All batches have one shape; the last one is filled up with the round's first images. All draws are made
+    on the CPU, the same for every device and number of processes. first: the batch to begin with.
     """
     (split, data, renders), rows = images, now.rows
     order = rows[torch.randperm(len(rows), generator=generator(seed, now.number, "batches"))]

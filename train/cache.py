@@ -1,7 +1,7 @@
 """Tensors on disk, from run to run: each file under a hash of all that went into it.
 
-A file is a checksum and then the tensors in the safetensors format. It is parsed only if the checksum holds. So a
-damaged file is computed anew; any file may be deleted at any time, and processes may share the folder.
+A file is a checksum and then the tensors in the safetensors format, parsed only if the checksum holds. A file may be
+damaged or deleted at any time, and processes may share the folder.
 """
 
 import hashlib
@@ -38,8 +38,7 @@ def source_key(*packages: Path) -> str:
 class TensorCache:
     """Named tensors in files of a folder, under keys of `content_hash`.
 
-    folder: made when first written to; None: nothing is written. Where it cannot be written to, a warning is logged,
-    and the run goes on, since everything can be computed again.
+    folder: made when first written to, or a warning is logged where it cannot be; None: nothing is written.
     """
 
     def __init__(self, folder: Path | None = None):

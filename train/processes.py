@@ -62,8 +62,7 @@ def summed(values: Tensor) -> Tensor:
 def replicated(model: nn.Module) -> nn.Module:
     """The model whose gradients are averaged over all processes; itself where there is but one.
 
-    On GPUs, batch normalization takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result
-    does not depend on the number of processes; on CPUs, over each process's part.
+    Batch normalization takes its statistics over the whole batch on GPUs, over each process's part on CPUs.
     """
     if utils.world_size() == 1:
         return model
@@ -81,11 +80,8 @@ class Interrupted(SystemExit):
 
 
 class Interruption:
-    """Notes the first of `SIGNALS` while it is entered; a second one acts as it would without.
-
-    So does the first where nobody asks for it until it is left. Signals that the process was started to ignore stay
-    ignored, and they reach its main thread alone: in another one, none is noted.
-    """
+    """Notes the first of `SIGNALS` while it is entered, in the main thread, which alone gets them; a second one acts as
+    it would without, as does the first where nobody asks for it. Those that the process was to ignore stay ignored."""
 
     def __init__(self) -> None:
         self._number: int | None = None

@@ -139,7 +139,17 @@ def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
 
     jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
     transform = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide(), "augmix": v2.AugMix()}[name]
-    return lambda images, labels, step: _transform_each(transform, images, seed, step)
+
+    def transform_each(images: Tensor, labels: Tensor, step: int) -> Tensor:
+        """torchvision's transforms draw once for a whole batch, and from the global generator."""
+        transformed = []
+        with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
+            for index, image in enumerate(images, utils.rank() * len(images)):
+                torch.manual_seed(stream_seed(seed, step, index, "distortion"))
+                transformed.append(transform(image))
+        return torch.stack(transformed)
+
+    return transform_each
 
 
 @torch.enable_grad()
@@ -157,14 +167,3 @@ def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator
             moved = adversarial.detach() + PGD_STEP * gradient.sign()
             adversarial = moved.clamp(clean - PGD_RADIUS, clean + PGD_RADIUS).clamp(0, 1)
     return to_bytes(adversarial)
-
-
-def _transform_each(transform: nn.Module, images: Tensor, seed: int, step: int) -> Tensor:
-    """torchvision's transforms draw once for a whole batch, and from the global generator."""
-    first = utils.rank() * len(images)
-    transformed = []
-    with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-        for index, image in enumerate(images, first):
-            torch.manual_seed(stream_seed(seed, step, index, "distortion"))
-            transformed.append(transform(image))
-    return torch.stack(transformed)

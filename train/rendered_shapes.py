@@ -38,11 +38,15 @@ CODE = source_key(*(Path(module).parent for module in (renderer.__file__, augmen
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
     """That many training and test images of every solid, in even light; whole instances (20 images) each."""
-    parts, labels = {"train": train, "test": test}, torch.arange(len(CLASSES))
-    splits = (
-        Split(_cached_images(part, count, size, seed, cache), labels.repeat_interleave(count))
-        for part, count in parts.items()
-    )
+    cache, settings, splits = cache or TensorCache(), replace(SETTINGS, size=size), []
+    for part, count in (("train", train), ("test", test)):
+        key = content_hash([CODE, CLASSES, count, seed, part, settings])
+        cached = cache.read(key)
+        if cached is None:
+            cached = {"images": _render(part, count, seed, settings)}
+            cache.write(key, cached)
+        console.info("%s images: %d", part, len(cached["images"]))
+        splits.append(Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(count)))
     return DataSet(CLASSES, *splits)
 
 
@@ -58,17 +62,6 @@ def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
     strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
     return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
-
-
-def _cached_images(part: str, per_class: int, size: int, seed: int, cache: TensorCache | None) -> Tensor:
-    cache, settings = cache or TensorCache(), replace(SETTINGS, size=size)
-    key = content_hash([CODE, CLASSES, per_class, seed, part, settings])
-    cached = cache.read(key)
-    if cached is None:
-        cached = {"images": _render(part, per_class, seed, settings)}
-        cache.write(key, cached)
-    console.info("%s images: %d", part, len(cached["images"]))
-    return cached["images"]
 
 
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:

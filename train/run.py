@@ -113,10 +113,7 @@ def load_data(settings: ExperimentSettings) -> DataSet:
 
 def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
     """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
-    its fraction and seed, and a hash of the images. None where `base`, the network begun with, does not know its own.
-
-    Of one seed, a smaller part lies within a larger one. So a network's part is the smallest along its ancestors.
-    """
+    the smallest along its ancestors, since parts of one seed are nested, or None where `base` does not know its own."""
     asked, init_from = settings.data.validation, settings.train.init_from
     fraction = VALIDATION if asked is None else asked
     own = {"fraction": fraction, "seed": 0, "images": checkpoint.content_hash([split.images, split.labels])}

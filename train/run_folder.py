@@ -135,10 +135,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The lines of a run's metrics.jsonl, one per epoch, then the final scores; [] without the file.
-
-    A last line that a crash cut short is skipped. InputError naming a damaged file.
-    """
+    """The lines of a run's metrics.jsonl, one per epoch, then the final scores, but none that a crash cut short; []
+    without the file. InputError naming a damaged file."""
     path = folder / METRICS
     if not path.is_file():
         return []
@@ -193,10 +191,8 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
 
 
 def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> DictConfig:
-    """The configuration of the run in the folder; InputError where its decisive settings or input files are others.
-
-    A run that goes on may get more epochs and another evaluation, unless it is finished.
-    """
+    """The configuration of the run in the folder; InputError where its decisive settings or input files are others,
+    but for more epochs and another evaluation of a run that is not finished."""
     config, elsewhere = read_config(folder / CONFIG), "another folder with run= (sweep=)"
     before, asked = decisive_settings(ExperimentSettings()) | decisive_settings(config), decisive_settings(settings)
     for key in sorted(before.keys() | asked.keys()):
