@@ -61,8 +61,7 @@ def main(settings: Settings) -> None:
     with sole_writer("out", out):
         if settings.calibrate and settings.false_positive_rate:
             folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
-            scored = scoring.predict_folder(model, network.classes, folder, label, *options)
-            point = scoring.choose_operating_point(scored, folder, label, rate)
+            point = scoring.choose_operating_point(model, network.classes, folder, label, rate, *options)
         point = point if point and point.label == label else None
         photos, by = published(Path(settings.photos)), settings.by
         summary = scoring.evaluate_photographs(model, network.classes, photos, label, out, *options, by, point)

@@ -57,9 +57,9 @@ def main(settings: Settings) -> None:
         network = load_run(path, model=settings.model)  # or InputError, since nobody could use it
     if settings.calibrate and settings.false_positive_rate:
         network.half().float()  # as it is published
-        folder, label = published(Path(settings.calibrate)), settings.label
-        scored = scoring.predict_folder(network, network.classes, folder, label, network.size, False, "cpu")
-        point = scoring.choose_operating_point(scored, folder, label, settings.false_positive_rate)
+        folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
+        options = network.classes, folder, settings.label, rate, network.size, False, "cpu"
+        point = scoring.choose_operating_point(network, *options)
         state["operating_point"] = asdict(point)
         print(f"threshold {point.threshold:.3f} for {scoring.describe_point(state['operating_point'])}")
     out.mkdir(parents=True, exist_ok=True)

@@ -108,7 +108,7 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
         ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of another class"),
         ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, r"meshes\[0\]: the label '.*x' names the"),
         ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label: give {mesh: fruit.glb, label: "),
-        ({"setups": 5}, "setups=5 must be a positive multiple of the 2 patterns"),
+        ({"setups": 5}, "setups=5 must be a multiple of the 2 patterns"),
         ({"patterns": ["stripes+slides"]}, "patterns has slides: name image files in slides="),
         ({"patterns": ["stripe"]}, "patterns=stripe: choose one of solid, gradient, stripes"),
     ],

@@ -25,8 +25,10 @@ from train.settings import LARGEST_SEED
 
 OTHERS = "apple:101 apple:102 pear:101 sweet_pepper:101 lemon:101 lemon:102 peach:101 peach:102 ball:101 ball:103"
 SOLIDS = [*(f"orange:{seed}" for seed in range(101, 107)), *OTHERS.split()]
-LARGEST = {"setups": 10**6, "size": LARGEST_SIZE, "spp": 10**5, "bounces": 1000}
-LIMITS = {"azimuth": (-180, 180), "elevation": (1, 89), "ambient": (0, 1), "albedo": (0, 1), "roughness": (0.05, 1)}
+LIMITS: dict[str, tuple[float, float]] = {"azimuth": (-180, 180), "elevation": (1, 89), "ambient": (0, 1)}
+LIMITS |= {"albedo": (0, 1), "roughness": (0.05, 1), "brightness": (1 / FACTOR, FACTOR)}
+RANGES: dict[str, tuple[float, float]] = {"walls": (0, 1), "exposure": (1 / FACTOR, FACTOR), "seed": (0, LARGEST_SEED)}
+RANGES |= {"setups": (1, 10**6), "size": (1, LARGEST_SIZE), "spp": (1, 10**5), "bounces": (1, 1000)}
 FOV = 25.0  # degrees, of the camera
 
 
@@ -62,48 +64,34 @@ class LabSettings:
         if SLIDES in families and not self.slides:
             raise InputError(f"patterns has {SLIDES}: name image files in slides=")
         sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
-        if not sources or self.setups < 1 or self.setups % len(sources):
-            raise InputError(
-                f"setups={self.setups} must be a positive multiple of the {len(sources)} patterns and maps"
-            )
+        if not sources or self.setups % len(sources):
+            raise InputError(f"setups={self.setups} must be a multiple of the {len(sources)} patterns and maps")
         if len(set(sources)) < len(sources):
             raise InputError("patterns and environments must have different names, which are the renders' sources")
-        require_limits("brightness", self.brightness, 1 / FACTOR, FACTOR)
-        for name, (least, greatest) in LIMITS.items():
-            require_limits(name, getattr(self, name), least, greatest)
-        require_range("walls", self.walls, 0, 1)
-        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
-        require_range("seed", self.seed, 0, LARGEST_SEED)
-        for name, most in LARGEST.items():
-            require_range(name, getattr(self, name), 1, most)
+        for name, ends in LIMITS.items():
+            require_limits(name, getattr(self, name), *ends)
+        for name, ends in RANGES.items():
+            require_range(name, getattr(self, name), *ends)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One light, camera, pose and table, for any object.
-
-    brightness: radiance of a white surface that faces all projectors where their images are white, or that faces up
-    under an environment. patterns: the projected images (H, W, 3), of as many projectors. environment: radiance
-    (H, W, 3), laid out as in `renderer.light.environment`, in place of projectors and ambient. ambient: radiance from
-    everywhere (3,). table: albedo (3,). projectors, camera: positions (3,). center, aim: the points (3,) that they look
-    at. rotation: of the object (3, 3). scale: the object's largest coordinate. wall: the point (3,) of a wall that is
-    nearest to `center`. roughness: of the object's surface.
-    """
+    """One light, camera, pose and table, for any object; positions, colors and albedo are (3,)."""
 
     family: str
-    brightness: float
-    patterns: Sequence[np.ndarray]
-    ambient: np.ndarray
-    table: np.ndarray
-    projectors: Sequence[np.ndarray]
-    camera: np.ndarray
-    center: np.ndarray
-    aim: np.ndarray
-    rotation: np.ndarray
-    scale: float
-    roughness: float
-    wall: np.ndarray | None = None
-    environment: np.ndarray | None = None
+    brightness: float  # radiance of a white surface that faces all projectors, where these are white, or up under a map
+    patterns: Sequence[np.ndarray]  # the projected images (H, W, 3), of as many projectors
+    ambient: np.ndarray  # radiance from everywhere
+    table: np.ndarray  # albedo
+    projectors: Sequence[np.ndarray]  # positions
+    camera: np.ndarray  # position
+    center: np.ndarray  # what the projectors look at
+    aim: np.ndarray  # what the camera looks at
+    rotation: np.ndarray  # (3, 3), of the object
+    scale: float  # the object's largest coordinate
+    roughness: float  # of the object's surface
+    wall: np.ndarray | None = None  # the point of a wall that is nearest to `center`
+    environment: np.ndarray | None = None  # radiance (H, W, 3) of `equirectangular`, for projectors and ambient
 
 
 def draw_shots(

@@ -1,6 +1,6 @@
 """The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property, partial, reduce
@@ -26,8 +26,8 @@ IMAGES, RUNS = 0, 1  # seeds, so that images and runs are drawn independently
 Scores = Sequence[float] | np.ndarray
 
 
-def resample(*groups: np.ndarray) -> Iterator[list[np.ndarray]]:
-    """How often replicates of the bootstrap draw each image: (BLOCK, n) per group, until there are REPLICATES.
+def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
+    """A statistic's values, (..., REPLICATES), of how often replicates draw each image, (BLOCK, n) per group.
 
     groups: the object of each image, (n,) numbers by first appearance from 0 on, n at least 1. A replicate draws as
     many objects as a group has, with replacement, and from each as many images as it has (Davison and Hinkley 1997,
@@ -36,8 +36,8 @@ def resample(*groups: np.ndarray) -> Iterator[list[np.ndarray]]:
     groups get equal draws at every call, so that the metrics of networks on the same images are replicated in pairs.
     """
     generator = np.random.default_rng(IMAGES)
-    for _ in range(REPLICATES // BLOCK):
-        yield [_draw(objects, generator) for objects in groups]
+    blocks = ([_draw(objects, generator) for objects in groups] for _ in range(REPLICATES // BLOCK))
+    return np.concatenate([statistic(*counts) for counts in blocks], axis=-1)
 
 
 def _draw(objects: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -49,11 +49,6 @@ def _draw(objects: np.ndarray, generator: np.random.Generator) -> np.ndarray:
         places = first.repeat(counts) + generator.integers(counts.repeat(counts))
         images, rows = objects.argsort(kind="stable")[places], rows.repeat(counts)
     return np.bincount(rows * n + images.ravel(), minlength=BLOCK * n).reshape(BLOCK, n)
-
-
-def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
-    """A statistic's values, (..., REPLICATES), of the counts that `resample` draws from groups."""
-    return np.concatenate([statistic(*counts) for counts in resample(*groups)], axis=-1)
 
 
 def interval(replicates: np.ndarray) -> dict[str, float]:
@@ -121,31 +116,10 @@ def roc_curve(positives: Scores, negatives: Scores) -> tuple[np.ndarray, np.ndar
     return rate, recall, thresholds
 
 
-def roc_metrics(positives: Scores, negatives: Scores, *objects: np.ndarray) -> dict[str, Any]:
-    """auc and recall_at, a mapping by rate: each {value, low, high}, None where either kind of image is missing.
-
-    objects: of the positives and of the negatives, as of `resample`; by default every image is its own.
-    auc also has the numbers of positives and negatives, and of their objects, and each recall its threshold.
-    """
-    objects = objects or (np.arange(len(positives)), np.arange(len(negatives)))
-    results: list[dict[str, Any]] = [{"value": None, "low": None, "high": None}] * len(RANKED)
-    bars: list[float | None] = [None] * len(RATES)
-    if len(positives) and len(negatives):
-        groups = np.asarray(positives), np.asarray(negatives)
-        pairs = zip(auc_and_recalls(*groups), bootstrap(partial(auc_and_recalls, *groups), *objects), strict=True)
-        results = [{"value": float(value), **interval(replicates)} for value, replicates in pairs]
-        bars = [float(bar) for bar in thresholds(groups[1], np.ones(len(negatives), int))]
-    auc, *recalls = results
-    recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
-    numbers = dict(zip(("positive_objects", "negative_objects"), (len(set(group)) for group in objects), strict=True))
-    auc = {**auc, "positives": len(positives), "negatives": len(negatives), **numbers}
-    return {"auc": auc, "recall_at": recall_at}
-
-
 def resampled(auc: Mapping[str, Any]) -> str:
     """What the intervals of an `auc` resample: images, or objects of several images, too."""
-    pairs = ((auc.get(f"{kind}_objects"), auc.get(f"{kind}s")) for kind in ("positive", "negative"))
-    return "images" if all(objects in (None, images) for objects, images in pairs) else "objects and images"
+    single = all(auc.get(f"{kind}_objects") in (None, auc.get(f"{kind}s")) for kind in ("positive", "negative"))
+    return "images" if single else "objects and images"
 
 
 @dataclass(frozen=True)
@@ -184,9 +158,28 @@ class Pool:
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
-        """Fractions of `outcomes`, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
+        """n, fractions of `outcomes` as `fraction` returns them, and auc and recall_at, a mapping by rate.
+
+        The last two are {value, low, high}, None where either kind of image is missing. auc also has the numbers of
+        positives and negatives, and of their objects, and each recall its threshold.
+        """
         counted = {name: fraction(sum(hits), len(hits)) for name, (_, hits) in self.outcomes.items()}
-        return counted | roc_metrics(*self.scores, *map(_objects, self.ranked))
+        ranked: list[dict[str, Any]] = [{"value": None, "low": None, "high": None}] * len(RANKED)
+        bars: list[float | None] = [None] * len(RATES)
+        if all(self.ranked):
+            values = zip(auc_and_recalls(*self.scores), self._ranked_replicates, strict=True)
+            ranked = [{"value": float(value), **interval(replicates)} for value, replicates in values]
+            negatives = self.scores[1]
+            bars = [float(bar) for bar in thresholds(negatives, np.ones(len(negatives), int))]
+        auc, *recalls = ranked
+        for kind, group in zip(("positive", "negative"), self.ranked, strict=True):
+            auc = {**auc, f"{kind}s": len(group), f"{kind}_objects": len(set(_objects(group)))}
+        recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
+        return {"n": len(self.positives) + len(self.negatives), **counted, "auc": auc, "recall_at": recall_at}
+
+    @cached_property
+    def _ranked_replicates(self) -> np.ndarray:
+        return bootstrap(partial(auc_and_recalls, *self.scores), *map(_objects, self.ranked))
 
     @cached_property
     def replicates(self) -> dict[str, np.ndarray]:
@@ -196,10 +189,7 @@ class Pool:
             for name, (group, hits) in self.outcomes.items()
             if hits
         }
-        if all(self.ranked):
-            ranked = bootstrap(partial(auc_and_recalls, *self.scores), *map(_objects, self.ranked))
-            replicates |= dict(zip(RANKED, ranked, strict=True))
-        return replicates
+        return replicates | dict(zip(RANKED, self._ranked_replicates if all(self.ranked) else (), strict=False))
 
 
 def _weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -207,7 +197,7 @@ def _weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _objects(predictions: Sequence[Prediction]) -> np.ndarray:
-    """The object of each image as a number, as `resample` takes them; one of unknown mesh is an object of its own."""
+    """The object of each image as a number, as `bootstrap` takes them; one of unknown mesh is an object of its own."""
     numbers: dict[str | int, int] = {}
     names = (item.photograph.mesh or index for index, item in enumerate(predictions))
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])

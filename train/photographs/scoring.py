@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,21 +26,13 @@ SUMMARY = "summary.json"
 WRONG_CLASSES = 5  # the most common ones, which are named
 COUNTED = ("recall", "top5", "false_positive_rate", "recall_at_threshold", "false_positive_rate_at_threshold")
 BY_CLASS = ("recall", "top5", "predicted_label")
+Device = str | torch.device
 
 
-class Scored(NamedTuple):
+def _predict_folder(
+    model: Model, classes: Sequence[str], folder: Path, label: str, size: int, skip: bool, device: Device
+) -> tuple[list[Prediction], torch.Tensor, list[str], str]:
     """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all."""
-
-    predictions: list[Prediction]
-    images: torch.Tensor
-    unreadable: list[str]
-    hash: str
-
-
-def predict_folder(
-    model: Model, classes: Sequence[str], folder: Path, label: str, size: int, skip: bool, device: str | torch.device
-) -> Scored:
-    """The predictions for a folder's photographs; arguments and errors as of `evaluate_photographs`."""
     found = find_photographs(folder, classes, label)
     photographs, images, unreadable = load_photographs(folder, found, size, skip)
     logits = compute_logits(model, images, len(classes), device)
@@ -48,7 +40,7 @@ def predict_folder(
     for photograph in photographs:
         content = (folder / photograph.path).read_bytes()
         digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
-    return Scored(predict(photographs, logits, classes, label), images, unreadable, digest.hexdigest())
+    return predict(photographs, logits, classes, label), images, unreadable, digest.hexdigest()
 
 
 def evaluate_photographs(
@@ -59,7 +51,7 @@ def evaluate_photographs(
     out: Path,
     size: int = 32,
     skip_unreadable: bool = False,
-    device: str | torch.device = "cpu",
+    device: Device = "cpu",
     by: str = "source",
     point: OperatingPoint | None = None,
 ) -> dict[str, Any]:
@@ -75,18 +67,18 @@ def evaluate_photographs(
     - n: photographs, positives, negatives, unreadable, left_out; label; size; unreadable, left_out: their paths;
     - recall, top5: of the photographs of class `label`, and their most common wrong classes, most_common_wrong;
     - false_positive_rate: the fraction of all others that are predicted as `label`;
-    - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`roc_metrics`);
+    - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`Pool.metrics`);
     - recall_at_threshold, false_positive_rate_at_threshold: at an operating point of `label`, where one is given; and
       operating_point, its fields, and in_sample: whether it was chosen on these very images;
     - by_source, and by_mesh with by="mesh": n, and the metrics above of each known source or mesh (`pool_by`);
     - by_class: n, recall, top5, predicted_label (the fraction predicted as `label`) and most_common_wrong.
 
     Fractions have 95 % Wilson intervals, `auc` and `recall_at` bootstrap intervals over images and, where photos.csv
-    names them, over objects (`resample`). InputError as of `find_photographs`, `load_photographs` and
+    names them, over objects (`bootstrap`). InputError as of `find_photographs`, `load_photographs` and
     `compute_logits`, for `out` inside `folder`, and for by="mesh" where no mesh is known.
     """
     require_outside(out, folder)
-    scored = predict_folder(model, classes, folder, label, size, skip_unreadable, device)
+    scored = _predict_folder(model, classes, folder, label, size, skip_unreadable, device)
     predictions, images, unreadable, images_hash = scored
     if by == "mesh" and not any(item.photograph.mesh for item in predictions):
         raise InputError(f"by=mesh: {folder} has no {TABLE} with a column mesh: leave it out")
@@ -94,11 +86,7 @@ def evaluate_photographs(
     pools = {key: pool_by(predictions, label, key, threshold=threshold) for key in dict.fromkeys(("source", by))}
     whole = pools["source"][OVERALL]
     metrics = {
-        f"by_{key}": {
-            name: {"n": len(group.positives) + len(group.negatives), **group.metrics}
-            for name, group in progress(groups.items(), "intervals")
-            if name != OVERALL
-        }
+        f"by_{key}": {name: group.metrics for name, group in progress(groups.items(), "intervals") if name != OVERALL}
         for key, groups in pools.items()
     }
     others = [str(path) for path in left_out(folder)]
@@ -130,17 +118,21 @@ def evaluate_photographs(
     return summary
 
 
-def choose_operating_point(scored: Scored, folder: Path, label: str, rate: float) -> OperatingPoint:
+def choose_operating_point(
+    model: Model, classes: Sequence[str], folder: Path, label: str, rate: float, size: int, skip: bool, device: Device
+) -> OperatingPoint:
     """The lowest of the log-odds of `label` that at most the fraction `rate` of a folder's other images exceed.
 
-    An image that ties with it does not exceed it. InputError for fewer than 1 / rate images of other things.
+    An image that ties with it does not exceed it. Arguments and InputError as of `evaluate_photographs`, and InputError
+    for fewer than 1 / rate images of other things.
     """
-    negatives, exact = pool_by(scored.predictions, label, "source")[OVERALL].scores[1], Fraction(str(rate))
-    if len(negatives) * exact < 1:
+    predictions, _, _, images_hash = _predict_folder(model, classes, folder, label, size, skip, device)
+    negatives = np.array([item.log_odds for item in predictions if item.photograph.label != label])
+    if len(negatives) * (exact := Fraction(str(rate))) < 1:
         fault = f"calibrate={folder} has {len(negatives)} images of other things than {label}"
         raise InputError(f"{fault}: give at least {math.ceil(1 / exact)} for false_positive_rate={rate}")
     threshold = float(thresholds(negatives, np.ones(len(negatives), int), [str(rate)])[0])
-    return OperatingPoint(label, threshold, rate, folder.resolve().name, scored.hash, len(negatives))
+    return OperatingPoint(label, threshold, rate, folder.resolve().name, images_hash, len(negatives))
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
@@ -152,9 +144,8 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
 
 def describe_point(point: Mapping[str, Any]) -> str:
     """How the `operating_point` of a summary was chosen."""
-    where = (
-        "these very images, in-sample" if point.get("in_sample") else f"{point['folder']}, {point['negatives']} others"
-    )
+    others = f"{point['folder']}, {point['negatives']} others"
+    where = "these very images, in-sample" if point.get("in_sample") else others
     return f"{point['false_positive_rate']:.1%} FPR on {where}"
 
 

@@ -1,4 +1,5 @@
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,10 +14,8 @@ from train.photographs.metrics import (
     REPLICATES,
     auc_and_recalls,
     bootstrap,
-    find_metric,
+    interval,
     replicate_difference,
-    roc_curve,
-    roc_metrics,
     thresholds,
 )
 
@@ -59,11 +58,11 @@ def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_i
         lambda positives, negatives: auc_and_recalls(positives, negatives)[RANKED.index(name)],
         vectorized=False, method="percentile", n_resamples=2000, rng=np.random.default_rng(8),
     ).confidence_interval  # fmt: skip
-    repeated = [group.repeat(images) for group in (*scores, np.arange(80), np.arange(120))]
-    metrics = roc_metrics(*repeated)
-    metric = find_metric(metrics, name)
-    assert (metric["low"], metric["high"]) == pytest.approx(tuple(reference), rel=0, abs=0.02)
-    assert metrics == roc_metrics(*repeated)  # the same at every call
+    statistic = partial(auc_and_recalls, *(group.repeat(images) for group in scores))
+    objects = [np.arange(len(group)).repeat(images) for group in scores]
+    first, again = (bootstrap(statistic, *objects)[RANKED.index(name)] for _ in range(2))
+    assert tuple(interval(first).values()) == pytest.approx(tuple(reference), rel=0, abs=0.02)
+    np.testing.assert_array_equal(first, again)
 
 
 def test_the_spread_over_objects_and_their_images_is_that_of_a_two_level_bootstrap_in_closed_form():
@@ -74,16 +73,6 @@ def test_the_spread_over_objects_and_their_images_is_that_of_a_two_level_bootstr
     variance = (values.mean(axis=0).var() + values.var(axis=0).mean() / 8) / 5
     assert means.mean() == pytest.approx(values.mean(), abs=4 * (variance / REPLICATES) ** 0.5)
     assert means.var() == pytest.approx(variance, rel=0.13)  # four standard errors of 2,000 replicates
-
-
-def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the_auc(scores):
-    positives, negatives = scores
-    rates, recalls, thresholds = roc_curve(positives, negatives)
-    assert (rates[0], recalls[0], rates[-1], recalls[-1], thresholds[-1]) == (0, 0, 1, 1, -np.inf)
-    assert len(rates) == len(np.unique([*positives, *negatives])) + 1 and (np.diff(thresholds) < 0).all()
-    for rate, recall, threshold in zip(rates, recalls, thresholds, strict=True):
-        assert (rate, recall) == ((negatives > threshold).mean(), (positives > threshold).mean())
-    assert np.trapezoid(recalls, rates) == pytest.approx(auc_and_recalls(positives, negatives)[0], rel=0, abs=1e-12)
 
 
 def test_pairing_cancels_what_both_runs_share():

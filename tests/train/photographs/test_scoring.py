@@ -13,7 +13,7 @@ from scipy.special import logsumexp, softmax
 from renderer.errors import InputError
 from train.photographs.folder import Photograph
 from train.photographs.predictions import Prediction, read_predictions, write_predictions
-from train.photographs.scoring import choose_operating_point, evaluate_photographs, format_summary, predict_folder
+from train.photographs.scoring import choose_operating_point, evaluate_photographs, format_summary
 from train.photographs.sheet import FRAME, IMAGE
 from train.tables import fraction
 
@@ -152,19 +152,18 @@ def test_a_mesh_is_ranked_against_all_images_of_the_other_kind_and_objects_count
 def test_an_operating_point_is_the_lowest_threshold_within_its_rate(fruit, tmp_path, rate, recall, false_positives):
     """Of the ranks of orange, 1, 2, 6, 5, 2 and of the others 1, 5, 2, 1, 2: those that tie with it lie below."""
     _, _, folder = fruit
-    point = choose_operating_point(predict_folder(*fruit, "orange", 32, False, "cpu"), folder, "orange", rate)
+    point = choose_operating_point(*fruit, "orange", rate, 32, False, "cpu")
     for in_sample in (True, False):
         summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", point=point)
         assert summary["recall_at_threshold"] == fraction(recall, 5)
         assert summary["false_positive_rate_at_threshold"] == fraction(false_positives, 5)
         assert summary["operating_point"] == vars(point) | {"in_sample": in_sample}
         table = (tmp_path / "out" / "predictions.csv").read_text()
-        assert table.count("True\n") == recall + false_positives and table.count("False\n") == 10 - table.count(
-            "True\n"
-        )
+        above = recall + false_positives
+        assert (table.count("True\n"), table.count("False\n")) == (above, 10 - above)
         Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")  # another image of the same prediction
     with pytest.raises(InputError, match=r"^calibrate=.* has 5 images of other things .* at least 10 for .*=0\.1$"):
-        choose_operating_point(predict_folder(*fruit, "orange", 32, False, "cpu"), folder, "orange", 0.1)
+        choose_operating_point(*fruit, "orange", 0.1, 32, False, "cpu")
 
 
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
