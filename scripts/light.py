@@ -10,9 +10,8 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from renderer.errors import InputError, require_range
-from renderer.light.environment import check_map_name, negative_fraction, to_map, write_map
+from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.presets import load_light
-from train.errors import writable_file
 from train.settings import keyed
 
 
@@ -28,13 +27,12 @@ class Settings:
 
 @cli.command()
 def main(settings: Settings) -> None:
-    light, out = load_light(settings.light), writable_file(settings.out, "out")
-    with keyed("out"):
-        check_map_name(out)
+    out = Path(settings.out)
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
-    radiance = to_map(light, settings.height)
-    write_map(out, radiance)
+    radiance = to_map(load_light(settings.light), settings.height)
+    with keyed("out"):
+        write_map(out, radiance)
     negative = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
     print(
         f"{out}: {radiance.shape[1]} × {radiance.shape[0]} texels, radiance {radiance.min():.3g} to "

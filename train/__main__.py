@@ -22,7 +22,7 @@ from augment import utils
 from renderer.errors import InputError
 from train import console
 from train.command_help import format_help
-from train.errors import writable_file, writable_folder
+from train.errors import writable_folder
 from train.processes import Interrupted, broadcast, process_group
 from train.report.compare import format_table
 from train.report.page import report_of
@@ -89,7 +89,7 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, arm_settings)  # before anything is written
     if first:
-        log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
+        log_to(writable_folder(run, "run") / LOG)
     data = load_data(settings)
     with sole_writer("run", *arms) if first else nullcontext():
         runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake

@@ -1,4 +1,4 @@
-"""What the user can do about an error, in one sentence, and whether an output can be written."""
+"""What the user can do about an error, in one sentence, and whether a folder can be written to."""
 
 import errno
 import tempfile
@@ -51,28 +51,15 @@ def _configuration_error(error: Exception) -> str:
 
 
 def writable_folder(folder: str | Path, key: str) -> Path:
-    """The folder, which may be missing yet. InputError naming the key where no file can be written into it."""
-    return _writable(Path(folder), key, is_folder=True)
+    """The folder, which may be missing yet. InputError naming the key where no file can be written into it.
 
-
-def writable_file(file: str | Path, key: str) -> Path:
-    """The file, which may be missing yet, as may its folder. InputError naming the key where it cannot be written."""
-    return _writable(Path(file), key, is_folder=False)
-
-
-def _writable(path: Path, key: str, is_folder: bool) -> Path:
-    """Open the file, if it exists, and write a temporary one to its folder, or the nearest folder above that exists."""
+    A temporary file is written to it or to the nearest folder above that exists.
+    """
+    path = Path(folder)
     try:
-        if not is_folder and path.exists():
-            if not path.is_file():
-                raise ValueError("it is not a regular file")
-            path.open("ab").close()
-        folder = path if is_folder else path.parent
-        existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
             file.write(bytes(2**16))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        written, kind = ("written to", "folder") if is_folder else ("written", "file")
-        raise InputError(f"{key}={path} cannot be {written} ({reason}): choose another {kind}") from error
+    except OSError as error:
+        raise InputError(f"{key}={path} cannot be written to ({error.strerror}): choose another folder") from error
     return path

@@ -83,12 +83,6 @@ def read_panorama(path: Path) -> Tensor:
     return radiance.clamp(min=0)
 
 
-def check_map_name(path: Path) -> None:
-    """InputError where the suffix is not one of `SUFFIXES`."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
-
-
 def write_map(path: Path, radiance: Tensor) -> None:
     """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
 
@@ -96,7 +90,8 @@ def write_map(path: Path, radiance: Tensor) -> None:
     much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
     InputError where the suffix is another or the file cannot be written.
     """
-    check_map_name(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

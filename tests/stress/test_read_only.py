@@ -36,7 +36,7 @@ def call(*command: str, folder: Path) -> tuple[int, str]:
     "command, reported",
     [
         ((*TRAIN, "run=../locked/run"), "run=../locked/run cannot be written to (Permission denied)"),
-        ((LIGHT, "light=grace", "out=../locked/a.hdr"), "out=../locked/a.hdr cannot be written"),
+        ((LIGHT, "light=grace", "out=../locked/a.hdr"), "out: environment map ../locked/a.hdr cannot be written"),
         ((LAB, "out=../locked"), "out=../locked cannot be written to (Permission denied)"),
     ],
     ids=["run", "file", "folder"],

@@ -16,7 +16,7 @@ import yaml
 from renderer.errors import InputError
 from train import checkpoint, cli, errors
 from train.checkpoint import LAST
-from train.errors import one_sentence, writable_file, writable_folder
+from train.errors import one_sentence, writable_folder
 from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
@@ -61,7 +61,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_
     [
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist: give the path of an .npz file"),
         (["run=file/run"], "run=file/run cannot be written to (Not a directory): choose another folder"),
-        (["run=odd"], "run=odd/train.log cannot be written (it is not a regular file)"),
+        (["run=odd"], "PATH/odd/train.log cannot be read or written: Is a directory"),
         (["train.epoch=3"], "Could not override 'train.epoch'"),
         (["compare=[non]"], "compare: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
@@ -76,7 +76,7 @@ def test_a_mistake_is_one_line_and_status_2(call, capsys, monkeypatch, tmp_path,
     (tmp_path / "odd" / "train.log").mkdir(parents=True)
     assert call("train", *arguments) == cli.USER_ERROR
     error = capsys.readouterr().err
-    assert error.startswith(f"error: {sentence}") and error.count("\n") == 1
+    assert error.replace(str(tmp_path), "PATH").startswith(f"error: {sentence}") and error.count("\n") == 1
     assert not list(tmp_path.rglob("config.yaml"))
 
 
@@ -258,12 +258,9 @@ def test_an_error_is_one_sentence_where_the_user_can_fix_it(error, sentence):
 
 def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("old")
     for folder in (".", "a/b", tmp_path / "c"):
         assert writable_folder(folder, "out") == Path(folder)
-    for file in ("file", "c/new"):
-        assert writable_file(file, "out") == Path(file)
-    assert [*tmp_path.iterdir()] == [tmp_path / "file"] and (tmp_path / "file").read_text() == "old"
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):

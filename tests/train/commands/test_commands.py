@@ -71,7 +71,7 @@ WRONG = [
     (["compare", "--multirun"], "--multirun is not an option"),
     ([*EXPORT, "out=a.jpg"], "out: "),
     (["publish", "run=1.10", "out=file/out"], "out=file/out cannot be written to"),
-    ([*EXPORT, "out=2024"], "out=2024 cannot be written (it is not a regular file): choose another file"),
+    ([*EXPORT, "out=file/a.npy"], "out: environment map file/a.npy cannot be written: "),
     (["lab", "out=file/out"], "out=file/out cannot be written to"),
 ]
 
