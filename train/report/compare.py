@@ -9,7 +9,7 @@ import numpy as np
 from augment.utils import progress
 from renderer.errors import InputError
 from train.photographs import metrics
-from train.photographs.metrics import METRICS, OVERALL, Pool, find_metric, metric_title
+from train.photographs.metrics import METRICS, Pool, find_metric, metric_title
 from train.photographs.predictions import PREDICTIONS, read_predictions
 from train.report.summary import INITIAL, RunSummary, Scored, arms_of, by_images, run_tables, seconds_table
 from train.settings import PHOTOGRAPHS
@@ -70,9 +70,7 @@ def group_table(arms: Evaluations, pooled: str = "all", by: str = "source") -> T
         for arm, group in arms.items():
             means = (format_interval(mean_metric(group, source, name)) for name in METRICS)
             rows.append([source or pooled, arm, *means])
-    over = metrics.resampled(next(iter(arms.values()))[0].pools[OVERALL].metrics["auc"])
-    title = f"by {by}" if over == "images" else f"by {by}, AUC and recall at FPR over {over}"
-    return Table(title, [by, "network", *TITLES], rows)
+    return Table(f"by {by}", [by, "network", *TITLES], rows)
 
 
 def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from augment.utils import announced
 from renderer.errors import InputError
@@ -129,12 +129,9 @@ def _attack_examples(run: RunSummary) -> dict[int, list[Picture]]:
 
 def _side(label: str, when: str, side: Side) -> Picture:
     image, sphere = (Image.fromarray(pixels.permute(1, 2, 0).numpy()) for pixels in (side.image, side.sphere))
-    pair = Image.new("RGBA", (plots.SMALL + plots.GAP + sphere.width, plots.SMALL))  # transparent, also around the ball
+    pair = Image.new("RGB", (plots.SMALL + plots.GAP + sphere.width, plots.SMALL), "white")  # as around the ball
     pair.paste(image.resize((plots.SMALL, plots.SMALL), Image.Resampling.NEAREST))
-    ball = Image.new("L", (4 * sphere.width, 4 * sphere.height))
-    ImageDraw.Draw(ball).ellipse((0, 0, *ball.size), 255)
-    place = plots.SMALL + plots.GAP, (plots.SMALL - sphere.height) // 2
-    pair.paste(sphere, place, ball.resize(sphere.size, Image.Resampling.BOX))
+    pair.paste(sphere, (plots.SMALL + plots.GAP, (plots.SMALL - sphere.height) // 2))
     predicted = f"{side.confidence:.0%} {side.predicted}"
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
