@@ -17,7 +17,7 @@ from augment.reshading import Reshading
 from augment.utils import progress, require_memory
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
-from renderer.image import ImageSettings, background_term, clamp, tonemap_composite
+from renderer.image import ImageSettings, background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis, parts_of
 from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
@@ -183,7 +183,7 @@ class Scene:
         """
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
-        covered = [tonemap_composite(layer.composite, self.settings.encoding) for layer in layers]
+        covered = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
         images = InPlace.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)

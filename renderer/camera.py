@@ -135,10 +135,8 @@ class PerspectiveCamera(Camera):
         """InputError where a point lies behind the camera or as good as there."""
         depths = self.distance - points @ self.axes()[2]
         if not (depths >= NEAREST * self.distance).all():
-            raise InputError(
-                f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: give a larger distance "
-                "(a smaller fov or a larger width), or normalize the mesh"
-            )
+            advice = "give a larger distance (a smaller fov or a larger width), or normalize the mesh"
+            raise InputError(f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: {advice}")
         return depths
 
 

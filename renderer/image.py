@@ -66,7 +66,7 @@ def tonemap(
     background: image values behind the surface, of three channels or one. InputError: NaN.
     """
     require_bounded(radiance=radiance)
-    return tonemap_composite(radiance + background_term(coverage, background, encoding), encoding)
+    return encode(clamp(radiance + background_term(coverage, background, encoding)), encoding)
 
 
 def composite(
@@ -103,21 +103,11 @@ def background_term(coverage: Tensor, background: Tensor, encoding: str = "linea
     return (1 - coverage) * decode(background, encoding)
 
 
-def tonemap_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
-    """`tonemap`, given the sum of radiance and `background_term`."""
-    return encode(clamp(composite), encoding)
-
-
-def clamped(composite: Tensor) -> Tensor:
-    """Where `tonemap_composite` clamps and the gradient is therefore zero. Boolean, as the composite."""
-    return (composite < 0) | (composite > 1)
-
-
 def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
     """To [0, ceiling]; differentiable in the values.
 
-    At the bounds themselves the gradient passes, so that a light of zero on black can grow: where `clamped` is False,
-    and unlike `torch.clamp`, whose versions differ there.
+    At the bounds themselves the gradient passes, so that a light of zero on black can grow, unlike that of
+    `torch.clamp`, whose versions differ there.
     """
     return _Clamp.apply(values, ceiling)
 

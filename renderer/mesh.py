@@ -251,9 +251,7 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     if large.all():
         return refine(_quartered(mesh), area)
     small, finer = _select(mesh, ~large), refine(_quartered(_select(mesh, large)), area)
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in (small, finer)]) for name in PER_FACE
-    }
+    joined: dict[str, Any] = {name: np.concatenate([getattr(small, name), getattr(finer, name)]) for name in PER_FACE}
     return replace(finer, **joined)
 
 

@@ -109,9 +109,8 @@ def _power_of_two(edges: Tensor) -> Tensor:
     """About the extent of the faces: dividing by it rounds nothing, and keeps products in range at any size."""
     if not edges.numel():
         return edges.new_ones(())
-    largest = edges.abs().max()
-    _, exponent = torch.frexp(torch.where(largest > 0, largest, 1))
-    return torch.ldexp(torch.ones_like(largest), exponent)
+    _, exponent = torch.frexp(edges.abs().max())
+    return torch.ldexp(edges.new_ones(()), exponent)
 
 
 def _cross(u: Tensor, v: Tensor) -> Tensor:

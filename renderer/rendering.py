@@ -198,7 +198,5 @@ def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -
         return face_albedo(albedo, view)
     if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
         return surface_albedo(mesh, view, encoding, [albedo])
-    raise InputError(
-        f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: give {tuple(mesh.faces.shape)}, a color per "
-        "face, or (H, W, 3) for a mesh that has one texture"
-    )
+    advice = f"give {tuple(mesh.faces.shape)}, a color per face, or (H, W, 3) for a mesh that has one texture"
+    raise InputError(f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: {advice}")

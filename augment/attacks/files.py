@@ -17,7 +17,7 @@ from augment.attacks.evaluate import warnings
 from augment.scene import Conditions
 from augment.utils import progress
 from renderer.errors import require_choice
-from renderer.image import background_term, clamp, to_bytes, to_unit, tonemap_composite
+from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
 from renderer.io.tiles import Tile, draw_grid
 from renderer.mesh import doubled_area_vectors
@@ -147,7 +147,7 @@ def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer)
         encoding = adversary.settings.encoding
         rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
         composite = rgba[:, :3] + background_term(rgba[:, 3:], adversary.background, encoding)
-        tonemapped = tonemap_composite(composite, encoding)
+        tonemapped = encode(clamp(composite), encoding)
         images[MITSUBA] = tonemapped if adversary.pixels is None else clamp(tonemapped + adversary.pixels)
     return images
 

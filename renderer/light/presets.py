@@ -65,10 +65,8 @@ def load_light(light: str) -> Tensor:
         return coefficients
     if suffix in SUFFIXES:
         return _read_light_map(Path(light))
-    raise InputError(
-        f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or the path of an environment map "
-        f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
-    )
+    files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
+    raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
 
 
 def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
@@ -115,10 +113,8 @@ def read_light(path: Path, *kinds: type[Any]) -> tuple[Any, Tensor]:
     except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
         raise InputError(f"{path} does not describe a light ({error}): write it again") from error
     if coefficients.shape != (basis.size, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
-        raise InputError(
-            f"{path} has coefficients {tuple(coefficients.shape)}: give {basis.size} rows [r, g, b] of finite numbers, "
-            f"no larger than {FACTOR:g}"
-        )
+        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"
+        raise InputError(f"{path} has coefficients {tuple(coefficients.shape)}: {advice}")
     return basis, coefficients
 
 

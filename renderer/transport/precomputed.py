@@ -84,11 +84,11 @@ class Patches:
         summed = values.new_zeros(len(self.view.pixels), values.shape[1])
         return summed.index_add_(0, self.view.pixel, values * self.fractions)
 
-    def weights_by_patch(self, hits: RayHits, weights: Tensor) -> csr_matrix:
-        """(B, N) sums of the weights (B, D) of directions over the patch that is hit there."""
+    def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
+        """(B, N) sums of the weights (B, D) of directions (D, 3) over the patch that is hit there."""
         pixel, direction = torch.nonzero(weights * (hits.face >= 0), as_tuple=True)
         face = hits.face[pixel, direction]
-        behind = (self._normals[face] * hits.directions[direction]).sum(1) > 0
+        behind = (self._normals[face] * directions[direction]).sum(1) > 0
         entries = pixel.numpy(), self.of_side[behind.long(), face].numpy()
         return csr_matrix((weights[pixel, direction].numpy(), entries), (len(weights), len(self.view.pixels)))
 
@@ -128,7 +128,7 @@ class Transport:
                 added[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
                     sent = self._sent[..., channel if self.colors else 0].numpy()
-                    received = self._patches.weights_by_patch(hits, blocked) @ sent
+                    received = self._patches.weights_by_patch(hits, self._directions, blocked) @ sent
                     added[:, hits.pixels] += torch.from_numpy(received).T
         return change
 
@@ -176,7 +176,7 @@ def _first_bounce(patches: Patches, rays: Rays, basis: Harmonics) -> tuple[Tenso
         weights = hits.weight * patches.fractions[hits.sample, 0]
         from_sky[hits.pixels] -= weights @ radiance
         receiving.append(hits.pixels)
-        links.append(patches.weights_by_patch(hits, weights))
+        links.append(patches.weights_by_patch(hits, directions, weights))
     if not links:
         return from_sky[..., None], torch.arange(0), csr_matrix((0, len(from_sky)))
     return from_sky[..., None], torch.cat(receiving), vstack(links, format="csr")

@@ -76,14 +76,13 @@ class Surface:
 class RayHits(NamedTuple):
     """The faces of the mesh that B of a view's pixels see in D directions; sample, weight, face: (B, D).
 
-    pixels: (B,), indices among the view's. directions: (D, 3). sample: from which the ray starts. weight: of the
-    radiance from there in the pixel's irradiance, solid angle × cosine × the number of the pixel's samples, and zero
-    where nothing blocks it. face: the first that the ray hits; -1 for none, and where the sample's own face blocks
-    light from below it, which smooth normals would receive.
+    pixels: (B,), indices among the view's. sample: from which the ray starts. weight: of the radiance from there in the
+    pixel's irradiance, solid angle × cosine × the number of the pixel's samples, and zero where nothing blocks it.
+    face: the first that the ray hits; -1 for none, and where the sample's own face blocks light from below it, which
+    smooth normals would receive.
     """
 
     pixels: Tensor
-    directions: Tensor
     sample: Tensor
     weight: Tensor
     face: Tensor
@@ -118,7 +117,7 @@ class Rays:
             face = self.first_hit(surface.points[start] + self.offset * planes[start], directions[cast[1]])
             face = torch.full_like(sample, -1).index_put_(cast, face)
             weight = (cosine * of_pixel * solid_angle).masked_fill((face < 0) & (above >= 0), 0)
-            yield RayHits(some, directions, sample, weight, face)
+            yield RayHits(some, sample, weight, face)
 
     @cached_property
     def _scene(self) -> Any:
@@ -126,10 +125,8 @@ class Rays:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
-            raise InputError(
-                "shadows are found by rays that Embree casts: pip install embreex, or set shadows=false and "
-                "no lights that stand in the scene"
-            ) from error
+            advice = "pip install embreex, or set shadows=false and no lights that stand in the scene"
+            raise InputError(f"shadows are found by rays that Embree casts: {advice}") from error
         scene = EmbreeScene(robust=True)
         TriangleMesh(scene, self._mesh.vertices.astype(np.float32), self._mesh.faces.astype(np.int32))
         return scene

@@ -18,7 +18,7 @@ from renderer import shading
 from renderer.albedo import surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings, background_term, clamped, tonemap
+from renderer.image import ImageSettings, background_term, tonemap
 from renderer.light.harmonics import MAX_DEGREE, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
@@ -141,7 +141,8 @@ class Image:
 
     def clamped(self, *inputs) -> torch.Tensor:
         lit, *around = self.parts(*inputs)[1]
-        return clamped(lit + background_term(*around))
+        composite = lit + background_term(*around)
+        return (composite < 0) | (composite > 1)
 
 
 def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:
