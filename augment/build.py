@@ -26,8 +26,7 @@ from renderer.rasterizer import NAMES, choose
 
 @dataclass
 class ProjectorSettings:
-    """A `Projector`, with angles in degrees. pattern: where attacks begin, in fractions of its power: a gray value or
-    an image file."""
+    """A `Projector`; angles in degrees. pattern: where attacks begin, a gray or an image file, of its power."""
 
     pixels: int = 16
     polar: float = 45.0

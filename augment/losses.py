@@ -24,8 +24,7 @@ def adversarial_cost(
 ) -> Float[Tensor, " E"]:
     """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases.
 
-    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError for a class beyond the
-    logits.
+    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError: a class without logit.
     """
     require_known(source.clamp(min=0), logits)  # NO_CLASS passes
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)

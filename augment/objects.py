@@ -78,8 +78,7 @@ class SceneObject:
     """A mesh that spans [-1, 1], the name of its class, a factor of its albedo, and its own name in messages.
 
     The mesh has the faces of props and table, whose albedo is multiplied, too, after the object's own. own: the number
-    of the object's faces, None where all are. props: their meshes, standing on z = 0. ground: the color of the table,
-    None without one.
+    of the object's faces, None where all are. props: their meshes, on z = 0. ground: the table's color, or None.
     """
 
     label: str
@@ -151,8 +150,7 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
 
 
 def another_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Another instance of a solid that is named without a seed, with the same props and table; of anything else, the
-    object itself."""
+    """Another instance of a solid named without a seed, with the same props and table; of others, the object itself."""
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item

@@ -33,8 +33,7 @@ class Layer(NamedTuple):
 
 
 class InPlace(torch.autograd.Function):
-    """Canvases (N, 3, size²), overwritten at the rows and pixels of each layer by its values (B, 3, P), and
-    differentiable in these."""
+    """Canvases (N, 3, size²), overwritten where layers are by their values (B, 3, P); differentiable in these."""
 
     @staticmethod
     def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
@@ -91,8 +90,7 @@ class OperatorStack:
         )
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Linear radiance (A, 3, P) of images (A,) on the host, each in its light (A, size, 3); differentiable in the
-        lights.
+        """Linear radiance (A, 3, P), differentiable in the lights (A, size, 3), of images (A,), which are on the host.
 
         Lights are laid out on a grid of operators × their images, with gaps where an operator has fewer than another.
         Operators that none of the images shows are left out.
@@ -180,8 +178,7 @@ class Relighting:
                 require_memory(views, rest + self.beside, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
-        """(a stack; (N,) each image's rank among the A images of the stack; the background terms of these (A, C,
-        P))."""
+        """(a stack; (N,) each image's rank among the A images of the stack; their background terms (A, C, P))."""
         first = index * self._per_stack
         views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
         for number, group in groupby(views, key=itemgetter(0)):

@@ -70,8 +70,7 @@ class Scene:
     stacked (`Relighting`). Where vertices move, a view is rasterized each time (`Reshading`). lights: (E, size, 3), or
     (size, 3) for all, where attacks begin; images have their dtype and device. basis: of the lights'
     coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered images (A, V, 3, size,
-    size) and their examples (A,); see `CameraEffects`. one_light: each view is shown in one light only, and is shaded
-    without an operator in less time.
+    size) and their examples (A,); see `draw_camera_effects`. one_light: without operators, for views shown once.
 
     >>> from augment.build import build_scene
     >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
@@ -96,10 +95,9 @@ class Scene:
             raise InputError("examples is empty: give at least one mesh, one view and one background")
         if self.lights.shape[-2:] != (self.basis.size, 3):
             raise InputError(f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows")
-        if self.backgrounds.shape[1:] not in ((1, size, size), (3, size, size)):
-            raise InputError(f"backgrounds has shape {tuple(self.backgrounds.shape)}: give (B, 3, {size}, {size})")
-        if not (self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
-            raise InputError("backgrounds: give values in [0, 1]")
+        fit = self.backgrounds.shape[1:] in ((1, size, size), (3, size, size))
+        if not (fit and self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
+            raise InputError(f"backgrounds: give (B, 3, {size}, {size}) of values in [0, 1]")
         radii = [item.radius for item in self.objects]  # a camera's depth range holds the whole object
         cameras = [tuple(camera.seeing(radii[row.object]) for camera in row.cameras) for row in self.examples]
         self.examples = [replace(row, cameras=views) for row, views in zip(self.examples, cameras, strict=True)]

@@ -114,17 +114,13 @@ class AugmentationSettings:
 
 @dataclass(frozen=True)
 class AttackExamples:
-    """S successful examples of a regeneration, before and after the attack.
+    """S successful examples of a regeneration, before the attack and after it.
 
-    images_before, images: (S, 3, H, W) in [0, 1]. lights_before, lights: (S, basis.size, 3). predictions_before,
-    predictions: (S, C) probabilities. labels: (S,) int64.
+    images: (2, S, 3, H, W) in [0, 1]. lights: (2, S, basis.size, 3). predictions: (2, S, C) probabilities.
     """
 
-    images_before: Tensor
     images: Tensor
-    lights_before: Tensor
     lights: Tensor
-    predictions_before: Tensor
     predictions: Tensor
     labels: Tensor
     basis: Basis = HARMONICS
@@ -201,8 +197,7 @@ class AugmentationService:
         """A service for any training loop: meshes × views × backgrounds renders, as in the paper by default.
 
         meshes: pairs of a file, solid:NAME or `Mesh`, and the index of its class. size: pixels per side. of_scene:
-        further arguments of `build_scene`, by default the paper's: 10 views before 5 grays, 8 × 8 samples per pixel and
-        flat shading.
+        further arguments of `build_scene`, by default the paper's: 10 views, 5 grays, 8 × 8 samples and flat shading.
 
         >>> service = AugmentationService.from_meshes([("solid:orange", 0), ("solid:apple", 1)], 8, views=1, samples=1)
         >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
@@ -282,7 +277,6 @@ class AugmentationService:
             examples=shard,
             start=start[shard],
             restarts=restarts,
-            at_once=problem.scene.at_once,
             seed=stream_seed(self.seed, number),
         )
         shards = [getattr(result, item.name) for item in fields(result)]
@@ -325,12 +319,12 @@ def choose_attack_examples(
     rows = torch.nonzero(success).squeeze(1)
     chosen = torch.linspace(0, max(len(rows) - 1, 0), min(SHOWN_EXAMPLES, len(rows))).round().long()
     rows = rows[chosen.to(rows.device)]
-    before, after = (problem.conditions(end[rows], rows) for end in (problem.start, values))
+    sides = [problem.conditions(end[rows], rows) for end in (problem.start, values)]
     with as_found(model), torch.no_grad():
-        images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
+        images = [problem.scene.render(side, rows)[:, 0] for side in sides]
         predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    sides = images[0], images[1], before.light, after.light, predictions[0], predictions[1]
-    return AttackExamples(*sides, labels[rows], problem.scene.basis)
+    lights = torch.stack([side.light for side in sides])
+    return AttackExamples(torch.stack(images), lights, torch.stack(predictions), labels[rows], problem.scene.basis)
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:

@@ -56,8 +56,7 @@ class VariationSettings:
     in each of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and
     down. environments: each example is in one of these lights, as `load_light` takes them. directional_fraction: of the
     examples, in a directional light from the camera's side, up to 70° off, plus [least, most] `fill_light` of their own
-    light. lit_background: a background is a wall that faces the camera, in the example's light. camera: effects on
-    the images.
+    light. lit_background: a background is a wall that faces the camera, in the example's light.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
@@ -201,45 +200,32 @@ def _with_lit_walls(scene: Scene) -> Scene:
     return replace(scene, examples=rows, backgrounds=lit)
 
 
-@dataclass(frozen=True)
-class CameraEffects:
-    """The effects on the images of E examples.
-
-    gains: (E, 3, 1 or size, 1 or size), factors of the linear light of object and background: the projected pattern
-    times the white balance. blur: (E,) standard deviation of a Gaussian, in pixels; 0 for none. noise: (E, 3, size,
-    size), added to the image's values.
-    """
-
-    gains: Tensor
-    blur: Tensor
-    noise: Tensor
-    encoding: str
-
-    def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
-        """Images (A, V, 3, size, size) of examples (A,) with their effects; differentiable in the images."""
-        light = decode(images, self.encoding) * self.gains[examples, None]
-        image = encode(clamp(_blurred(light, self.blur[examples])), self.encoding)
-        return clamp(image + self.noise[examples, None])
-
-
 def draw_camera_effects(
     settings: CameraEffectSettings,
     count: int,
     image: ImageSettings,
     draws: torch.Generator,
     device: torch.device | str = "cpu",
-) -> CameraEffects:
-    """Random effects for `count` examples."""
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Random effects of `count` examples: a differentiable function of images (A, V, 3, size, size) and their examples
+    (A,). Projected patterns and white balance scale the linear light of object and background."""
     patterns = draw_patterns(count, image.size, draws)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
     plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
     light = torch.where(plain, 1.0, fill + (1 - fill) * patterns)
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
-    blur = settings.blur * torch.rand(count, generator=draws)
+    sigma = settings.blur * torch.rand(count, generator=draws)
     deviation = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noise = deviation * torch.randn(count, 3, image.size, image.size, generator=draws)
-    return CameraEffects((light * 2**stops).to(device), blur.to(device), noise.to(device), image.encoding)
+    noises = deviation * torch.randn(count, 3, image.size, image.size, generator=draws)
+    gains, blur, noise = (drawn.to(device) for drawn in (light * 2**stops, sigma, noises))
+
+    def effects(images: Tensor, examples: Tensor) -> Tensor:
+        gained = decode(images, image.encoding) * gains[examples, None]
+        blurred = encode(clamp(_blurred(gained, blur[examples])), image.encoding)
+        return clamp(blurred + noise[examples, None])
+
+    return effects
 
 
 def _blurred(images: Tensor, sigma: Tensor) -> Tensor:

@@ -35,10 +35,8 @@ def write_attack_examples(path: Path, shown: AttackExamples, classes: Sequence[s
     """Images as bytes in the safetensors format; labels and predictions in its metadata."""
     labels = [classes[index] if index >= 0 else OTHER for index in shown.labels.tolist()]
     tensors, predictions = {}, {"label": labels}
-    for name, images, lights, probabilities in [
-        ("before", shown.images_before, shown.lights_before, shown.predictions_before),
-        ("after", shown.images, shown.lights, shown.predictions),
-    ]:
+    sides = zip(("before", "after"), shown.images, shown.lights, shown.predictions, strict=True)
+    for name, images, lights, probabilities in sides:
         images = images.detach().cpu()
         if images.shape[-1] > LARGEST_SIDE:
             images = interpolate(images, LARGEST_SIDE, mode="area")

@@ -35,8 +35,7 @@ class Adversary:
     """V views of one object, each (3, size, size), before an attack and after.
 
     shown: the object with its attacked shape and colors, in the scene's coordinates. light: (size, 3) coefficients of
-    the basis, exposure included. background: (C, size, size), C 3 or 1. pixels: (V, 3, size, size) added to the images,
-    or None.
+    the basis, exposure included. background: (3 or 1, size, size). pixels: (V, 3, size, size) added to images, or None.
     """
 
     shown: SceneObject
@@ -53,8 +52,7 @@ class Adversary:
     def of(
         scene: Scene, example: int, after: Conditions, before: Tensor, images: Tensor, row: int | None = None
     ) -> Adversary:
-        """An example of a scene under a row of conditions, by default its own among those of all examples, with its
-        images (V, 3, size, size)."""
+        """An example of a scene and its images (V, 3, size, size) under a row of conditions, by default its own row."""
         of_example, row = scene.examples[example], example if row is None else row
         shown = scene.objects[of_example.object]
         mesh, albedo_scale = shown.mesh, shown.albedo_scale

@@ -90,10 +90,6 @@ class AttackSettings:
         return AttackProblem(scene, [make[name](scene, settings) for name, settings in self.parameters.items()])
 
 
-class NotCleanCorrectError(InputError):
-    """The classifier is wrong before any attack."""
-
-
 @dataclass(frozen=True)
 class AttackResult:
     """The result of an attack on E examples of V views, a value: `augment.check`, `augment.random_search`,
@@ -174,8 +170,7 @@ def attack(
     the class of each image's lowest confidence. settings: what is changed, within which norm-balls; by default the
     light, without a limit. seed: of the restarts. force: also attack what the classifier gets wrong before. The scene
     lies on the classifier's device.
-    NotCleanCorrectError where an example is not classified correctly before; InputError where the classifier lacks a
-    class, or a target is the right one.
+    InputError where an example is misclassified before, the classifier lacks a class, or a target is the right one.
 
     >>> def logits(images):
     ...     mean = images.mean((1, 2, 3))
@@ -201,7 +196,7 @@ def attack(
     phases = Phases(problem.start.device)
     restarts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
-        descent = descend(model, problem, goal, settings, phases, restarts=restarts, at_once=scene.at_once, seed=seed)
+        descent = descend(model, problem, goal, settings, phases, restarts=restarts, seed=seed)
         images = final_images(problem, descent.values, problem.everything, descent.images)
     after = logits_of(model, images, settings.batch_size)
     return AttackResult(
@@ -256,7 +251,7 @@ def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
 
 
 def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:
-    """NotCleanCorrectError, with the five most probable classes, unless every image (E, V) has its label (E,)."""
+    """InputError, with the five most probable classes, unless every image (E, V) has its label (E,)."""
     wrong = (logits.argmax(2) != labels[:, None]).nonzero().tolist()
     if wrong:
         example, view = wrong[0]
@@ -266,4 +261,4 @@ def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifi
         most_probable = ", ".join(f"{name} {p:.1%}" for name, p in zip(names, confidence.tolist(), strict=True))
         images = f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r}"
         remedy = "change the scene, or set force=True"
-        raise NotCleanCorrectError(f"{images} before any attack (the first: {most_probable}): {remedy}")
+        raise InputError(f"{images} before any attack (the first: {most_probable}): {remedy}")

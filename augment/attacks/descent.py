@@ -62,9 +62,8 @@ class DescentResult:
     """The end of a descent, per example; all tensors lie on the values' device.
 
     values, images: of the step that reached the margin, else of the success of lowest cost, else of the last step that
-    was accepted. steps: number of steps. success_at: the first step that was a success (meaningless without one); with
-    a margin, descent goes on from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first
-    gradient was exactly zero.
+    was accepted. success_at: the first step that was a success (meaningless without one); with a margin, descent goes
+    on from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first one was exactly zero.
     """
 
     values: Float[Tensor, "E D"]
@@ -89,21 +88,20 @@ def descend(
     examples: Tensor | None = None,
     start: Tensor | None = None,
     restarts: Iterable[Tensor] = (),
-    at_once: int | None = None,
     seed: int = 0,
 ) -> DescentResult:
-    """Descend from the problem's start and, for examples without success, from further starts.
+    """Descend from the problem's start and, for examples without success, from further starts. As many examples as the
+    problem renders at once are attacked in a round, so that memory holds no more than theirs.
 
     model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. goal: of
     the examples. examples: (A,), some of the problem's. start: (A, D) instead of the problem's. restarts: further
-    starts (A, D); one replaces an example's result only if it succeeds; steps add up. at_once: examples per round, so
-    that memory holds no more than theirs; None: all. seed: of the transformations that `settings.eot` asks for.
+    starts (A, D); one replaces an example's result only if it succeeds; steps add up. seed: of `settings.eot`.
     """
     phases = phases or Phases()
     examples = torch.arange(len(problem.start), device=problem.start.device) if examples is None else examples
     start = problem.start[examples] if start is None else start
     expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
-    rounds = torch.arange(len(start), device=start.device).split(at_once or max(len(start), 1))
+    rounds = torch.arange(len(start), device=start.device).split(problem.at_once)
     restarts = restarts if len(rounds) <= 1 else list(restarts)
     whole: dict[str, Tensor] = {}
 

@@ -146,7 +146,6 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
                 settings,
                 examples=left,
                 start=values[left],
-                at_once=problem.scene.at_once,
                 seed=result.seed,
             )
             values[left] = end.values
@@ -164,8 +163,7 @@ def transfer(
     objects: Sequence[SceneObject] = (),
 ) -> list[dict[str, Any]]:
     """Render an attack's A adversaries, its clean-correct examples with success, elsewhere: for other classifiers, each
-    at its size; for the attacked one, from cameras turned by degrees around the vertical; and with other objects in
-    place of the scene's.
+    at its size; for the attacked one, from cameras turned by degrees around the vertical, and with other objects.
 
     Returns a dict for each, for JSON. network, azimuth or mesh: which. clean_correct, success: A times whether every
     view is classified correctly before the attack, and whether the goal is reached in every view after it, which counts

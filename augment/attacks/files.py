@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
@@ -14,13 +13,11 @@ from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, w
 from augment.attacks.attack import AttackResult, logits_of, predictions
 from augment.attacks.eot import as_jpeg
 from augment.attacks.evaluate import warnings
-from augment.scene import Conditions
 from augment.utils import progress
 from renderer.errors import require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
 from renderer.io.tiles import Tile, draw_grid
-from renderer.mesh import doubled_area_vectors
 from renderer.rasterizer import Rasterizer
 from renderer.rendering import light_sphere
 
@@ -60,7 +57,7 @@ def save(
         light = write_adversary(Adversary.of(scene, example, after, *images), stem)
         started = before.light[example].cpu() * scene.examples[example].exposure
         save_lights(stem, started, scene.basis_under(before, example), "_before")
-        lines.append({"example": example, **_numbers(result, example), **light, **_damage(result, after, example)})
+        lines.append({"example": example, **_numbers(result, example), **light})
     versions = _versions(result, stems, verify)
     for example, line in enumerate(lines):
         line["versions"] = {name: numbers[example] for name, numbers in versions.items()}
@@ -98,17 +95,6 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     }
 
 
-def _damage(result: AttackResult, after: Conditions, example: int) -> dict[str, dict[str, Any]]:
-    """Of an attacked shape: faces turned by more than 90°, and the largest displacements along x, y and z."""
-    mesh = result.problem.scene.mesh(example)
-    if after.vertices is None:
-        return {}
-    vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
-    before, now = (doubled_area_vectors(corners, mesh.faces) for corners in (mesh.vertices, vertices))
-    displacement = np.abs(vertices - mesh.vertices).max(axis=0).tolist()
-    return {"shape": {"flipped": int(((before * now).sum(axis=1) < 0).sum()), "displacement": displacement}}
-
-
 def _versions(result: AttackResult, folders: Sequence[Path], verify: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
     """By version of the images after the attack, each example's numbers; folders: of the examples."""
     images = result.images.cpu()
@@ -120,22 +106,21 @@ def _versions(result: AttackResult, folders: Sequence[Path], verify: Sequence[st
     to_verify = progress(folders if verify else [], "rendering the saved files")
     again = [render_again(folder, verify, result.problem.scene.rasterizer) for folder in to_verify]
     versions |= {name: torch.stack([views[name] for views in again]) for name in verify}
-    return {name: _version(result, version.to(result.images)) for name, version in versions.items()}
-
-
-def _version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
-    """Each example's numbers with other images (E, V, 3, size, size)."""
-    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
-    success, differences = result.goal.reached(logits.argmax(2)), (images - result.images).abs().flatten(1)
-    return [
-        {
-            "success": bool(success[example]),
-            **predictions(logits[example], result.classifier.classes),
-            "largest_difference": float(difference.max()),
-            "mean_difference": float(difference.mean()),
-        }
-        for example, difference in enumerate(differences)
-    ]
+    numbers = {}
+    for name, version in versions.items():
+        images = version.to(result.images)
+        logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+        success, differences = result.goal.reached(logits.argmax(2)), (images - result.images).abs().flatten(1)
+        numbers[name] = [
+            {
+                "success": bool(success[example]),
+                **predictions(logits[example], result.classifier.classes),
+                "largest_difference": float(difference.max()),
+                "mean_difference": float(difference.mean()),
+            }
+            for example, difference in enumerate(differences)
+        ]
+    return numbers
 
 
 def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer) -> dict[str, Tensor]:
@@ -191,6 +176,6 @@ def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[
 
 def _tiles(images: Tensor | Sequence[Tensor], captions: Sequence[tuple[str, ...]]) -> list[Tile]:
     """Tiles of images (V, 3, H, W) in [0, 1], at least SIDE pixels wide."""
-    enlarged = [image.repeat_interleave(-(-SIDE // image.shape[2]), 1) for image in images]
-    enlarged = [image.repeat_interleave(-(-SIDE // image.shape[2]), 2) for image in enlarged]
+    factor = -(-SIDE // images[0].shape[2])
+    enlarged = [image.repeat_interleave(factor, 1).repeat_interleave(factor, 2) for image in images]
     return [Tile.of(image, caption) for image, caption in zip(enlarged, captions, strict=True)]

@@ -172,8 +172,7 @@ def _of_mesh(
     condition: str,
     of_objects: Tensor | None = None,
 ) -> Parameter:
-    """Three values for each of the items, vertices or faces, of a mesh; the first of them in a smaller mesh, and used
-    where they are the object's own.
+    """Three values for each vertex or face of the largest mesh, used where a mesh has it and it is the object's own.
 
     own: (items,) bool, of each object. condition: the one to change. of_objects: (M, items, 3), to add the values to.
     """
@@ -213,7 +212,7 @@ class AttackProblem:
     """Parameters side by side: values (E, D) are theirs, one after the other; start: where descent begins."""
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
-        self.scene, self.parameters = scene, parameters
+        self.scene, self.parameters, self.at_once = scene, parameters, scene.at_once
         self.start = torch.cat([parameter.start.to(scene.lights) for parameter in parameters], dim=1)
         self.everything = torch.arange(len(scene), device=self.start.device)
         self._sizes = [parameter.start.shape[1] for parameter in parameters]
@@ -235,7 +234,7 @@ class AttackProblem:
         little memory beside theirs is used."""
         size, examples = self.scene.settings.size, self.everything if examples is None else examples
         images = values.new_empty(len(examples), self.scene.views, 3, size, size)
-        parts = [*zip(images.split(self.scene.at_once), examples.split(self.scene.at_once), strict=True)]
+        parts = [*zip(images.split(self.at_once), examples.split(self.at_once), strict=True)]
         for part, rows in progress(parts, "images") if len(parts) > 1 else parts:
             part.copy_(self.render(values[rows], rows))
         return images
@@ -250,14 +249,10 @@ class AttackProblem:
 
     def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
         """Draws (E, D), one parameter after the other; see `Parameter.sample`."""
-        parts: Sequence[Tensor | None] = [None] * len(self.parameters) if reached is None else self.split(reached)
-        pairs = zip(self.parameters, parts, strict=True)
-        return torch.cat([parameter.sample(generator, part).to(self.start) for parameter, part in pairs], dim=1)
+        pairs = self.by_parameter(self.start if reached is None else reached)
+        draws = (parameter.sample(generator, None if reached is None else part) for parameter, part in pairs)
+        return torch.cat([draw.to(self.start) for draw in draws], dim=1)
 
     def by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
         """Each parameter with its part (A, D_k) of values (A, D)."""
-        return [*zip(self.parameters, self.split(values), strict=True)]
-
-    def split(self, values: Tensor) -> tuple[Tensor, ...]:
-        """Each parameter's part (A, D_k) of values (A, D)."""
-        return values.split(self._sizes, dim=1)
+        return [*zip(self.parameters, values.split(self._sizes, dim=1), strict=True)]

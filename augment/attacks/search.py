@@ -53,8 +53,7 @@ def find_scene(
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """The scene from several cameras, the first of them its own, before its backgrounds and, in place of a gray one,
-    before light gray."""
+    """The scene from several cameras, its own first, before its backgrounds and, instead of a gray, light gray."""
     for index in range(cameras):
         fov = FOV if settings.fov is None and index % 2 else settings.fov
         candidate = _with_random_camera(replace(settings, fov=fov), draws) if index else settings

@@ -45,6 +45,7 @@ class LinearScene:
     ball: StepSettings = field(default_factory=StepSettings)
     views: int = 1
     center: Tensor | None = None  # of the balls, where it is not the start
+    at_once: int = 1000
 
     def __post_init__(self):
         self.center = self.start if self.center is None else self.center
@@ -170,6 +171,7 @@ class Axis:
     """Images of one value, which steps of 1.5 cross."""
 
     start: Tensor
+    at_once: int = 1000
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return values[:, :, None, None, None]

@@ -267,11 +267,9 @@ def test_attack_examples_are_new_successes_before_and_after(serve, scene, model)
     renders = serve(attack=TrainingAttackSettings(max_steps=30, step_size=0.5)).regenerate(model, 0)
     examples = renders.attack_examples
     assert renders.diagnostics["attack_success"] > renders.diagnostics["attack_success_before"]
-    assert 0 < len(examples) <= 4 and torch.equal(examples.lights_before, LIGHT.expand(len(examples), -1, -1))
-    for images, lights, predictions, right in [
-        (examples.images_before, examples.lights_before, examples.predictions_before, True),
-        (examples.images, examples.lights, examples.predictions, False),
-    ]:
+    assert 0 < len(examples) <= 4 and torch.equal(examples.lights[0], LIGHT.expand(len(examples), -1, -1))
+    sides = zip(examples.images, examples.lights, examples.predictions, (True, False), strict=True)
+    for images, lights, predictions, right in sides:
         everything = [render(scene, light.expand(len(scene), -1, -1)) for light in lights]
         gaps = [(image - shown).flatten(1).abs().amax(1).min() for image, shown in zip(images, everything, strict=True)]
         assert max(gaps) < 100 * EPS32

@@ -71,6 +71,9 @@ class Shades:
 
     start = torch.linspace(0.2, 1, 10, dtype=torch.float64)[:, None]
 
+    def __init__(self, at_once: int):
+        self.at_once = at_once
+
     def render(self, values, examples):
         return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
 
@@ -84,7 +87,7 @@ class Shades:
 def attack(model: nn.Module, batch_size: int = 4, at_once: int = 10) -> DescentResult:
     goal = Goal(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, batch_size=batch_size)
-    return descend(model, Shades(), goal, settings, restarts=[Shades.start.flip(0)], at_once=at_once)
+    return descend(model, Shades(at_once), goal, settings, restarts=[Shades.start.flip(0)])
 
 
 def assert_same(actual: DescentResult, expected: DescentResult) -> None:

@@ -16,7 +16,7 @@ def attack_examples(side: int, count: int = 2) -> AttackExamples:
     images, lights = (torch.rand(2, count, 3, *rest, generator=draws) for rest in ((side, side), (1,)))
     lights = lights.expand(2, count, 3, BASIS.size).transpose(2, 3)
     predictions = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, count, 2)
-    return AttackExamples(*images, *lights, *predictions, torch.ones(count, dtype=torch.int64), BASIS)
+    return AttackExamples(images, lights, predictions, torch.ones(count, dtype=torch.int64), BASIS)
 
 
 def test_a_file_stays_small_and_a_damaged_one_is_refused_by_name(tmp_path):

@@ -82,14 +82,10 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positiv
 
 def test_the_shape_is_read_back_where_the_attack_left_it(attacked, tmp_path):
     result = attacked("geometry", max_steps=2)
-    (line,) = augment.save(result, tmp_path)
+    augment.save(result, tmp_path)
     mesh, moved = result.problem.scene.mesh(0), result.conditions.vertices[0].double().numpy()
     found = load_mesh(tmp_path / "example_000" / "mesh.glb")
     np.testing.assert_array_equal(found.vertices[found.faces], moved[mesh.faces])
-    shapes = [trimesh.Trimesh(vertices, mesh.faces, process=False) for vertices in (mesh.vertices, moved)]
-    assert line["shape"]["flipped"] == ((shapes[0].face_normals * shapes[1].face_normals).sum(axis=1) < 0).sum()
-    assert line["shape"]["displacement"] == pytest.approx(np.abs(moved - mesh.vertices).max(0), abs=2**-23)
-    assert 0 < max(line["shape"]["displacement"]) <= 0.02 + 2**-23
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
