@@ -81,10 +81,8 @@ def auc_and_recalls(
     at a rate is the fraction of positives above the threshold; a positive that ties with it is missed.
     drawn, others: how often each positive (..., n) and negative (..., m) counts, once by default.
     """
-    drawn, others = (
-        np.ones(len(scores), int) if counts is None else counts
-        for scores, counts in ((positives, drawn), (negatives, others))
-    )
+    drawn = np.ones(len(positives), int) if drawn is None else drawn
+    others = np.ones(len(negatives), int) if others is None else others
     order, total = negatives.argsort(), drawn.sum(axis=-1)
     below = np.insert(others[..., order].cumsum(axis=-1), 0, 0, axis=-1)
     places = [negatives[order].searchsorted(positives, side) for side in ("left", "right")]
@@ -161,20 +159,17 @@ class Pool:
         """n, fractions of `outcomes` as `fraction` returns them, and auc and recall_at, a mapping by rate.
 
         The last two are {value, low, high}, None where either kind of image is missing. auc also has the numbers of
-        positives and negatives, and of their objects, and each recall its threshold.
+        positives and negatives, and of their objects.
         """
         counted = {name: fraction(sum(hits), len(hits)) for name, (_, hits) in self.outcomes.items()}
         ranked: list[dict[str, Any]] = [{"value": None, "low": None, "high": None}] * len(RANKED)
-        bars: list[float | None] = [None] * len(RATES)
         if all(self.ranked):
             values = zip(auc_and_recalls(*self.scores), self._ranked_replicates, strict=True)
             ranked = [{"value": float(value), **interval(replicates)} for value, replicates in values]
-            negatives = self.scores[1]
-            bars = [float(bar) for bar in thresholds(negatives, np.ones(len(negatives), int))]
         auc, *recalls = ranked
         for kind, group in zip(("positive", "negative"), self.ranked, strict=True):
             auc = {**auc, f"{kind}s": len(group), f"{kind}_objects": len(set(_objects(group)))}
-        recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
+        recall_at = dict(zip(RATES, recalls, strict=True))
         return {"n": len(self.positives) + len(self.negatives), **counted, "auc": auc, "recall_at": recall_at}
 
     @cached_property

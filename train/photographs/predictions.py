@@ -76,19 +76,15 @@ def predict(
     return predictions
 
 
-def write_predictions(
-    path: Path, predictions: Sequence[Prediction], label: str, threshold: float | None = None
-) -> None:
-    """Write a row per photograph, with whether it exceeds a threshold on the log-odds; None becomes an empty cell."""
+def write_predictions(path: Path, predictions: Sequence[Prediction], label: str) -> None:
+    """Write a row per photograph; None becomes an empty cell."""
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        columns = [*_columns(label), f"{label}_above_threshold"]
-        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
+        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *_columns(label)])
         for prediction in predictions:
             photograph, *cells = vars(prediction).values()
             names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
-            above = None if threshold is None else prediction.log_odds > threshold
-            writer.writerow([*names.values(), *cells, above])
+            writer.writerow([*names.values(), *cells])
 
 
 def read_predictions(path: Path, label: str) -> list[Prediction]:

@@ -109,7 +109,7 @@ def evaluate_photographs(
     }
 
     out.mkdir(parents=True, exist_ok=True)
-    write_predictions(out / PREDICTIONS, predictions, label, threshold)
+    write_predictions(out / PREDICTIONS, predictions, label)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     contact_sheet(predictions, images, label).save(out / "contact_sheet.png")

@@ -158,9 +158,6 @@ def test_an_operating_point_is_the_lowest_threshold_within_its_rate(fruit, tmp_p
         assert summary["recall_at_threshold"] == fraction(recall, 5)
         assert summary["false_positive_rate_at_threshold"] == fraction(false_positives, 5)
         assert summary["operating_point"] == vars(point) | {"in_sample": in_sample}
-        table = (tmp_path / "out" / "predictions.csv").read_text()
-        above = recall + false_positives
-        assert (table.count("True\n"), table.count("False\n")) == (above, 10 - above)
         Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")  # another image of the same prediction
     with pytest.raises(InputError, match=r"^calibrate=.* has 5 images of other things .* at least 10 for .*=0\.1$"):
         choose_operating_point(*fruit, "orange", 0.1, 32, False, "cpu")
