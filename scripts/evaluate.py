@@ -65,7 +65,7 @@ def main(settings: Settings) -> None:
         point = point if point and point.label == label else None
         photos, by = published(Path(settings.photos)), settings.by
         summary = scoring.evaluate_photographs(model, network.classes, photos, label, out, *options, by, point)
-    print(f"{scoring.format_summary(summary, settings.by)}\n\ntable, scores and image: {out}")
+    print(f"{scoring.format_summary(summary)}\n\ntable, scores and image: {out}")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ GROUPS = ("source", "mesh")
 REPLICATES = 2000
 BLOCK = 250  # replicates at a time, which bounds the memory
 IMAGES, RUNS = 0, 1  # seeds, so that images and runs are drawn independently
-Scores = Sequence[float] | np.ndarray
 
 
 def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
@@ -101,7 +100,7 @@ def thresholds(negatives: np.ndarray, counts: np.ndarray, rates: Sequence[str] =
     return [negatives[order][(below < (below[..., -1] - most)[..., None]).sum(axis=-1)] for most in allowed]
 
 
-def roc_curve(positives: Scores, negatives: Scores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def roc_curve(positives: np.ndarray, negatives: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """False positive rate, recall and threshold from (0, 0) to (1, 1), a point per distinct score.
 
     An image is called positive where its score exceeds the threshold; all exceed the last one, minus infinity.

@@ -65,7 +65,7 @@ def evaluate_photographs(
 
     - images: a hash of `label` and the photographs, equal where the metrics of two networks can be compared;
     - n: photographs, positives, negatives, unreadable, left_out; label; size; unreadable, left_out: their paths;
-    - recall, top5: of the photographs of class `label`, and their most common wrong classes, most_common_wrong;
+    - recall, top5: of the photographs of class `label`;
     - false_positive_rate: the fraction of all others that are predicted as `label`;
     - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`Pool.metrics`);
     - recall_at_threshold, false_positive_rate_at_threshold: at an operating point of `label`, where one is given; and
@@ -101,7 +101,6 @@ def evaluate_photographs(
         **whole.metrics,
         **chosen,
         "n": {"photographs": len(predictions), **counts, "unreadable": len(unreadable), "left_out": len(others)},
-        "most_common_wrong": _most_common_wrong(whole.positives),
         **metrics,
         "by_class": {name: _class_metrics(group, label) for name, group in by_class.items()},
         "unreadable": unreadable,
@@ -151,24 +150,20 @@ def describe_point(point: Mapping[str, Any]) -> str:
 
 def _class_metrics(predictions: Sequence[Prediction], label: str) -> dict[str, Any]:
     ranks = [item.true_rank for item in predictions if item.true_rank is not None]
+    wrong = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
     return {
         "n": len(predictions),
         "recall": fraction(ranks.count(1), len(ranks)),
         "top5": fraction(sum(rank <= 5 for rank in ranks), len(ranks)),
         "predicted_label": fraction(sum(item.predicted == label for item in predictions), len(predictions)),
-        "most_common_wrong": _most_common_wrong(predictions),
+        "most_common_wrong": dict(wrong.most_common(WRONG_CLASSES)),
     }
 
 
-def _most_common_wrong(predictions: Sequence[Prediction]) -> dict[str, int]:
-    counts = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
-    return dict(counts.most_common(WRONG_CLASSES))
-
-
-def format_summary(summary: dict[str, Any], by: str = "source") -> str:
-    """The summary of `evaluate_photographs` as Markdown tables, by source or mesh, without a newline at the end."""
+def format_summary(summary: dict[str, Any]) -> str:
+    """The summary of `evaluate_photographs` as Markdown tables, by mesh or source, without a newline at the end."""
     label, n, files = summary["label"], summary["n"], summary["left_out"]
-    pools = {"all": summary, **summary[f"by_{by}"]}
+    pools = {"all": summary, **summary.get("by_mesh", summary["by_source"])}
     over = resampled(auc := summary["auc"])
     if over != "images":
         over += f" ({auc['positive_objects']} of {label} and {auc['negative_objects']} others)"

@@ -109,8 +109,7 @@ def test_every_metric_of_a_known_model_is_right(fruit, tmp_path):
         assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
         assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
         assert {name: metrics[name] for name in expected} == expected
-    wrong = {"pear": 2, "apple": 1, "plum": 1}
-    assert summary["by_class"]["orange"]["most_common_wrong"] == summary["most_common_wrong"] == wrong
+    assert summary["by_class"]["orange"]["most_common_wrong"] == {"pear": 2, "apple": 1, "plum": 1}
     assert summary["by_class"]["other_lemon"] == {
         "n": 2, "recall": fraction(0, 0), "top5": fraction(0, 0), "predicted_label": fraction(1, 2),
         "most_common_wrong": {"lime": 1, "orange": 1},
@@ -145,7 +144,7 @@ def test_a_mesh_is_ranked_against_all_images_of_the_other_kind_and_objects_count
         other = [(name, order) for name, _, order in FRUIT if name.startswith("orange/") == (mesh == "k")]
         assert metrics["auc"]["value"] == pytest.approx(score(of_mesh + other)["auc"], abs=1e-12)
         assert metrics["recall"] == score(of_mesh)["recall"]
-    assert list(summary["by_mesh"]) == ["k", "m", "n"] and "objects and images" in format_summary(summary, "mesh")
+    assert list(summary["by_mesh"]) == ["k", "m", "n"] and "objects and images" in format_summary(summary)
 
 
 @pytest.mark.parametrize(("rate", "recall", "false_positives"), [(0.4, 1, 2), (0.39, 0, 0), (0.8, 3, 4), (0.6, 1, 2)])
