@@ -85,8 +85,8 @@ def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
 def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
     """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high.
 
-    The interval is a 95 % bootstrap interval over objects and images, the same ones for all runs, and over
-    seeds, which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n, the
+    The interval is a 95 % bootstrap interval over objects and images, the same ones for all runs, and over seeds,
+    which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n, the
     bootstrap underestimates the variance by 1/n, and with one it finds none. Empty where a run lacks the metric.
     """
     pools = [[evaluation.pools[source] for evaluation in evaluations] for evaluations in (group, reference)]

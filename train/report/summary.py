@@ -260,7 +260,7 @@ def find(folders: Sequence[Path]) -> Findings:
 
     Runs are ordered by arm, so that the others are compared with `none`, or with a network that no run trained. The
     third part holds folders, their states in words or why they cannot be read, and the lines of their epochs.
-    InputError for a folder that is missing, and where there is nothing that can be read.
+    InputError for a folder that is missing, and where nothing is found.
     """
     for folder in folders:
         if not folder.is_dir():
@@ -268,7 +268,7 @@ def find(folders: Sequence[Path]) -> Findings:
     paths = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
     if not paths:
         raise InputError(f"runs: {', '.join(map(str, folders))} holds no run and no attack: give other folders")
-    runs, attacks, unfinished, errors = [], [], [], []
+    runs, attacks, unfinished = [], [], []
     for path in paths:
         try:
             if (path / LINES).is_file():
@@ -279,10 +279,7 @@ def find(folders: Sequence[Path]) -> Findings:
                 epochs = [line for line in read_metrics(path) if "epoch" in line]
                 unfinished.append((path, run_folder.state(path), epochs))
         except (InputError, OSError) as error:  # the latter of the lock in another user's folder
-            errors.append(error)
             unfinished.append((path, f"cannot be read: {error}", []))
-    if len(errors) == len(paths):
-        raise InputError(f"runs: nothing there can be read: {errors[0]}")
     runs.sort(key=lambda run: ARMS.index(run.arm) if run.arm in ARMS else -1)
     return runs, attacks, unfinished
 

@@ -106,16 +106,13 @@ def test_a_line_is_drawn_where_it_has_points_that_differ():
 
 
 def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
-    """A run that cannot be read beside one that can is named in the page."""
+    """Runs that cannot be read are named in the page."""
     with pytest.raises(InputError, match="holds no run and no attack"):
         write_report([tmp_path], tmp_path)
     assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
-    with pytest.raises(InputError, match=rf"^runs: nothing there can be read: {tmp_path}/a/metrics.jsonl"):
-        write_report([tmp_path], tmp_path)
-    (tmp_path / "b" / "metrics.jsonl").write_text("")
     assert "/a</td><td" in write_report([tmp_path], tmp_path).read_text()
 
 
