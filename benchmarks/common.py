@@ -8,7 +8,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -66,3 +66,24 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
         writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[Row]:
+    """Print the machine, and each row as it is measured; with a path, write what there is to a CSV file every time."""
+    print(machine(device))
+    measured = []
+    for row in rows:
+        print(row, flush=True)
+        measured.append(row)
+        if path:
+            write_csv(path, measured)
+    return measured
+
+
+def with_median(rows: Iterable[Row]) -> Iterator[Row]:
+    """The rows of the rounds, and then one of the medians of their columns but "round"."""
+    rounds = []
+    for row in rows:
+        rounds.append(row)
+        yield row
+    yield {name: statistics.median(row[name] for row in rounds) if name != "round" else "median" for name in rounds[0]}

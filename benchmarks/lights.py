@@ -30,7 +30,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from benchmarks.common import Row, machine, medians, relative_error, write_csv
+from benchmarks.common import Row, medians, record, relative_error
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
@@ -171,16 +171,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=21, help="in which all settings take turns")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    print(machine())
     cup, sizes = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes
     tables = [costs("cost", LIGHT_PATHS, cup, sizes, options.rounds)]
     tables += [costs("local lights", LOCAL_LIGHTS, cup, sizes, options.rounds)]
     tables += [beside_mitsuba(sizes[0])] if options.mitsuba else []
-    rows = []
-    for row in chain.from_iterable(tables):
-        print(row, flush=True)
-        rows.append(row)
-        write_csv(options.csv, rows)
+    record(chain.from_iterable(tables), options.csv)
 
 
 if __name__ == "__main__":

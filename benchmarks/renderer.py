@@ -90,7 +90,7 @@ SHADINGS: dict[str, Shading] = {ANALYTIC: shading.radiance, AUTOGRAD: shade_by_f
 # ---------------------------------------------------------------------------- panels
 
 
-def light_steps(view: View, mitsuba: bool) -> Iterator[Contender]:
+def light_steps(view: View) -> Iterator[Contender]:
     """A step of an attack on the light, by degree and number type of the operator."""
     for degree, (name, dtype) in product(DEGREES, DTYPES.items()):
         light = coefficients(degree, torch.promote_types(dtype, torch.float32), view.device)
@@ -98,7 +98,7 @@ def light_steps(view: View, mitsuba: bool) -> Iterator[Contender]:
         yield f"degree {degree}, {name}", SAMPLES, degree, step, step
 
 
-def builds(view: View, mitsuba: bool) -> Iterator[Contender]:
+def builds(view: View) -> Iterator[Contender]:
     """An operator of one view, by samples and degree."""
     for samples, degree in product(PER_SIDE, DEGREES):
         build = partial(view.operator, samples, degree)
@@ -106,8 +106,8 @@ def builds(view: View, mitsuba: bool) -> Iterator[Contender]:
         yield f"{samples}² samples, degree {degree}", samples, degree, step, build
 
 
-def light_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
-    """The gradient by the light: the operator, plain autograd with ever more computed once and kept, Mitsuba."""
+def light_gradients(view: View) -> Iterator[Contender]:
+    """The gradient by the light: the operator, plain autograd with ever more computed once and kept."""
     light, vertices = coefficients(DEGREE, torch.float32, view.device), view.vertices()
     operator = view.operator()
     upstream = view.upstream(operator.pixels)
@@ -125,9 +125,6 @@ def light_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
             return pixels, radiance.detach(), *torch.autograd.grad(radiance, variable, upstream)
 
         yield f"plain autograd, kept: {kept}", samples, DEGREE, by_autograd, by_autograd
-    if mitsuba:
-        step, _ = scene.mitsuba_steps(view)
-        yield "Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step
 
 
 def lit_by_autograd(view: View, vertices: Tensor, samples: int) -> Iterator[tuple[str, Lit]]:
@@ -159,8 +156,8 @@ def lit_by_autograd(view: View, vertices: Tensor, samples: int) -> Iterator[tupl
     yield "operator", lambda light: (pixels, light[operator.nonzero].T @ at_pixels * operator.albedo)
 
 
-def vertex_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
-    """A step by the vertices: analytic and plain autograd, visibility cached or rasterized anew, and Mitsuba."""
+def vertex_gradients(view: View) -> Iterator[Contender]:
+    """A step by the vertices: analytic and plain autograd, visibility cached or rasterized anew."""
     light = coefficients(DEGREE, torch.float32, view.device)
     for samples, (name, shade) in product([s for s in PER_SIDE if s <= SAMPLES], SHADINGS.items()):
         if samples > 2 and name != ANALYTIC:
@@ -170,9 +167,6 @@ def vertex_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
         if samples == 1:
             step = vertex_step(view, samples, light, shade, cached=True)
             yield f"{name}, visibility cached", samples, DEGREE, step, step
-    if mitsuba:
-        _, step = scene.mitsuba_steps(view)
-        yield "Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step
 
 
 PANELS = {  # contenders, the reference's irradiance and gradient
@@ -181,15 +175,20 @@ PANELS = {  # contenders, the reference's irradiance and gradient
     "gradient by the light": (light_gradients, scene.cut_irradiance, "by_light"),
     "gradient by the vertices": (vertex_gradients, scene.cut_irradiance, "by_vertices"),
 }
+MITSUBA = {"gradient by the light": "light.data", "gradient by the vertices": "mesh.vertex_positions"}
 
 
 def measure(panel: str, view: View, options: argparse.Namespace) -> list[Row]:
     """A row per contender, marked where no other is as fast and as accurate, and better in one of the two."""
     contenders, irradiance, gradient = PANELS[panel]
     exact, rows, calls = Converged(view, irradiance), [], []
+    measured = list(contenders(view))
+    if options.mitsuba and panel in MITSUBA:
+        step = scene.mitsuba_step(view, MITSUBA[panel])
+        measured.append(("Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step))
     defaults = {"operator", f"degree {DEGREE}, float32", f"{ANALYTIC}, rasterized in every step"}
     defaults |= {f"{SAMPLES}² samples, degree {DEGREE}"}
-    for setting, samples, degree, step, call in contenders(view, options.mitsuba):
+    for setting, samples, degree, step, call in measured:
         row = {"panel": f"{panel}, {view.size}²", "setting": setting, "time_ms": None}
         row |= {"degree": degree, "samples": samples**2, "size": view.size}
         row["default"] = samples == SAMPLES and setting in defaults

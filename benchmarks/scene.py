@@ -1,11 +1,11 @@
 """The scene of the renderer's benchmark: an ellipsoid under a probe and a sun.
 
-`Converged` is the image and the gradients that all methods converge to; `mitsuba_steps` renders the scene with Mitsuba.
+`Converged` is the image and the gradients that all methods converge to; `mitsuba_step` renders the scene with Mitsuba.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -148,9 +148,9 @@ def covered_fractions(view: View) -> tuple[Tensor, Tensor, Tensor]:
     return torch.from_numpy(key // len(faces)), torch.from_numpy(key % len(faces)), torch.from_numpy(weight)
 
 
-def mitsuba_steps(view: View) -> tuple[Step, Step]:
-    """The gradient by the light (49, 3), and by the vertices (V, 3) through the shading alone, by Mitsuba 3 on one
-    thread, as its users would set it up.
+def mitsuba_step(view: View, name: str) -> Step:
+    """The gradient by light.data (49, 3), or by mesh.vertex_positions (V, 3) through the shading alone, by Mitsuba 3 on
+    one thread, as its users would set it up.
 
     Each camera ray draws one direction by the cosine and looks up an environment map there: Mitsuba's cheapest way, and
     the least noisy for a smooth light. Automatic differentiation holds outlines fixed; moved vertices rebuild the ray
@@ -173,11 +173,11 @@ def mitsuba_steps(view: View) -> tuple[Step, Step]:
     scene = load(module, scene)
     parameters = module.traverse(scene)
     upstream = module.TensorXf(np.pi * view.image_gradient.T.cpu().float().unflatten(0, (size, size)).numpy())
-    values = {"light.data": module.TensorXf(repeated.detach().numpy())}
-    values["mesh.vertex_positions"] = module.Float(view.mesh.vertices.astype(np.float32).ravel())
+    by_light, vertices = name == "light.data", view.mesh.vertices.astype(np.float32).ravel()
+    start = module.TensorXf(repeated.detach().numpy()) if by_light else module.Float(vertices)
 
-    def step(name: str) -> Result:
-        value = drjit.detach(values[name])
+    def step() -> Result:
+        value = drjit.detach(start)
         drjit.enable_grad(value)
         parameters[name] = value
         parameters.update()
@@ -185,9 +185,9 @@ def mitsuba_steps(view: View) -> tuple[Step, Step]:
         drjit.backward(drjit.sum(image * upstream, axis=None))
         gradient = torch.from_numpy(np.array(drjit.grad(value)))  # waits for the result
         drjit.disable_grad(parameters[name])
-        if name == "light.data":
+        if by_light:
             [gradient] = torch.autograd.grad(repeated, light, gradient, retain_graph=True)
         radiance = np.pi * np.array(drjit.detach(image)).reshape(-1, 3).T
         return torch.arange(size**2), torch.from_numpy(radiance), gradient.view(-1, 3)
 
-    return partial(step, "light.data"), partial(step, "mesh.vertex_positions")
+    return step

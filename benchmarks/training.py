@@ -16,16 +16,16 @@ import argparse
 import json
 import multiprocessing
 import os
-import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,32 +40,56 @@ from augment.build import build_scene
 from augment.service import TrainingAttackSettings
 from augment.utils import generator
 from augment.variation import vary
-from benchmarks.common import Row, machine, write_csv
+from benchmarks.common import Row, record, with_median
 from train import checkpoint
 from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
 from train.settings import ExperimentSettings, compose, read_settings
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
-GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+BACKGROUNDS = 5  # of each view
 SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
 
 
-def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
-    """The last epoch's metrics of two of `python -m train`; the first compiles and warms up."""
-    command = [sys.executable, "-m", "train", "experiment=paper", "data=npz", f"data.path={options.data}", f"run={run}"]
-    command += ["data.validation=0.05", "train.epochs=2", f"train.images_per_epoch={options.images}"]
-    command += [f"model.depth={options.depth}", f"model.width={options.width}", f"scene.meshes={options.meshes}"]
-    command += [f"train.device={options.device}", *overrides, *options.overrides]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict[str, float]:
+    """The metrics of the second of two epochs of `python -m train`; the first compiles and warms up."""
+    command = [sys.executable, *launcher, "-m", "train", "experiment=paper", "train.epochs=2", f"run={run}"]
+    subprocess.run([*command, *overrides], check=True, stdout=subprocess.DEVNULL)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return next(line for line in reversed(lines) if "epoch" in line)
+
+
+def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
+    settings = ["data=npz", f"data.path={options.data}", "data.validation=0.05", f"scene.meshes={options.meshes}"]
+    settings += [f"train.images_per_epoch={options.images}", f"train.device={options.device}"]
+    settings += [f"model.depth={options.depth}", f"model.width={options.width}"]
+    return last_epoch(run, *settings, *overrides, *options.overrides)
 
 
 def make_sure(head: dict[str, Tensor], label: int = 0) -> None:
     """Edit a network's last layer so that it predicts one class for every image, with a gradient left."""
     head["weight"][label] = 0
     head["bias"][label] = SURE
+
+
+def sure_network(depth: int, width: int) -> WideResNet:
+    torch.manual_seed(0)
+    network = WideResNet(10, depth, width, 0.0).eval()
+    make_sure(network.head.state_dict())
+    return network
+
+
+def attacked_solids(meshes: int, views: int, device: str = "cpu", **attack: Any) -> AugmentationService:
+    """Meshes × views × five backgrounds, under attack, at 32 pixels per side."""
+    solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
+    settings = AugmentationSettings(attack=TrainingAttackSettings(**attack))
+    scene = {"views": views, "samples": 2, "rasterizer": "numpy", "device": device}
+    return AugmentationService.from_meshes(solids, 32, settings, **scene)
+
+
+def estimated_bytes(service: AugmentationService) -> int:
+    """What `Scene` estimates for an attack, and its operators."""
+    return service.scene.attack_bytes + sum(stack.transfer.nbytes for stack in service.scene.stacks)
 
 
 def collate(transform: Callable[[Image.Image], Tensor], batch: list[tuple[Image.Image, int]]) -> tuple[Tensor, Tensor]:
@@ -110,9 +134,8 @@ def plain_loop(options: argparse.Namespace) -> dict[str, Callable[[], float]]:
     return {name: partial(epoch, network) for name, network in {**networks, "data": None}.items()}
 
 
-def speed(options: argparse.Namespace) -> list[Row]:
+def speed(options: argparse.Namespace) -> Iterator[Row]:
     """Images per second from stored images to updated weights, and the attack's fraction of a whole epoch."""
-    rows: list[Row] = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         loops = plain_loop(options)
@@ -132,10 +155,7 @@ def speed(options: argparse.Namespace) -> list[Row]:
                 row |= {f"{name}_images_per_second": options.images / seconds, f"{name}_ratio": seconds / ours}
             row |= {"attack_seconds": attack, "attack_steps": adversarial["augment/steps"]}
             row["attack_fraction_of_epoch"] = attack / (attack + ours * EPOCH_IMAGES / options.images)
-            rows.append(row)
-            print(row, flush=True)
-    median = {name: statistics.median(row[name] for row in rows) for name in rows[0] if name != "round"}
-    return [*rows, {"round": "median", **median}]
+            yield row
 
 
 def peak_memory() -> int:
@@ -147,15 +167,9 @@ def peak_memory() -> int:
 def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     """Seconds of one core that one round of attacks takes, against a WideResNet-10-1 that is sure of the class."""
     torch.set_num_threads(1)
-    torch.manual_seed(0)
-    network = WideResNet(10, 10, 1, 0.0).eval()
-    make_sure(network.head.state_dict())
-    views, before, start = renders // (meshes * len(GRAYS)), peak_memory(), time.process_time()
-    solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
-    settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps))
-    scene = {"views": views, "backgrounds": GRAYS, "samples": 2, "rasterizer": "numpy"}
-    service = AugmentationService.from_meshes(solids, 32, settings, **scene)
-    assert service.scene is not None
+    network, views = sure_network(10, 1), renders // (meshes * BACKGROUNDS)
+    before, start = peak_memory(), time.process_time()
+    service = attacked_solids(meshes, views, max_steps=steps)
     _ = service.scene.stacks  # what is precomputed of each view
     built = time.process_time()
     service.regenerate(network, 0)
@@ -163,37 +177,26 @@ def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     row = {"renders": renders, "meshes": meshes, "views": views * meshes, "steps": steps}
     row |= {"precompute_seconds": built - start, "attack_seconds": attack}
     row["ms_per_render_and_pass"] = 1e3 * attack / (renders * (steps + 1))
-    operators = sum(stack.transfer.nbytes for stack in service.scene.stacks)
-    estimated = service.scene.attack_bytes + operators
-    return row | {"memory_mb": (peak_memory() - before) / 1e6, "estimated_mb": estimated / 1e6}
+    return row | {"memory_mb": (peak_memory() - before) / 1e6, "estimated_mb": estimated_bytes(service) / 1e6}
 
 
-def renders(options: argparse.Namespace) -> list[Row]:
+def renders(options: argparse.Namespace) -> Iterator[Row]:
     """A row per number of renders, and per number of meshes with the first number of renders of each."""
     few, meshes = options.numbers[0], options.meshes[0]
     loads = [(number, meshes) for number in options.numbers] + [(few * count, count) for count in options.meshes]
-    rows = []
     for load in dict.fromkeys(loads):
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-            rows.append(pool.submit(attack_cost, *load, options.steps).result())
-        print(rows[-1], flush=True)
-    return rows
+            yield pool.submit(attack_cost, *load, options.steps).result()
 
 
-def moved(options: argparse.Namespace) -> list[Row]:
+def moved(options: argparse.Namespace) -> Iterator[Row]:
     """Milliseconds of one core per render, by rounds; what one draws and shades, without the classifier's part."""
     torch.set_num_threads(1)
-    meshes = ["solid:orange"] * 10
-    overrides = [
-        "experiment=best",
-        "train.init_from=-",
-        "run=-",
-        f"scene.meshes={meshes}",
-        f"scene.views={options.views}",
-    ]
+    overrides = ["experiment=best", "train.init_from=-", "run=-", f"scene.views={options.views}"]
+    overrides.append(f"scene.meshes={['solid:orange'] * 10}")
     settings = read_settings(ExperimentSettings, compose("train", overrides))
     kept = {"scene": settings.scene, "renderer": settings.renderer, "cache": None}
-    scene, rows = build_scene(list(settings.objects.values()), 32, settings.views, **kept), list[Row]()
+    scene = build_scene(list(settings.objects.values()), 32, settings.views, **kept)
     for number in range(options.rounds + 1):
         row: Row = {"round": number, "renders": len(scene)}
         for name, once in (("direct", True), ("operators", False)):
@@ -201,17 +204,15 @@ def moved(options: argparse.Namespace) -> list[Row]:
             varied, everything = vary(scene, settings.augment.vary, generator(number), once), torch.arange(len(scene))
             varied.render(varied.conditions(everything), everything)
             row[f"ms_per_render_{name}"] = 1e3 * (time.process_time() - start) / len(scene)
-        rows.append(row)
-        print(row, flush=True)
-    median = {name: statistics.median(row[name] for row in rows[1:]) for name in rows[0] if name != "round"}
-    return [*rows[1:], {"round": "median", **median}]  # the first warms up
+        if number:  # the first warms up
+            yield row
 
 
 def main(arguments: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("speed", help="against a plain loop, and the attack's fraction of an epoch")
-    command.set_defaults(measure=speed)
+    command.set_defaults(measure=lambda options: with_median(speed(options)))
     command.add_argument("--data", type=Path, required=True, help=".npz file, as data=npz reads it")
     command.add_argument("--meshes", default="[solid:orange:0,solid:orange:1]", help="a list, as scene.meshes takes it")
     command.add_argument("--images", type=int, default=512, help="per epoch that is timed")
@@ -221,24 +222,19 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     command.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), help="of the plain loop's loader")
     command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     command.add_argument("--overrides", nargs="*", default=[], help="further ones of `python -m train`")
-    command.add_argument("--csv", type=Path)
     command = commands.add_parser("renders", help="the cost of attacks over the number of renders")
     command.set_defaults(measure=renders, device="cpu")
     command.add_argument("--numbers", nargs="+", type=int, default=[100, 1000, 10_000], help="multiples of 5 × meshes")
     command.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
     command.add_argument("--steps", type=int, default=1)
-    command.add_argument("--csv", type=Path)
     command = commands.add_parser("moved", help="renders of a view and a light each, directly and by operators")
-    command.set_defaults(measure=moved, device="cpu")
+    command.set_defaults(measure=lambda options: with_median(moved(options)), device="cpu")
     command.add_argument("--views", type=int, default=20, help="of each mesh")
     command.add_argument("--rounds", type=int, default=3)
-    command.add_argument("--csv", type=Path)
+    for command in commands.choices.values():
+        command.add_argument("--csv", type=Path)
     options = parser.parse_args(arguments)
-    print(machine(options.device))
-    rows = options.measure(options)
-    if options.csv:
-        write_csv(options.csv, rows)
-    return rows
+    return record(options.measure(options), options.csv, options.device)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def test_the_benchmarks_plain_autograd_is_the_analytic_gradient():
 
 def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples():
     """Whatever plain autograd keeps from step to step; to float32's rounding of sums over all pixels."""
-    contenders = list(renderer.light_gradients(scene.View(scene.ellipsoid(2), 16, choose("numpy")), mitsuba=False))
+    contenders = list(renderer.light_gradients(scene.View(scene.ellipsoid(2), 16, choose("numpy"))))
     for samples in (1, scene.SAMPLES):
         (pixels, *first), *others = [step() for _, count, _, step, _ in contenders if count == samples]
         assert len(others) == 3 + (samples == 1)
@@ -133,8 +133,10 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert len(read(path)) == 2
 
 
-def test_the_questions_to_a_gpu_have_a_dry_run_on_a_cpu(monkeypatch):
+def test_an_attack_is_compared_on_a_cpu_too(monkeypatch, tmp_path):
     monkeypatch.setattr(common, "BURST", 0.0)
-    tiny = ["--device=cpu", "--pixels=8", "--views=1", "--depth=10", "--rounds=1", "--steps=1"]
-    rows = gpu.main([*tiny, "--questions", "attack", "synchronizations", "memory", "agreement"])
-    assert [row["value"] for row in rows if row["question"].startswith("difference")] == [0, 0]
+    for name, value in {"DEPTH": 10, "ROUNDS": 1, "STEPS": 1}.items():
+        monkeypatch.setattr(gpu, name, value)
+    [row] = gpu.main(["--device=cpu", "--questions", "attack", "memory", f"--csv={tmp_path}/gpu.csv"])
+    assert row["ratio"] == row["value"] / row["reference"] > 0
+    assert len(read(tmp_path / "gpu.csv")) == 1
