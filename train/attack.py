@@ -40,11 +40,7 @@ LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """shared: the views share what is attacked. force: go on where nothing is clean-correct. checks: `augment.check`.
-
-    radius_scales: of the radii to draw success against; see `augment.success_by_radius`.
-    verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
-    """
+    """conf/attack.yaml says what each key does."""
 
     shared: bool = False
     force: bool = False
@@ -80,8 +76,7 @@ class AttackSceneSettings(SceneSettings):
 
 @dataclass
 class TransferSettings:
-    """Where else adversaries are shown. classifiers: as `classifier`, or {classifier, weights}. azimuths: degrees by
-    which cameras are turned. meshes: as those of a scene."""
+    """Where else adversaries are shown; conf/attack.yaml says what each key does."""
 
     classifiers: list[Any] = field(default_factory=list)
     azimuths: list[float] = field(default_factory=list)
@@ -94,9 +89,8 @@ class TransferSettings:
 
 @dataclass
 class AttackExperimentSettings:
-    """One attack on one classifier. target: None, a class, least_likely, or a class per view. reload: an adversary's
-    folder, to render or to attack instead of the scene. A projector or lamps that are attacked stand in the scene,
-    where it names none with their defaults."""
+    """One attack on one classifier; conf/attack.yaml says what each key does. A projector or lamps that are attacked
+    stand in the scene, where it names none with their defaults."""
 
     classifier: str = "efficientnet_lite0"
     weights: str | None = None
@@ -169,10 +163,15 @@ def attacks(
     settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
 ) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
     """(name, settings of the attacked scene, result) of an adversary, around which norm-balls then are, or without one
-    of each mesh, in a scene that was searched for where `scene.search` says so.
+    of each mesh, in a scene that `scene.search` found. InputError also where the classifier is wrong before."""
 
-    InputError also where the classifier is wrong before the attack.
-    """
+    def build(item: ObjectSettings, scene: AttackSceneSettings) -> Scene:
+        """An example per view and background, or per background where views share the attack."""
+        options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
+        options["rasterizer"] = chosen_rasterizer(settings.renderer)
+        with keyed("scene", vars(scene)):
+            return build_scene([item], classifier.size, scene.views, shared=settings.attack.shared, **options)
+
     target, seed, force = settings.target, settings.seed, settings.attack.force
     if adversary is not None:
         if adversary.pixels is not None:
@@ -183,26 +182,15 @@ def attacks(
         return
     for index, item in enumerate(settings.scene.meshes):
         named, chosen = read_object(item, settings.label, index), settings.scene
-        build = partial(build_attacked, named, settings, classifier.size, device)
         if settings.scene.search and not force:
             draws = generator(seed, named.mesh, "search")
-            chosen = find_scene(classifier, chosen, settings.attack, build, chosen.search, draws)
-        attacked = build(chosen)
+            chosen = find_scene(classifier, chosen, settings.attack, partial(build, named), chosen.search, draws)
+        attacked = build(named, chosen)
         try:
             result = attack(classifier, attacked, target, settings.attack, seed=seed, force=force)
         except InputError as error:  # which names arguments of Python
             raise InputError(re.sub(r"(force|shared)=True", r"attack.\1=true", str(error))) from error
         yield named.mesh, chosen, result
-
-
-def build_attacked(
-    item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device, scene: SceneSettings
-) -> Scene:
-    """An example per view and background at `size` pixels per side, or per background where views share the attack."""
-    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
-    options["rasterizer"] = chosen_rasterizer(settings.renderer)
-    with keyed("scene", vars(scene)):
-        return build_scene([item], size, scene.views, shared=settings.attack.shared, **options)
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:

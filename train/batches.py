@@ -1,7 +1,4 @@
-"""Batches of training images, data and renders, in the rounds of an epoch: shuffled, cropped and flipped.
-
-Images are uint8 and live on the device, cropped and flipped there for many batches at once.
-"""
+"""Batches of training images, data and renders, in the rounds of an epoch: shuffled, cropped and flipped."""
 
 import math
 from collections.abc import Iterator

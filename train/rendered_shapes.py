@@ -1,7 +1,4 @@
-"""A small labeled data set of procedural solids, rendered here, so that training runs with nothing downloaded.
-
-The images stand in soft, even light, as stock photographs do.
-"""
+"""A small labeled data set of solids, rendered here in soft, even light, so that training needs no download."""
 
 import math
 from collections.abc import Sequence

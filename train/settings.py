@@ -231,10 +231,8 @@ def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Settings:
-    """The dataclass from its configuration, which stands at a key.
-
-    InputError names the key that is unknown, unset, of the wrong type or, by the dataclass's own check, out of range.
-    """
+    """The dataclass from its configuration, which stands at a key; InputError naming the key that is unknown, unset, of
+    the wrong type or, by the dataclass's own check, out of range."""
     try:
         merged: Any = OmegaConf.merge(_schema(kind), config)  # type: ignore[arg-type]  # types are hashable
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
