@@ -157,7 +157,6 @@ class Trainer:
         return True
 
     def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
-        """Renders made against the current weights."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
@@ -288,10 +287,9 @@ class Trainer:
                 raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise InputError(
-                f"the checkpoint in {self.folder} is not one that this run can go on from ({in_one_line(error)}): "
-                f"restore {checkpoint.LAST}, or start in another folder with run="
-            ) from error
+            fault = f"the checkpoint in {self.folder} is not one that this run can go on from ({in_one_line(error)})"
+            remedy = f"restore {checkpoint.LAST}, or start in another folder with run="
+            raise InputError(f"{fault}: {remedy}") from error
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or it would take the place of the whole one

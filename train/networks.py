@@ -189,10 +189,8 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
-        raise InputError(
-            f"the network in {path} is made by {name}: give model={name} to run that code or, for an attack, "
-            "classifier=python: with a function that loads the weights"
-        )
+        attack = "for an attack, classifier=python: with a function that loads the weights"
+        raise InputError(f"the network in {path} is made by {name}: give model={name} to run that code or, {attack}")
     with _of_one_architecture(path):
         size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
         network = build_network(classes, size, **shape)

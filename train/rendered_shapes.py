@@ -38,8 +38,7 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
     cache, settings, splits = cache or TensorCache(), replace(SETTINGS, size=size), []
     for part, count in (("train", train), ("test", test)):
         key = content_hash([CODE, CLASSES, count, seed, part, settings])
-        cached = cache.read(key)
-        if cached is None:
+        if (cached := cache.read(key)) is None:
             cached = {"images": _render(part, count, seed, settings)}
             cache.write(key, cached)
         console.info("%s images: %d", part, len(cached["images"]))
