@@ -37,8 +37,7 @@ VALIDATION = 0.1  # of every class's images, where neither data.validation nor t
 def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], dict]:
     """Begin a run of one arm: all that comes before the first epoch, where wrong input shows.
 
-    Returns a function that trains and scores, and gives the scores, which are in the folder's files, too. command: the
-    one that was given, to be recorded.
+    Returns a function that trains, and returns the scores that it writes. command: as it was given, to be recorded.
     """
     base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
     if base and settings.data.name == "shapes":
