@@ -175,12 +175,7 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     local = [(part, values) for part, values in parts if isinstance(part, LocalBasis)]
     sky = next((values / math.pi for part, values in parts if isinstance(part, Harmonics)), None)
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
-    return render(_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
-
-
-@cache
-def _ball() -> Mesh:
-    return Mesh.plain(*sphere(5))
+    return render(Mesh.plain(*sphere(5)), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:

@@ -26,18 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import (
-    bands,
-    degree_of,
-    homogeneous_gradients,
-    lambertian_factors,
-    monomial_coefficients,
-    monomials,
-    nonzero_coefficients,
-    per_degree,
-    select_rows,
-    unit_vectors,
-)
+from renderer.light import harmonics
 from renderer.normals import area_vectors, vertex_normals
 
 if TYPE_CHECKING:
@@ -85,7 +74,7 @@ def irradiance(
     Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
     """
     require_bounded(light=light)
-    degree_of(light)
+    harmonics.degree_of(light)
     return _Irradiance.apply(normals, light.to(dtype))
 
 
@@ -94,7 +83,7 @@ class _Irradiance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
-        unit, length = unit_vectors(normals)
+        unit, length = harmonics.unit_vectors(normals)
         unit = unit.to(light.dtype)
         blocks = zip(*map(_polynomial(light), unit.split(BLOCK, dim=1)), strict=True)
         value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
@@ -133,7 +122,7 @@ def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     even, linear, constant = slopes[:, :-1], slopes[:, -1:], light[:1].T * math.sqrt(math.pi / 4)
 
     def evaluate(unit: Tensor) -> tuple[Tensor, Tensor]:
-        slope = torch.addmm(linear, even, monomials(unit, degree - 1)).unflatten(0, (3, 3))
+        slope = torch.addmm(linear, even, harmonics.monomials(unit, degree - 1)).unflatten(0, (3, 3))
         value = torch.addmm(constant, linear.view(3, 3).T, unit, alpha=1 - 1 / degree)
         for along, component in zip(slope, unit, strict=True):
             value.addcmul_(along, component, value=1 / degree)
@@ -142,13 +131,13 @@ def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     return evaluate
 
 
-@per_degree
+@harmonics.per_degree
 def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes in `_polynomial`: by each
     axis, those of its even bands in monomials, and that of band 1."""
     even = _even(degree)
-    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1) * lambertian_factors(even)
-    return slopes[..., : (degree + 1) ** 2].to(device, dtype)
+    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1)
+    return (slopes * harmonics.lambertian_factors(even))[..., : (degree + 1) ** 2].to(device, dtype)
 
 
 def _even(degree: int) -> int:
@@ -156,19 +145,20 @@ def _even(degree: int) -> int:
     return max(degree - degree % 2, 2)
 
 
-@per_degree
+@harmonics.per_degree
 def _slopes(degree: int) -> Tensor:
     """(3, J, (degree + 1)²): the slope by each axis of r^degree Y_k in monomials, for the bands of the degree's parity
     from 1 on."""
-    l = bands(degree)
-    slopes = monomial_coefficients(degree - 1) @ homogeneous_gradients(degree)[:, : degree**2]
+    l = harmonics.bands(degree)
+    slopes = harmonics.monomial_coefficients(degree - 1) @ harmonics.homogeneous_gradients(degree)[:, : degree**2]
     return slopes * ((l > 0) & (l % 2 == degree % 2))
 
 
 def _nonzero_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
     """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
-    nonzero = nonzero_coefficients(degree).tolist()
-    return nonzero, torch.stack(select_rows(unit, nonzero)) * lambertian_factors(degree).to(unit)[nonzero, None]
+    nonzero = harmonics.nonzero_coefficients(degree).tolist()
+    factors = harmonics.lambertian_factors(degree).to(unit)[nonzero, None]
+    return nonzero, torch.stack(harmonics.select_rows(unit, nonzero)) * factors
 
 
 def normals_in_sight(

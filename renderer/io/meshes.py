@@ -47,11 +47,8 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
         content, files = path.read_bytes(), _Files(path)
         textured_parts = _textured_parts(content) if suffix in ("gltf", "glb") else 0
         scene = _load(_utf8(content) if suffix == "obj" else content, suffix, files)
-        parts = {
-            name: _part(geometry, linear)
-            for name, geometry in scene.geometry.items()
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
-        }
+        named = [(name, part) for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)]
+        parts = {name: _part(part, linear) for name, part in named if len(part.faces)}
         if sum(len(part.textures) for part in parts.values()) < textured_parts:
             raise ValueError("the image of a texture is missing, or cannot be decoded")
     except Exception as error:  # readers of meshes and images raise almost anything at a damaged file

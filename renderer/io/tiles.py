@@ -47,9 +47,8 @@ def draw_grid(rows: Sequence[Sequence[Tile]], titles: Sequence[str] = (), headin
     font = ImageFont.load_default(TITLE_SIZE)
     images = [[tile.captioned() for tile in row] for row in rows]
     columns = [[image.width for image in column if image] for column in zip_longest(*images)]
-    widths = [
-        max([_text_width(title, TITLE_SIZE), *column]) for title, column in zip_longest(titles, columns, fillvalue="")
-    ]
+    titled_columns = zip_longest(titles, columns, fillvalue="")
+    widths = [max([_text_width(title, TITLE_SIZE), *column]) for title, column in titled_columns]
     heights = [max(image.height for image in row) for row in images]
     lefts = [*accumulate((width + GAP for width in widths), initial=MARGIN)]
     first = MARGIN + TITLE_HEIGHT * (bool(heading) + bool(titles))
