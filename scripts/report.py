@@ -10,7 +10,6 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 
 from omegaconf import MISSING
 
-from augment.utils import announced
 from renderer.errors import InputError
 from train.errors import writable_folder
 from train.report.page import write_report
@@ -37,8 +36,7 @@ def as_overrides(arguments: list[str]) -> list[str]:
 @cli.command(as_overrides)
 def main(settings: Settings) -> None:
     out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
-    with announced("report"):
-        page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
+    page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
 
 

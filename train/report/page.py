@@ -32,6 +32,7 @@ GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest im
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
+@announced("report")
 def write_report(folders: Sequence[Path], out: Path) -> Path:
     """Write the page of the runs and attacks in folders and below them, and return its path.
 
@@ -72,8 +73,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 def report_of(folders: Sequence[Path], out: Path) -> str:
     """The last line of a training: the path of its report, or why there is none, since a report never fails a run."""
     try:
-        with announced("report"):
-            return f"report: {write_report(folders, out)}"
+        return f"report: {write_report(folders, out)}"
     except Exception as error:  # the run is finished and saved
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
 

@@ -21,7 +21,6 @@ from train.photographs.scoring import SUMMARY, describe_point
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.tables import Table, format_interval
 
-DEPTH = 4  # folders below the one that is named
 MOST_NAMED, LONGEST_NAME = 30, 56  # arms named by their settings, and characters of such a name
 INITIAL = "the initial network"  # in place of an arm, of a network that runs of the tables began with
 
@@ -289,8 +288,6 @@ def _walk(folder: Path) -> Iterator[Path]:
     for root, below, files in os.walk(folder):
         path, names = Path(root), set(files)
         below.sort()
-        if len(path.relative_to(folder).parts) >= DEPTH:
-            below.clear()
         is_run = not names.isdisjoint({run_folder.METRICS, run_folder.FAILURE, checkpoint.LAST, checkpoint.BEST})
         if is_run:
             below[:] = [name for name in below if name != BEFORE and not (path / name / SUMMARY).is_file()]
