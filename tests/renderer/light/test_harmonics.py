@@ -8,13 +8,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, spherical_in
 
-from renderer.light.harmonics import (
-    MAX_DEGREE,
-    basis,
-    lambertian_factors,
-    project,
-    rotate,
-)
+from renderer.light.harmonics import MAX_DEGREE, basis, lambertian_factors, project, rotate
 from renderer.shading import irradiance
 
 EPS = np.finfo(np.float64).eps
