@@ -223,8 +223,7 @@ def selected_file(run: Path) -> Path | None:
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """The file of a run's selected network, and its content."""
-    path = selected_file(run)
-    if path is None:
+    if (path := selected_file(run)) is None:
         raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote")
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
 

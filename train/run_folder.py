@@ -82,8 +82,7 @@ def state(folder: Path) -> str:
     with locked(folder) as ours:
         if not ours:
             return "in training"
-    failure = folder / FAILURE
-    if failure.exists():
+    if (failure := folder / FAILURE).exists():
         return f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
     return "interrupted"
 
