@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = attach(
     {
         "attacks.adversary": ["Adversary", "reload"],
         "attacks.attack": ["AttackResult", "AttackSettings", "attack"],
-        "attacks.evaluate": ["check", "random_search", "success_by_radius", "transfer"],
+        "attacks.evaluate": ["check", "success_by_radius", "transfer"],
         "attacks.files": ["save"],
         "attacks.norm_ball": ["StepSettings"],
         "build": ["LampsSettings", "ProjectorSettings", "build_scene"],

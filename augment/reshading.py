@@ -75,8 +75,7 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 class Reshading:
     """Views of objects, which are given by their numbers.
 
-    basis: of the lights' coefficients. like: has the dtype and the device of the images. cached: keep the views of the
-    unmoved objects, to be used again.
+    basis: of the lights. like: has the dtype and the device of the images. cached: keep the views of unmoved objects.
     """
 
     objects: Sequence[SceneObject]

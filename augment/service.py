@@ -37,8 +37,7 @@ SHOWN_EXAMPLES = 4  # of an attack, to look at
 
 @dataclass
 class RandomLightSettings:
-    """Random offsets of the scene's light: uniform in ±amplitude per coefficient, or scaled to an L2 radius
-    (`renderer.light.presets.perturb`)."""
+    """Random offsets of the scene's light: uniform in ±amplitude per coefficient, or scaled to an L2 radius."""
 
     amplitude: float = 0.5
     radius: float | None = None
@@ -63,13 +62,9 @@ class TrainingAttackSettings(AttackSettings):
     rounded: bool = False
     batch_size: int = 128
 
-    def __post_init__(self) -> None:
-        self._light = StepSettings(step=self.step, step_size=self.step_size)
-        super().__post_init__()
-
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        return super().parameters or {"lighting": self._light}
+        return super().parameters or {"lighting": StepSettings(step=self.step, step_size=self.step_size)}
 
 
 @dataclass
@@ -143,9 +138,8 @@ default_collate_fn_map[Label] = lambda batch, **_: torch.tensor([int(label) for 
 class Renders(Dataset[tuple[Tensor, Tensor]]):
     """Labeled examples: images in [0, 1], labels, and diagnostics as plain numbers.
 
-    attack_examples: a few successful ones with what they were before the attack; None where that is not known.
-    As a data set, it holds pairs of an image on the CPU and its label, so that `data + renders` is both, whether the
-    labels of `data` are numbers or tensors.
+    attack_examples: a few successful ones with what they were before the attack; None where nothing is rendered.
+    As a data set, it holds images and labels on the CPU, so that `data + renders` is both.
     """
 
     images: Float[Tensor, "E 3 H W"]

@@ -90,8 +90,7 @@ class VariationSettings:
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
     """The scene with rows drawn anew around its own; the scene itself where nothing varies.
 
-    All views of a row are moved alike. once: they are rendered in one light only. InputError where the folder of
-    backgrounds has no readable image.
+    All views of a row are moved alike. once: they are rendered in one light only. InputError: a folder without images.
     """
     if settings.moves or settings.backgrounds is not None:
         scene = _with_moved_rows(scene, settings, draws, once)

@@ -65,7 +65,8 @@ class AttackSettings:
         require_range("batch_size", self.batch_size, 1, 10**6)
         if self.lighting and self.skylight:
             raise InputError("lighting and skylight both set the light: choose one of them")
-        if self.restarts and any(settings.radius is None for settings in self.parameters.values()):
+        unlimited = any(settings.radius is None for settings in self.parameters.values())
+        if self.restarts and unlimited:
             raise InputError("restarts draws from the norm-balls: set the radius of every parameter, or restarts=0")
 
     @property
@@ -92,8 +93,8 @@ class AttackSettings:
 
 @dataclass(frozen=True)
 class AttackResult:
-    """The result of an attack on E examples of V views, a value: `augment.check`, `augment.random_search`,
-    `augment.success_by_radius`, `augment.transfer` and `augment.save` take it.
+    """The result of an attack on E examples of V views, a value: `augment.check`, `augment.success_by_radius`,
+    `augment.transfer` and `augment.save` take it.
 
     images_before, images: (E, V, 3, size, size), not rounded, with the shadows and bounces of each shape in its own
     colors. logits_before, logits: (E, V, C), of the preprocessed images. success: (E,) bool, whether the goal is
@@ -207,8 +208,7 @@ def attack(
 def target_labels(
     target: str | Sequence[str] | None, source: Tensor, logits: Tensor, classifier: Classifier
 ) -> Tensor | None:
-    """The target classes (E, V) of `attack`'s target, given the right classes (E, V) and the logits (E, V, C) before.
-    None where any error will do."""
+    """The target classes (E, V), given the right ones (E, V) and the logits (E, V, C) before; None for any error."""
     if target is None:
         return None
     if target == LEAST_LIKELY:

@@ -25,11 +25,11 @@ OF_MESH, OF_VIEW = ("geometry", "albedo", "pixels"), ("pixels",)  # parameters t
 
 
 def check(result: AttackResult) -> dict[str, Any]:
-    """Compare an attack with random search, and with a descent of ten times as many steps.
+    """Compare an attack with as many random draws as it has steps, and with descents of 1, 3 and 10 times as many.
 
-    Returns fractions of the examples and mean costs. cost_fell: of the examples without success before. success,
-    success_with_margin, random_search, success_by_steps: of the clean-correct examples, the last one by descents of 1,
-    3 and 10 times as many steps.
+    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. Returns
+    fractions of the examples and mean costs. cost_fell: of the examples without success before. success,
+    success_with_margin, random_search, success_by_steps: of the clean-correct examples.
 
     >>> checks = augment.check(result)
     >>> checks["success"], checks["cost"] < checks["cost_before"]
@@ -42,6 +42,8 @@ def check(result: AttackResult) -> dict[str, Any]:
     end = descend(result.preprocessed_model, problem, result.goal, longest, seed=result.seed)
     success = _confirmed(result, problem, end.success, end.values, problem.everything, end.images)
     limits = [settings.max_steps * factor for factor in GROWTH]
+    draw = partial(problem.sample, generator(result.seed, "random search"), descent.values)
+    random = _success_by_draws(result, result.success_before, draw)
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
@@ -49,7 +51,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         "zero_gradient": _fraction(descent.zero_gradient),
         "success": _fraction(result.success[clean]),
         "success_with_margin": _fraction(result.success_with_margin[clean]),
-        "random_search": _fraction(random_search(result)[clean]),
+        "random_search": _fraction(random[clean]),
         "success_by_steps": {limit: _fraction((success & (end.success_at <= limit))[clean]) for limit in limits},
     }
 
@@ -62,18 +64,6 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
         "some first gradients are exactly zero": checks["zero_gradient"] > 0,
     }
     return [warning for warning, holds in reasons.items() if holds]
-
-
-def random_search(result: AttackResult) -> Tensor:
-    """(E,) bool: whether any of `max_steps` random draws is a success, each as far from the start as the attack may go
-    (uniform in the norm-ball) or, without a radius, went.
-
-    >>> augment.random_search(result).shape
-    torch.Size([1])
-    """
-    draws = generator(result.seed, "random search")
-    draw = partial(result.problem.sample, draws, result.descent.values)
-    return _success_by_draws(result, result.success_before, draw)
 
 
 def _success_by_draws(result: AttackResult, success: Tensor, draw: Callable[[], Tensor]) -> Tensor:
@@ -167,9 +157,8 @@ def transfer(
 
     Returns a dict for each, for JSON. network, azimuth or mesh: which. clean_correct, success: A times whether every
     view is classified correctly before the attack, and whether the goal is reached in every view after it, which counts
-    only of the clean-correct. predicted_before, confidence_before, predicted, confidence: A × V classes and
-    probabilities. What is added to pixels or is behind the object is resized for another network. InputError: as
-    `require_transferable`, and where a classifier lacks a class.
+    only of the clean-correct. predicted_before, confidence_before, predicted, confidence: A × V. Added pixels and the
+    background are resized for another network. InputError: as `require_transferable`, and a class that one lacks.
 
     >>> larger = augment.Classifier(result.classifier.function, size=12, classes=["orange", "other"])
     >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])

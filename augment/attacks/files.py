@@ -138,8 +138,7 @@ def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer)
 
 
 def figure(result: AttackResult, example: int) -> Image.Image:
-    """The images of an example before and after, with predictions, their difference, and each view's light where the
-    attack has changed it; a row per view.
+    """A row per view: an example's images before and after, predictions, difference, and the light where it changed.
 
     Differences are gray where there is none, and scaled alike so that the largest reaches black or white. Images are
     enlarged without smoothing, so that one sees the pixels that the classifier saw.

@@ -44,8 +44,7 @@ class StepSettings:
         require_range("step_size", self.step_size, 1 / LARGEST, FACTOR)
 
     def project(self, values: Tensor, center: Tensor, domain: Domain = anywhere) -> Tensor:
-        """The nearest points, in the Euclidean sense, of the ball's intersection with a domain that contains its
-        center; values and center (A, D)."""
+        """The nearest points (A, D) of the ball's intersection with a domain that contains its center (A, D)."""
         return domain(values, within=None if self.radius is None else Ball(center, self.radius, self.norm))
 
     def sample(self, center: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:

@@ -119,8 +119,7 @@ def _local_light(scene: Scene, name: str, attacked: str = "") -> tuple[slice, An
 
 
 def positions(scene: Scene, settings: StepSettings) -> Parameter:
-    """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are fixed in its
-    derivative. InputError where the scene has no lamps."""
+    """Where each lamp is, in world units. Shadows are cast anew in each image, and are fixed in its derivative."""
     placed = _local_light(scene, Lamps.name, "positions")[1].positions
     start = torch.tensor(placed).to(scene.lights).flatten().expand(len(scene), -1)
 
@@ -230,8 +229,7 @@ class AttackProblem:
 
     @torch.no_grad()
     def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
-        """(A, V, 3, size, size) of examples (A,), by default all, with values (E, D) of all; rendered by parts, so that
-        little memory beside theirs is used."""
+        """(A, V, 3, size, size) of examples (A,), by default all, with values (E, D) of all; rendered by parts."""
         size, examples = self.scene.settings.size, self.everything if examples is None else examples
         images = values.new_empty(len(examples), self.scene.views, 3, size, size)
         parts = [*zip(images.split(self.at_once), examples.split(self.at_once), strict=True)]
