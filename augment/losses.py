@@ -3,28 +3,20 @@
 A label is a class, or any class but one (a complementary label), written −1 − class.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import require_range
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
 NO_CLASS = -(10**9)  # in place of a source or target class, where there is none; no complementary label
 
 
-def adversarial_cost(
-    logits: Float[Tensor, "E classes"], source: Int[Tensor, " E"], target: Int[Tensor, " E"] | None = None
-) -> Float[Tensor, " E"]:
-    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases.
+def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
+    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases; (N,).
 
-    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError: a class without logit.
+    logits: (N, classes). source, target: (N,) int64; None leaves the second term out, and NO_CLASS in either its own.
+    InputError: a class without a logit.
     """
     require_known(source.clamp(min=0), logits)  # NO_CLASS passes
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)

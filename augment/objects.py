@@ -37,8 +37,7 @@ class MeshSettings:
 class PropSettings(MeshSettings):
     """A mesh beside the object, on the same ground.
 
-    at: (2,) x and y of its centroid, in world units. scale: its largest coordinate, where the object's is 1. azimuth:
-    degrees by which it is turned about the vertical.
+    at: x and y of its centroid, in world units. scale: its largest coordinate; the object's is 1. azimuth: in degrees.
     """
 
     at: list[float]

@@ -84,10 +84,8 @@ class OperatorStack:
         sparse = joined(parts)
         self._sparse = sparse and sparse.to(device)
         self.shown, self._first = shown, torch.tensor(first)
-        tensors = pixels, transfer, albedo, coverage, coefficients
-        self.pixels, self.transfer, self.albedo, self.coverage, self._coefficients = (
-            tensor.to(device) for tensor in tensors
-        )
+        tensors = (tensor.to(device) for tensor in (pixels, transfer, albedo, coverage, coefficients))
+        self.pixels, self.transfer, self.albedo, self.coverage, self._coefficients = tensors
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
         """Linear radiance (A, 3, P), differentiable in the lights (A, size, 3), of images (A,), which are on the host.

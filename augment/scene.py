@@ -117,10 +117,8 @@ class Scene:
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
         build = partial(build_operators, **shading, dtype=self.lights.dtype)
-        behind = self._background.repeat_interleave(self.views)
-        self._relighting = Relighting(
-            self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build, self.attack_bytes
-        )
+        behind, backgrounds = self._background.repeat_interleave(self.views), self.backgrounds.flatten(2)
+        self._relighting = Relighting(self.objects, views, behind, backgrounds, self.settings, build, self.attack_bytes)
         self._reshading = Reshading(self.objects, like=self.lights, cached=not self.one_light, **shading)
 
     @classmethod

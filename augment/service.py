@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,9 +24,6 @@ from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 ARMS = ("none", "random", "adversarial")
 INITS = ("scene", "random")
@@ -136,14 +133,14 @@ default_collate_fn_map[Label] = lambda batch, **_: torch.tensor([int(label) for 
 
 @dataclass(frozen=True)
 class Renders(Dataset[tuple[Tensor, Tensor]]):
-    """Labeled examples: images in [0, 1], labels, and diagnostics as plain numbers.
+    """Labeled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
 
     attack_examples: a few successful ones with what they were before the attack; None where nothing is rendered.
     As a data set, it holds images and labels on the CPU, so that `data + renders` is both.
     """
 
-    images: Float[Tensor, "E 3 H W"]
-    labels: Int[Tensor, " E"]
+    images: Tensor
+    labels: Tensor
     diagnostics: Mapping[str, float]
     attack_examples: AttackExamples | None = None
 

@@ -116,16 +116,12 @@ def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Gen
         views = dict.fromkeys((row.object, row.cameras) for row in scene.examples)
         numbers = {view: index for index, view in enumerate(views)}
         instances = zip(views, torch.randint(2**31, (len(views),), generator=draws).tolist(), strict=True)
-        changed["objects"] = [
-            another_instance(scene.objects[index], seed)
-            for (index, _), seed in progress(instances, "new instances", len(views))
-        ]
+        counted = progress(instances, "new instances", len(views))
+        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in counted]
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
-    if settings.moves:
-        has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
-        changed["one_light"] = once and not has_rays
-    return replace(scene, examples=rows, **changed)
+    has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
+    return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
 def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:

@@ -151,14 +151,13 @@ def _descend_once(
         for step in progress(range(settings.max_steps + 1), "attack"):
             chosen, active_goal = candidate[active].requires_grad_(True), goal.of(active)
             rendered = problem.render(chosen, examples[active])
+            shown = rendered.detach()
             with phases("attack_classifier"):
-                cost, gap, classes, by_image = _classifier_pass(
-                    model, rendered.detach(), active_goal, batch_size, expectation
-                )
+                cost, gap, classes, by_image = _classifier_pass(model, shown, active_goal, batch_size, expectation)
             (gradient,) = torch.autograd.grad(rendered, chosen, by_image)
             reached = active_goal.reached(classes)
             if step == 0:
-                images, cost_before, success_before = rendered.detach().clone(), cost, reached
+                images, cost_before, success_before = shown.clone(), cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (gap >= settings.margin)
             # The next step starts from an accepted one; with `shorten`, from none that raised the cost.
@@ -172,7 +171,7 @@ def _descend_once(
             moved, kept = active[on], active[rows]
             position[moved], position_gradient[moved] = candidate[moved], gradient[on]
             position_cost[moved] = cost[on]
-            values[kept], images[kept], kept_cost[kept] = candidate[kept], rendered.detach()[rows], cost[rows]
+            values[kept], images[kept], kept_cost[kept] = candidate[kept], shown[rows], cost[rows]
             predicted[kept], success[kept] = classes[rows], reached[rows]
             active = active[left]
             if step == settings.max_steps or not len(active):

@@ -78,8 +78,7 @@ def _best_light(
 
 @torch.no_grad()
 def _confidence(scene: Scene, attack: AttackSettings, classifier: Classifier, groups: int = 1) -> Tensor:
-    """(groups,) the least confidence in the label where an attack would begin, over each group of a scene's rows; 0
-    where an image is misclassified."""
+    """(groups,) the least confidence in the label where an attack would begin, by group of rows; 0 for any error."""
     problem = attack.problem(scene)
     images = problem.images(problem.start)
     probabilities = logits_of(attack.preprocessed_model(classifier), images, attack.batch_size).softmax(2)
