@@ -195,8 +195,8 @@ def moved(options: argparse.Namespace) -> Iterator[Row]:
     overrides = ["experiment=best", "train.init_from=-", "run=-", f"scene.views={options.views}"]
     overrides.append(f"scene.meshes={['solid:orange'] * 10}")
     settings = read_settings(ExperimentSettings, compose("train", overrides))
-    kept = {"scene": settings.scene, "renderer": settings.renderer, "cache": None}
-    scene = build_scene(list(settings.objects.values()), 32, settings.views, **kept)
+    chosen = {"scene": settings.scene, "renderer": settings.renderer}
+    scene = build_scene(list(settings.objects.values()), 32, settings.views, **chosen)
     for number in range(options.rounds + 1):
         row: Row = {"round": number, "renders": len(scene)}
         for name, once in (("direct", True), ("operators", False)):
