@@ -83,7 +83,7 @@ def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
 
 
 def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
-    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high.
+    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high, means.
 
     The interval is a 95 % bootstrap interval over objects and images, the same ones for all runs, and over seeds,
     which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n, the
@@ -95,7 +95,7 @@ def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], sou
     value, base = (fmean(find_metric(pool.metrics, name)["value"] for pool in seeds) for seeds in pools)
     one, other = (np.stack([pool.replicates[name] for pool in seeds]) for seeds in pools)
     replicates = metrics.replicate_difference(one, other, _paired(group, reference))
-    return {"value": value - base, **metrics.interval(replicates)}
+    return {"value": value - base, "means": (base, value), **metrics.interval(replicates)}
 
 
 def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:

@@ -4,8 +4,10 @@ import shlex
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -16,19 +18,20 @@ from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.loop import attack_success
-from train.photographs.metrics import OVERALL
+from train.photographs.metrics import OVERALL, metric_title
 from train.photographs.sheet import evenly
 from train.report import compare, plots, summary
 from train.report.plots import Picture
-from train.report.summary import RunSummary, Scored
+from train.report.summary import Arms, RunSummary, Scored
 from train.run_folder import CONFIG, read_config
-from train.tables import as_text
+from train.tables import as_text, format_interval
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
 MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with images
 ATTACK_EXAMPLES = 4  # with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
+HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")  # of METRICS, in the first sentences
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
@@ -47,14 +50,18 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     for folder, _, lines in [run for run in unfinished if run[2]][:MOST_UNFINISHED]:
         epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
     trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
+    read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
+    times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
     options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
     environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
-        title=f"Trained with renders: {', '.join(arms)}" if arms else "Attacks" if attacks else "Unfinished runs",
+        title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
         networks=len(runs),
         place=", ".join(map(str, folders)),
+        date=f"{datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "",
+        lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
         curves=_curves(epochs),
@@ -136,24 +143,57 @@ def _side(label: str, when: str, side: Side) -> Picture:
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
+def _title(arms: Arms) -> str:
+    labels = {scores["label"] for group in arms.values() for scores in group[0].photographs.values()}
+    names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
+    return f"{' and '.join(sorted(labels)) or 'Networks'}, trained with renders: {', '.join(names)}"
+
+
+def _accuracy_sentences(arms: Arms) -> list[str]:
+    """How the test accuracy of each arm compares with that of the network that it began with."""
+    sentences = []
+    for arm, group in arms.items():
+        if bases := [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]:
+            after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
+            data = OmegaConf.select(group[0].config, "data.name")
+            sentences.append(f"{arm}: accuracy on the test images of {data} went from {before:.1%} to {after:.1%}.")
+    return sentences
+
+
 def _photographs(title: str, group: Scored) -> dict[str, Any]:
     """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
     paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
     sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}
     tables = [summary.score_table("", group)]
-    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "error": ""}
+    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "sentences": []}
     try:
         if evaluations := compare.read_evaluations(group):
             first = next(iter(evaluations.values()))[0]
             scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
             content["roc"] = plots.roc(scores, first.pools[OVERALL].label)
+            content["sentences"] = _difference_sentences(evaluations, title)
             tables.append(compare.overall_differences(evaluations))
             if len(first.pools) > 1:
                 tables.append(compare.group_table(evaluations))
     except InputError as error:
-        content["error"] = str(error)
+        content["sentences"] = [str(error)]
     content["tables"] = [table.known for table in tables]
     return content
+
+
+def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
+    """How far each of HEADLINES is from that of the network that an arm is compared with."""
+    sentences = []
+    for arm, base in compare.pairs_of(arms):
+        parts = []
+        for name in HEADLINES:
+            if result := compare.difference(arms[arm], arms[base], OVERALL, name):
+                doubtful = result["low"] <= 0 <= result["high"]
+                difference = "no difference is shown" if doubtful else format_interval(result, "+")
+                parts.append("{} {:.2f} and {:.2f} ({})".format(metric_title(name), *result["means"], difference))
+        if parts:
+            sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
+    return sentences
 
 
 def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:

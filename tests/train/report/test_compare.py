@@ -87,6 +87,7 @@ def test_only_scores_on_the_same_images_share_a_table_or_plot(scored_run, tmp_pa
     text = write_report(runs, tmp_path / "out").read_text()
     assert re.findall(r'alt="ROC; AUC: ([^"]*)"', text) == ["none 0.250, random 0.750", "adversarial 1.000"]
     assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
+    assert text.count("<p>photographs, 2 of orange and 2 of other things, none and random: ") == 1
     tables = read_markdown(format_table([summarize(folder) for folder in runs]))
     arms = {title: [row[0] for row in table[1:]] for title, table in tables.items() if title.startswith("photographs")}
     assert list(arms.values()) == [["none", "random"], ["adversarial"]]
@@ -113,6 +114,8 @@ def test_a_hardened_network_is_compared_with_the_one_it_began_with_and_with_othe
     initial = "minus the initial network"
     expected = [(f"random {initial}", "+0.250"), (f"adversarial {initial}", "+0.750")]
     assert differences == [*expected, ("adversarial minus random", "+0.500")]
+    text = write_report(folders, tmp_path / "out").read_text()
+    assert "from 50.0% to 76.5%" in text and ", the initial network and random: " in text
     copytree(base, alone := tmp_path / "scores" / "base")
     tables = compare(read_markdown, [alone, folders[1]])
     assert tables["adversarial minus scores/base (1 and 1 seeds, paired)"][1][1].startswith("+0.750")
