@@ -1,4 +1,4 @@
-"""Meshes as files: .glb with colors, textures, normals and cameras; .ply with colors and normals."""
+"""Meshes as .glb files with colors, textures, normals and cameras."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from renderer.albedo import bilinear, mesh_textures
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.image import decode, encode
+from renderer.image import decode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
 from renderer.normals import corner_normals
 
@@ -26,24 +25,21 @@ _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
 def export_mesh(
     mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = (), first: int | None = None
 ) -> None:
-    """Write a mesh to a .glb or .ply file. A vertex whose corners differ in color, uv or normal is written for each.
+    """Write a mesh to a .glb file. A vertex whose corners differ in color, uv or normal is written for each.
 
-    .glb: `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture; a diffuse
+    `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture; a diffuse
     material that is seen from both sides. A mesh of several textures has its faces ordered by texture, the `first` so
     many of them before the others.
     normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
-    .ply: z up, colors of 8 bits. The format has no standard texture, so that vertices get their texel's color, times
-    their own in linear light: between them the texture is lost, unless the mesh is subdivided.
     InputError where the suffix is another or the file cannot be written.
 
     >>> apple, cameras = renderer.normalize(renderer.solid("apple")), renderer.orbit_cameras(views=3, width=2.2)
     >>> export_mesh(apple, "apple.glb", cameras=cameras)
-    >>> export_mesh(apple, "apple.ply", normals="flat")
     """
     path, shaded = Path(path), corner_normals(mesh, normals)
-    if path.suffix.lower() not in (".glb", ".ply"):
-        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb or .ply")
-    content = _glb(mesh, shaded, cameras, first) if path.suffix.lower() == ".glb" else _ply(mesh, shaded)
+    if path.suffix.lower() != ".glb":
+        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb")
+    content = _glb(mesh, shaded, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
@@ -110,25 +106,6 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     if isinstance(camera, PerspectiveCamera):
         return {"type": "perspective", "perspective": {"yfov": camera.angle, "aspectRatio": 1.0, **planes}}
     return {"type": "orthographic", "orthographic": {"xmag": half, "ymag": half, **planes}}
-
-
-def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:
-    import trimesh
-
-    ids, values, faces = _split(mesh.faces, np.concatenate([_baked_colors(mesh), normals], axis=-1))
-    colors, normals = values[:, :3].astype(np.uint8), values[:, 3:]
-    part = trimesh.Trimesh(mesh.vertices[ids], faces, vertex_normals=normals, vertex_colors=colors, process=False)
-    return part.export(file_type="ply", vertex_normal=True)
-
-
-def _baked_colors(mesh: Mesh) -> np.ndarray:
-    """(F, 3, 3) uint8: corner color × texture at the corners, sRGB-encoded."""
-    linear = decode(torch.from_numpy(mesh.corner_colors), "srgb")
-    for index, texture in enumerate(mesh_textures(mesh, "srgb", linear)):
-        here = torch.from_numpy(mesh.texture_ids == index)
-        uvs = torch.from_numpy(mesh.corner_uvs)[here]
-        linear[here] *= bilinear(texture, uvs.flatten(0, 1).T).T.unflatten(0, (-1, 3))
-    return (encode(linear, "srgb") * 255).round().to(torch.uint8).numpy()
 
 
 def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,8 +4,9 @@ Three scalars: the sun's zenith angle and azimuth, in radians and world axes, an
 disc itself is not part of the sky. Radiance is linear Rec. 709 RGB in kcd/m²: (1, 1, 1) is white of 1000 cd/m². The
 mean luminance over the sphere of a clear day's sky is about 5, where that of the probes in `presets` is about 0.1.
 
-The model and its quadrature are in benchmarks/fit_skylight.py, which fits them with the polynomials that are evaluated
-here, turned to the sun's azimuth (the paper's appendix "Differentiating Skylight Parameters", after Habel et al. 2008).
+The model and its quadrature are in tests/renderer/fit_skylight.py, which fits them with the polynomials that are
+evaluated here, turned to the sun's azimuth (the paper's appendix "Differentiating Skylight Parameters", after Habel et
+al. 2008).
 """
 
 import math
@@ -38,7 +39,7 @@ def coefficients(
     Float32 or float64, as the parameters, with analytic first derivatives. Off by up to 7e-5 of the coefficients' norm
     (4e-4 where they are smallest: in haze, with the sun on the horizon). The derivatives are off by up to 0.1 % in
     zenith and azimuth and 0.5 % in turbidity, two to three times that at the domain's ends. InputError: outside it.
-    fit: another one than the committed, as benchmarks/fit_skylight.py writes it.
+    fit: another one than the committed, as tests/renderer/fit_skylight.py writes it.
 
     >>> noon, evening = coefficients(0.5, 0.0, 3.0), coefficients(1.4, 0.0, 3.0)
     >>> noon.shape, bool(noon[0].sum() > evening[0].sum())  # index 0: the mean radiance

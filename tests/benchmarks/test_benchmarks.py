@@ -10,18 +10,10 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks import common, gpu, lights, renderer, scene, training
+from benchmarks import common, lights, renderer, scene, training
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transport import precomputed
-
-
-def test_calls_take_turns_in_every_round(monkeypatch):
-    monkeypatch.setattr(common, "BURST", 0.0)
-    order = []
-    times = common.medians({name: lambda name=name: order.append(name) for name in "ab"}, rounds=3)
-    assert list(times) == ["a", "b"] and all(value >= 0 for value in times.values())
-    assert "".join(order[-18:]) == "aaabbb" * 3  # each turn: two calls to warm up, one that is timed
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -131,12 +123,3 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert loads == [(10, 1, 2), (20, 2, 4)]
     assert all(row["attack_seconds"] > 0 and row["ms_per_render_and_pass"] > 0 for row in rows)
     assert len(read(path)) == 2
-
-
-def test_an_attack_is_compared_on_a_cpu_too(monkeypatch, tmp_path):
-    monkeypatch.setattr(common, "BURST", 0.0)
-    for name, value in {"DEPTH": 10, "ROUNDS": 1, "STEPS": 1}.items():
-        monkeypatch.setattr(gpu, name, value)
-    [row] = gpu.main(["--device=cpu", "--questions", "attack", "memory", f"--csv={tmp_path}/gpu.csv"])
-    assert row["ratio"] == row["value"] / row["reference"] > 0
-    assert len(read(tmp_path / "gpu.csv")) == 1

@@ -74,9 +74,8 @@ def write_data(folder: Path) -> None:
 def write_scene_files(folder: Path) -> None:
     """Meshes, lights, lamps, a projector's pattern and a background."""
     light = probe("st_peters")  # positive, as maps are
-    for name in ("mesh.glb", "mesh.ply"):
-        export_mesh(solid("lemon", 0), folder / name)
-    for name in ("mesh.stl", "mesh.off"):
+    export_mesh(solid("lemon", 0), folder / "mesh.glb")
+    for name in ("mesh.ply", "mesh.stl", "mesh.off"):
         trimesh.creation.icosphere(subdivisions=2).export(folder / name)
     for name in ("light.npy", "light.hdr", "light.exr"):
         write_map(folder / name, to_map(light, 8))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, linear_of, srgb_of
+from oracles import corners_of, linear_of
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
@@ -161,47 +161,7 @@ def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path)
         assert_array_equal(texture, mesh.textures[index])
 
 
-@pytest.mark.parametrize("name", ["orange", "cup"])
-def test_a_ply_gives_back_the_shape_and_colors_of_eight_bits(tmp_path, name):
-    mesh = solid(name)
-    export_mesh(mesh, tmp_path / "mesh.ply")
-    loaded = load_mesh(tmp_path / "mesh.ply")
-    assert_array_equal(corners_of(loaded), corners_of(mesh).astype(np.float32))
-    assert_allclose(loaded.corner_colors, mesh.corner_colors, rtol=0, atol=0.5 / 255 + 2 * EPS32)
-    assert loaded.closed is mesh.closed
-
-
-TEXELS = np.array([[[0, 50, 100], [200, 250, 30]], [[90, 0, 255], [10, 20, 30]]], dtype=np.uint8)  # rows from the top
-MEAN = srgb_of(linear_of(TEXELS / 255).mean(axis=(0, 1)))
-
-
-@pytest.mark.parametrize(
-    ("uv", "texel"),
-    [
-        ((0.25, 0.75), TEXELS[0, 0] / 255),
-        ((0.75, 0.25), TEXELS[1, 1] / 255),
-        ((-0.75, 3.75), TEXELS[0, 0] / 255),
-        ((2.75, -0.25), TEXELS[0, 1] / 255),
-        ((0.5, 0.5), MEAN),
-        ((0.0, 1.0), MEAN),
-        ((0.375, 0.75), srgb_of(linear_of(TEXELS[0] / 255).T @ [0.75, 0.25])),
-    ],
-)
-@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.5, 0.2, 0.9)])
-def test_ply_colors_are_texel_times_vertex_color_in_linear_light(tmp_path, uv, texel, color):
-    """Texel centers lie at half-integers, and the texture repeats."""
-    mesh = replace(
-        Mesh.plain(np.eye(3), [[0, 1, 2]], color),
-        corner_uvs=np.full((1, 3, 2), uv, dtype=np.float32),
-        texture_ids=np.zeros(1, dtype=np.int32),
-        textures=(TEXELS,),
-    )
-    export_mesh(mesh, tmp_path / "mesh.ply")
-    expected = srgb_of(linear_of(texel) * linear_of(np.array(color)))
-    assert_allclose(load_mesh(tmp_path / "mesh.ply").corner_colors[0], expected[None].repeat(3, 0), atol=0.51 / 255)
-
-
-@pytest.mark.parametrize("name", ["mesh.obj", "folder.glb"])
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply", "folder.glb"])
 def test_a_path_that_cannot_be_written_is_refused(tmp_path, name):
     (tmp_path / "folder.glb").mkdir()
     with pytest.raises(InputError, match=name):

@@ -1,10 +1,11 @@
-"""The sky's coefficients against the published formula, integrated by scipy and by benchmarks/fit_skylight.py."""
+"""The sky's coefficients against the published formula, integrated by scipy and by fit_skylight.py."""
 
 import itertools
 import math
 import re
 from pathlib import Path
 
+import fit_skylight
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,6 @@ from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
 
-from benchmarks import fit_skylight
 from renderer.errors import InputError
 from renderer.light.harmonics import basis, rotate
 from renderer.light.skylight import coefficients
@@ -117,13 +117,6 @@ def test_a_new_fit_is_the_committed_one():
     committed, fit = load_file(FIT)["fit"], fit_skylight.fit_polynomials(6, 4, nodes=16)
     # Quadratures of 16 nodes are off by up to 1e-4 of the norm, 140.
     torch.testing.assert_close(committed[:7, :5].double(), fit, rtol=0, atol=1e-2)
-
-
-@pytest.mark.slow
-def test_the_script_makes_the_committed_fit(tmp_path, capsys):
-    fit_skylight.main(f"{tmp_path}/fit.safetensors")
-    assert float(re.search(r"off by up to (\S+)", capsys.readouterr().out)[1]) < 7e-5
-    torch.testing.assert_close(load_file(tmp_path / "fit.safetensors"), load_file(FIT), rtol=0, atol=140 * EPS32)
 
 
 @pytest.mark.parametrize("azimuth", [0.5, -2.0, 9.0])

@@ -1,4 +1,4 @@
-"""Fit the sky's coefficients with polynomials and print the largest error: python -m benchmarks.fit_skylight
+"""Fit the sky's coefficients with polynomials and print the largest error: python tests/renderer/fit_skylight.py
 
 The model is that of `renderer.light.skylight`, and its coefficients are integrals by Gauss-Legendre quadrature.
 """
