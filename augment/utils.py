@@ -97,7 +97,7 @@ def _free(device: torch.device) -> int | None:
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
     """The items; after 2 seconds, with a bar on a terminal, or else a line, which comes again with the number of items
-    that are done, each time after twice as long; by the first process.
+    that are done, each time after twice as long, up to 30 seconds; by the first process.
 
     total: their number, where they have no length. done: how many came before.
     """
@@ -114,7 +114,7 @@ def progress(items: Iterable[Item], description: str, total: int | None = None, 
                 return
             counted = f": {done} of {bar.total}" if done and bar.total else ""
             print(f"{description}{counted} ...", file=sys.stderr, flush=True)
-            wait *= 2
+            wait = min(2 * wait, 30.0)
 
     if first:
         Thread(target=show, daemon=True).start()

@@ -25,7 +25,6 @@ from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
@@ -51,45 +50,21 @@ BACKGROUNDS = 5  # of each view
 SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
 
 
-def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict[str, float]:
-    """The metrics of the second of two epochs of `python -m train`; the first compiles and warms up."""
-    command = [sys.executable, *launcher, "-m", "train", "experiment=paper", "train.epochs=2", f"run={run}"]
-    subprocess.run([*command, *overrides], check=True, stdout=subprocess.DEVNULL)
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return next(line for line in reversed(lines) if "epoch" in line)
-
-
 def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
+    """The metrics of the second of two epochs of `python -m train`; the first compiles and warms up."""
+    command = [sys.executable, "-m", "train", "experiment=paper", "train.epochs=2", f"run={run}"]
     settings = ["data=npz", f"data.path={options.data}", "data.validation=0.05", f"scene.meshes={options.meshes}"]
     settings += [f"train.images_per_epoch={options.images}", f"train.device={options.device}"]
     settings += [f"model.depth={options.depth}", f"model.width={options.width}"]
-    return last_epoch(run, *settings, *overrides, *options.overrides)
+    subprocess.run([*command, *settings, *overrides, *options.overrides], check=True, stdout=subprocess.DEVNULL)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return next(line for line in reversed(lines) if "epoch" in line)
 
 
 def make_sure(head: dict[str, Tensor], label: int = 0) -> None:
     """Edit a network's last layer so that it predicts one class for every image, with a gradient left."""
     head["weight"][label] = 0
     head["bias"][label] = SURE
-
-
-def sure_network(depth: int, width: int) -> WideResNet:
-    torch.manual_seed(0)
-    network = WideResNet(10, depth, width, 0.0).eval()
-    make_sure(network.head.state_dict())
-    return network
-
-
-def attacked_solids(meshes: int, views: int, device: str = "cpu", **attack: Any) -> AugmentationService:
-    """Meshes × views × five backgrounds, under attack, at 32 pixels per side."""
-    solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
-    settings = AugmentationSettings(attack=TrainingAttackSettings(**attack))
-    scene = {"views": views, "samples": 2, "rasterizer": "numpy", "device": device}
-    return AugmentationService.from_meshes(solids, 32, settings, **scene)
-
-
-def estimated_bytes(service: AugmentationService) -> int:
-    """What `Scene` estimates for an attack, and its operators."""
-    return service.scene.attack_bytes + sum(stack.transfer.nbytes for stack in service.scene.stacks)
 
 
 def collate(transform: Callable[[Image.Image], Tensor], batch: list[tuple[Image.Image, int]]) -> tuple[Tensor, Tensor]:
@@ -167,9 +142,13 @@ def peak_memory() -> int:
 def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     """Seconds of one core that one round of attacks takes, against a WideResNet-10-1 that is sure of the class."""
     torch.set_num_threads(1)
-    network, views = sure_network(10, 1), renders // (meshes * BACKGROUNDS)
+    torch.manual_seed(0)
+    network, views = WideResNet(10, 10, 1, 0.0).eval(), renders // (meshes * BACKGROUNDS)
+    make_sure(network.head.state_dict())
+    solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
+    settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps))
     before, start = peak_memory(), time.process_time()
-    service = attacked_solids(meshes, views, max_steps=steps)
+    service = AugmentationService.from_meshes(solids, 32, settings, views=views, samples=2, rasterizer="numpy")
     _ = service.scene.stacks  # what is precomputed of each view
     built = time.process_time()
     service.regenerate(network, 0)
@@ -177,7 +156,8 @@ def attack_cost(renders: int, meshes: int, steps: int) -> Row:
     row = {"renders": renders, "meshes": meshes, "views": views * meshes, "steps": steps}
     row |= {"precompute_seconds": built - start, "attack_seconds": attack}
     row["ms_per_render_and_pass"] = 1e3 * attack / (renders * (steps + 1))
-    return row | {"memory_mb": (peak_memory() - before) / 1e6, "estimated_mb": estimated_bytes(service) / 1e6}
+    estimated = service.scene.attack_bytes + sum(stack.transfer.nbytes for stack in service.scene.stacks)
+    return row | {"memory_mb": (peak_memory() - before) / 1e6, "estimated_mb": estimated / 1e6}
 
 
 def renders(options: argparse.Namespace) -> Iterator[Row]:

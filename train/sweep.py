@@ -133,5 +133,6 @@ def format_sweep(folders: Sequence[Path]) -> str:
     parts = [f"{len(finished)} of {len(folders)} runs are finished"]
     if finished:
         parts.append(format_table(finished))
-    parts += [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]
+    if unfinished := [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]:
+        parts += [*unfinished, "to go on, give the same command again"]
     return "\n" + "\n\n".join(parts)
