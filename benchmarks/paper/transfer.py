@@ -32,7 +32,8 @@ def as_one_example(problem: AttackProblem) -> Any:
     def render(values: Tensor, examples: Tensor) -> Tensor:
         return problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
 
-    return SimpleNamespace(start=problem.start[:1], render=render, step=problem.step, project=problem.project)
+    same = {"step": problem.step, "project": problem.project, "at_once": problem.at_once}
+    return SimpleNamespace(start=problem.start[:1], render=render, **same)
 
 
 def adversaries(

@@ -190,7 +190,8 @@ def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
             if result := compare.difference(arms[arm], arms[base], OVERALL, name):
                 doubtful = result["low"] <= 0 <= result["high"]
                 difference = "no difference is shown" if doubtful else format_interval(result, "+")
-                parts.append("{} {:.2f} and {:.2f} ({})".format(metric_title(name), *result["means"], difference))
+                before, after = result["means"]
+                parts.append(f"{metric_title(name)} {before:.2f} and {after:.2f} ({difference})")
         if parts:
             sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
     return sentences
