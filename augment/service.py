@@ -22,10 +22,11 @@ from augment.scene import Conditions, Scene
 from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_choice, require_range
+from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
 
-ARMS = ("none", "random", "adversarial")
+ARMS = ("none", "random", "adversarial", "folder")
 INITS = ("scene", "random")
 MOST_EXAMPLES = 10**6
 MOST_EVERY = 10**9
@@ -68,7 +69,8 @@ class TrainingAttackSettings(AttackSettings):
 class AugmentationSettings:
     """What a service renders, and when.
 
-    arm: "none", "random" (random light or shape) or "adversarial". examples: renders per regeneration. init: where an
+    arm: "none", "random" (random light or shape), "adversarial", or "folder" (images of a folder in place of renders).
+    folder: where these lie, for the commands. examples: per regeneration; None: all of the folder. init: where an
     attack begins: "scene" (the scene's own values) or "random" (light by `random_light`, everything else uniform in its
     norm-ball). warm_start: begin where the last regeneration's attack ended. every: training images between two
     regenerations, counted within an epoch; None: one regeneration per epoch. vary: what is drawn anew each time.
@@ -78,6 +80,7 @@ class AugmentationSettings:
     """
 
     arm: str = "adversarial"
+    folder: str | None = None
     examples: int | None = 100
     init: str = "scene"
     warm_start: bool = False
@@ -89,6 +92,8 @@ class AugmentationSettings:
     def __post_init__(self) -> None:
         require_choice("arm", self.arm, ARMS)
         require_choice("init", self.init, INITS)
+        if self.arm == "folder" and not self.folder:
+            raise InputError(f"folder is {self.folder}, and arm=folder shows its images: name a folder")
         require_range("examples", self.examples, 0, MOST_EXAMPLES)
         require_range("every", self.every, 1, MOST_EVERY)
         random = "random" in (self.arm, self.init)
@@ -100,7 +105,7 @@ class AugmentationSettings:
 
     @property
     def renders(self) -> bool:
-        """Whether any example is rendered at all."""
+        """Whether there are any examples at all."""
         return self.arm != "none" and self.examples != 0
 
 
@@ -156,9 +161,10 @@ class AugmentationService:
     """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
 
     scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`. label:
-    the class that hard negatives are attacked towards, where a scene has any: these are the examples of all other
+    the class that hard negatives are attacked towards, where there are any: these are the examples of all other
     labels. None: every attack leads away from the example's own class. rank, world_size: of this process among those
-    that train together; each attacks its shard of the examples, and all get all renders.
+    that train together; each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W) uint8, of
+    arm="folder".
     """
 
     settings: AugmentationSettings
@@ -169,11 +175,15 @@ class AugmentationService:
     label: int | None = None
     rank: int = 0
     world_size: int = 1
+    images: Tensor | None = None
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        if self.scene is None and self.settings.renders:
-            raise InputError(f"scene is None, and arm={self.settings.arm} renders examples: give a scene")
+        source = "images" if self.settings.arm == "folder" else "scene"
+        if self.settings.renders and getattr(self, source) is None:
+            raise InputError(
+                f"{source} is None, and arm={self.settings.arm} needs examples: give a scene, or images for a folder"
+            )
 
     @classmethod
     def from_meshes(
@@ -205,7 +215,9 @@ class AugmentationService:
 
     def __len__(self) -> int:
         """Examples per regeneration."""
-        return len(self.labels) if self.settings.renders else 0
+        if self.images is None:
+            return len(self.labels) if self.settings.renders else 0
+        return len(self.labels) if self.settings.examples is None else self.settings.examples
 
     def regenerate(self, model: nn.Module, number: int) -> Renders:
         """Fresh examples for the model's current weights; the model keeps its mode, gradients and random state.
@@ -213,6 +225,8 @@ class AugmentationService:
         model: images (N, 3, size, size) in [0, 1] → logits. number: counts a run's regenerations from 0. The draw
         depends on it and on the seed alone, so a resumed run repeats it. InputError: a label that has no logit.
         """
+        if self.images is not None and self.settings.renders:
+            return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         once = self.settings.arm == "random"
@@ -234,19 +248,37 @@ class AugmentationService:
             raise InputError(f"the checkpoint continues {counts}; resume with the settings of the run")
         self._last_values = state["values"].to(self.labels.device)
 
+    def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
+        """The images that are next in passes over the whole folder, each in an order of its own."""
+        total, first = len(images), number * len(self)
+        passes = range(first // total, (first + len(self) - 1) // total + 1)
+        order = torch.cat([torch.randperm(total, generator=generator(self.seed, part, "folder")) for part in passes])
+        rows = order[first - passes.start * total :][: len(self)].to(images.device)
+        shown, labels = to_unit(images[rows]), self.labels[rows]
+        shard = utils.shard(len(rows), self.rank, self.world_size).to(images.device)
+        _, diagnostics = self._errors(model, shown[shard, None], labels, shard)
+        return Renders(shown, labels, diagnostics)
+
     def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         values = self._random_values(problem, number)
         images = problem.images(values, shard)
+        success, diagnostics = self._errors(model, images, self.labels, shard)
+        images = utils.merged(images, shard, len(self.labels), self.world_size)[:, 0]
+        examples = choose_attack_examples(model, problem, values, success, self.labels)
+        return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
+
+    def _errors(
+        self, model: nn.Module, images: Tensor, labels: Tensor, shard: Tensor
+    ) -> tuple[Tensor, dict[str, float]]:
+        """On which of the examples with labels (E,) the model errs, (E,) bool, from this process's images of them
+        (A, 1, 3, H, W); and how often, with the mean loss."""
         with as_found(model), self.phases("attack_classifier"):
             preprocessed_model = self.settings.attack.preprocessed_model(model)
             logits = logits_of(preprocessed_model, images, self.settings.attack.batch_size)
-        shards = images, logits
-        images, logits = (utils.merged(rows, shard, len(self.labels), self.world_size)[:, 0] for rows in shards)
-        require_known(self.labels, logits)
-        success = ~is_right(logits.argmax(1), self.labels)
-        diagnostics = {"attack_success": _mean(success), "loss": _mean(label_loss(logits, self.labels))}
-        examples = choose_attack_examples(model, problem, values, success, self.labels)
-        return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
+        logits = utils.merged(logits, shard, len(labels), self.world_size)[:, 0]
+        require_known(labels, logits)
+        success = ~is_right(logits.argmax(1), labels)
+        return success, {"attack_success": _mean(success), "loss": _mean(label_loss(logits, labels))}
 
     def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         attack, goal = self.settings.attack, Goal(self.labels[:, None])

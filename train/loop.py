@@ -71,7 +71,7 @@ class Trainer:
         if settings.batch_size % processes:
             raise InputError(f"train.batch_size={settings.batch_size} is no multiple of the {processes} processes")
         if settings.ranking and service.label is None:
-            raise InputError("train.ranking ranks hard negatives: name some in scene.hard_negatives")
+            raise InputError("train.ranking ranks hard negatives: name some in scene.hard_negatives or augment.folder")
         self.settings, self.architecture, self.service, self.folder = settings, architecture, service, folder
         self.phases, self.seed, self.epoch = service.phases, service.seed, 0
         self.history: list[dict[str, float]] = []  # the metrics of each epoch

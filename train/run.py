@@ -21,7 +21,7 @@ from train.data import DataSet, Split, channel_statistics, held_out_rows, load_c
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
 from train.networks import PYTHON, build_network, describe, load_selected, start_from
-from train.photographs.folder import find_photographs, require_outside
+from train.photographs.folder import find_photographs, load_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.predictions import Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
@@ -153,10 +153,13 @@ def build_trainer(
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
     """The scene, its labels and the service that regenerates its renders; logs the rasterizer."""
-    scene, labels = None, torch.zeros(0, dtype=torch.int64, device=device)
+    scene, images, labels = None, None, torch.zeros(0, dtype=torch.int64, device=device)
     phases, process = Phases(device), (utils.rank(), utils.world_size())
     ranked = class_index(data.classes, settings.label, "label") if settings.scene.hard_negatives else None
-    if settings.augment.renders:
+    if settings.augment.renders and settings.augment.arm == "folder":
+        images, labels = (part.to(device) for part in load_renders(settings, data))
+        ranked = class_index(data.classes, settings.label, "label") if len(labels.unique()) > 1 else None
+    elif settings.augment.renders:
         label, objects = class_index(data.classes, settings.label, "label"), settings.objects
         named = {item.label: key for key, item in objects.items() if item.label != OTHER}
         numbers = {name: class_index(data.classes, name, f"label of {key}") for name, key in named.items()}
@@ -167,7 +170,21 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
             scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
-    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
+    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process, images)
+
+
+def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[torch.Tensor, torch.Tensor]:
+    """The images (N, 3, size, size) uint8 of the folder `augment.folder`, and their labels (N,) by the names of its
+    folders. InputError: as `find_photographs` and `load_photographs`, or no image of the class under study."""
+    folder, label = Path(str(settings.augment.folder)), class_index(data.classes, settings.label, "label")
+    with keyed("augment.folder"):
+        found = find_photographs(folder, data.classes, settings.label)
+        found, images, _ = load_photographs(folder, found, data.size, advice="")
+        foreign, numbers = complementary_label(label), {name: index for index, name in enumerate(data.classes)}
+        labels = torch.tensor([numbers.get(item.label, foreign) for item in found])
+        if not (labels == label).any():
+            raise InputError(f"{folder} holds no image of label={settings.label}: add a folder of them")
+    return images, labels
 
 
 def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:

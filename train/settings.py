@@ -38,7 +38,7 @@ RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a ru
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
 TEXTS = {  # keys whose values are names or paths, also where they look like numbers
-    *("run", "sweep", "init_from", "out", "photos", "path", "cache"),
+    *("run", "sweep", "init_from", "out", "photos", "path", "folder", "cache"),
     *("weights", "light", "label", "target", "classifier", "name", "reload"),
 }
 
@@ -137,7 +137,7 @@ class ExperimentSettings:
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
-        if self.augment.renders:
+        if self.augment.renders and self.augment.arm != "folder":
             self.augment.examples = self.views * self.scene.objects * len(self.scene.backgrounds)
             require_range("meshes × views × backgrounds", self.augment.examples, 1, MOST_IMAGES)
 

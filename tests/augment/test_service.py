@@ -116,6 +116,27 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     assert (serve(seed=2, **settings).regenerate(model, 3).images != images).any()
 
 
+@pytest.mark.parametrize("examples, shown", [(3, 3), (None, 7), (10, 10)])
+def test_a_folders_images_are_all_shown_before_any_is_shown_again_and_the_round_decides_which(examples, shown):
+    """Image n has the value n and the label n % 3, so that the network, which sees values, errs on all but label 0."""
+    images, labels = torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(-1, 3, 8, 8), torch.arange(7) % 3
+    model = nn.Sequential(nn.Flatten(), nn.Linear(192, 3))
+    nn.init.zeros_(model[1].weight).data[0] = model[1].bias.data[0] = 1.0
+    settings = AugmentationSettings(arm="folder", folder="unread", examples=examples)
+    service = AugmentationService(settings, None, labels, 5, Phases(), images=images)
+    rounds = [service.regenerate(model, number) for number in range(21)]
+    drawn = torch.cat([made.images[:, 0, 0, 0] * 255 for made in rounds]).round().long()
+    assert len(service) == shown and len(drawn) == 21 * shown
+    passes = drawn.view(-1, 7)
+    assert torch.equal(passes.sort(1).values, torch.arange(7).expand_as(passes)) and len(passes.unique(dim=0)) > 1
+    assert torch.equal(torch.cat([made.labels for made in rounds]), drawn % 3)
+    assert rounds[4].diagnostics["attack_success"] == pytest.approx(float((rounds[4].labels > 0).float().mean()))
+    again = AugmentationService(settings, None, labels, 5, Phases(), images=images).regenerate(model, 4)
+    assert torch.equal(again.images, rounds[4].images)
+    with pytest.raises(InputError, match="images is None"):
+        AugmentationService(settings, None, labels, 5, Phases())
+
+
 def test_random_light_has_its_norm_and_diagnostics_of_its_images(serve, model):
     renders = serve(arm="random").regenerate(model, 0)
     logits = logits_of(model, renders.images)

@@ -40,6 +40,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "two")
         random_arm(folder / f"random_{index}.pt")
+        folder_arm(folder / f"folder_{index}.pt")
         run_until_a_signal(folder / "config.yaml", folder / "mixed")
 
 
@@ -60,6 +61,19 @@ def random_arm(file: Path) -> None:
         torch.manual_seed(0)
         made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0)
     torch.save((made.images, made.diagnostics, count[0]), file)
+
+
+def folder_arm(file: Path) -> None:
+    """Write the images, labels and diagnostics of a round."""
+    torch.manual_seed(0)
+    images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
+    settings, process = (
+        AugmentationSettings(arm="folder", folder="unread", examples=5),
+        (utils.rank(), utils.world_size()),
+    )
+    service = AugmentationService(settings, None, labels, 0, utils.Phases(), None, *process, images)
+    made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
+    torch.save((made.images, made.labels, made.diagnostics), file)
 
 
 def run_until_a_signal(config: Path, folder: Path) -> None:
@@ -130,6 +144,15 @@ def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of
         shared, described, part = torch.load(runs / f"random_{index}.pt")
         torch.testing.assert_close(shared, images, rtol=0, atol=1e-6)
         assert part == 15 and described == pytest.approx(diagnostics, rel=1e-5)
+
+
+def test_processes_show_the_same_images_of_a_folder_and_the_diagnostics_of_all(runs):
+    folder_arm(runs / "folder.pt")
+    images, labels, diagnostics = torch.load(runs / "folder.pt")
+    for index in range(2):
+        *same, described = torch.load(runs / f"folder_{index}.pt")
+        assert torch.equal(same[0], images) and torch.equal(same[1], labels)
+        assert described == pytest.approx(diagnostics, rel=1e-5)
 
 
 @pytest.mark.slow

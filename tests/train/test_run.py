@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 
 from augment.losses import complementary_label
 from renderer.errors import InputError
@@ -294,6 +295,52 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
     logits = network(data.test.images / 255)
     assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == data.test.labels).double().mean().item())
     assert network.classes == ("apple", "orange", "pear") and network.size == 16
+
+
+def test_a_folders_images_train_in_place_of_renders_and_a_resumed_run_shows_those_of_the_whole_one(
+    tiny, tmp_path, regenerated
+):
+    """Labels by the names of folders; the pixels are those of the files, which have the data's size."""
+    rng, by_image = np.random.default_rng(0), {}
+    for name, label in {"orange": 1, "apple": 0, "other_ball": complementary_label(1)}.items():
+        (tmp_path / "lab" / name).mkdir(parents=True)
+        for number in range(3):
+            pixels = rng.integers(0, 256, (16, 16, 3)).astype(np.uint8)
+            Image.fromarray(pixels).save(tmp_path / "lab" / name / f"{number}.png")
+            by_image[pixels.tobytes()] = label
+    keys = [f"augment.folder={tmp_path / 'lab'}", "augment.warm_start=false", "train.resume=true", "train.ranking=1"]
+    settings = tiny("augment=folder", *keys, "train.epochs=2", "augment.every=27", "augment.examples=4")
+    train(settings, tmp_path / "whole")
+    shown, rounds = [], list(regenerated)
+    for part in rounds:
+        shown += [image.permute(1, 2, 0).numpy().tobytes() for image in part.images]
+        assert [by_image[image] for image in shown[-4:]] == part.labels.tolist()
+    assert len(rounds) == 4 and len(set(shown[:9])) == 9
+    with pytest.raises(Interrupted):
+        train_with_signal(settings, tmp_path / "stopped", 3, 1, signal.SIGTERM)
+    train(settings, tmp_path / "stopped")
+    assert weights(tmp_path / "stopped") == weights(tmp_path / "whole")
+    (tmp_path / "lab" / "apple" / "0.png").unlink()
+    with pytest.raises(InputError, match=r"lab has changed since .*stopped began"):
+        train(settings, tmp_path / "stopped")
+
+
+@pytest.mark.parametrize(
+    "folder, match",
+    [
+        ("missing", "^augment.folder: .*missing is not a folder"),
+        ("", "^augment.folder: folder is None, and arm=folder shows its images: name a folder"),
+        ("negatives", "^augment.folder: .*negatives holds no image of label=orange"),
+        ("broken", "^augment.folder: .*1 of 1 photographs cannot be read"),
+    ],
+)
+def test_a_folder_without_images_of_the_class_is_refused_by_its_key(tiny, photos, tmp_path, folder, match):
+    (tmp_path / "negatives").mkdir()
+    (tmp_path / "negatives" / "apple").symlink_to(photos / "apple")
+    (tmp_path / "broken" / "orange").mkdir(parents=True)
+    (tmp_path / "broken" / "orange" / "0.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match=match):
+        train(tiny("augment=folder", f"augment.folder={tmp_path / folder if folder else 'null'}"), tmp_path / "run")
 
 
 def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(tiny, finished, tmp_path, caplog):
