@@ -4,6 +4,7 @@ Run a benchmark as a module from the repository's root: python -m benchmarks.ren
 """
 
 import csv
+import json
 import os
 import platform
 import statistics
@@ -69,13 +70,16 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
 
 
 def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[Row]:
-    """Print the machine, and each row as it is measured; with a path, write what there is to a CSV file every time."""
+    """Print the machine, and each row as it is measured; with a path, write what there is every time, to a .jsonl or
+    CSV file."""
     print(machine(device))
     measured = []
     for row in rows:
         print(row, flush=True)
         measured.append(row)
-        if path:
+        if path and path.suffix == ".jsonl":
+            path.write_text("".join(json.dumps(row) + "\n" for row in measured), encoding="utf-8")
+        elif path:
             write_csv(path, measured)
     return measured
 

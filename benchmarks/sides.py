@@ -18,6 +18,7 @@ import hashlib
 import subprocess
 import tarfile
 import zipfile
+from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,15 @@ from train.lab.shots import LabSettings
 from train.loop import evaluate
 from train.networks import load_run
 from train.photographs.folder import TABLE
-from train.photographs.metrics import METRICS, find_metric, metric_title
+from train.photographs.metrics import METRICS, OVERALL, RANKED, find_metric, interval, metric_title, pool_by
+from train.photographs.predictions import PREDICTIONS, read_predictions
 from train.photographs.scoring import evaluate_photographs
 from train.tables import Table, format_interval
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
 LABEL, VALIDATION, BY = "orange", 0.02, {"photographs": "source"}
 LEFT_OUT = ("turntable", "studio")  # photographs of few objects, whose two halves would show the same ones
+TRAINED = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}  # meshes of training, with their albedo_scale
 OUTSIDE = {  # meshes from no generator of ours and in no training, in DATA or in packages
     "orange_scan.glb": "orange", "orange_leaf.glb": "orange", "apple_scan.glb": "apple", "banana.glb": "other_banana",
     "golf_ball.glb": "other_golf_ball", "racquetball.glb": "other_racquetball", "lemon.obj": "other_lemon",
@@ -65,18 +68,16 @@ def solids(seed: int) -> list[str]:
 
 
 def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
-    """The settings of pnb-lab of each part; those ending in _seen repeat another with what training has seen."""
+    """The settings of pnb-lab of each part; those ending in _seen_objects repeat another with objects of training."""
     maps = {path.stem: str(path) for path in [*(extra / "hdri").glob("*.npy"), *(data / "hdri").glob("*.npy")]}
     files = {path.name: str(path) for path in [*(data / "meshes").iterdir(), *extra.rglob("*.obj")]}
     outside = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
-    scales = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}
-    trained = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in scales.items()]
+    trained = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in TRAINED.items()]
     slides = sorted(str(path) for path in (extra / "slides").iterdir())
     unseen = {**UNSEEN, "patterns": ["window", "leaves", "text", "slides", "window+text"], "slides": slides, "seed": 3}
     reported, roughness = [maps[name] for name in sorted(set(maps).difference(CHOSEN))], UNSEEN["roughness"]
     skies = {"environments": reported, "patterns": [], "setups": 5 * len(reported), "seed": 4, "roughness": roughness}
     chosen, seen = {"meshes": solids(2001)}, {"meshes": [*trained, *solids(0)]}
-    patterns = ["solid", "stripes", "checkers", "half", "spots"]
     return {
         "choosing/laboratory": {**chosen, "patterns": ["gradient", "rings", "colors"], "setups": 240, "seed": 1},
         "choosing/hdri": {**chosen, "environments": [maps[x] for x in CHOSEN], "patterns": [], "setups": 80, "seed": 2},
@@ -84,7 +85,6 @@ def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
         "reporting/hdri": {"meshes": outside, **skies},
         "reporting/laboratory_seen_objects": {**seen, **unseen, "setups": 100},
         "reporting/hdri_seen_objects": {**seen, **skies},
-        "reporting/laboratory_seen_patterns": {"meshes": outside, "patterns": patterns, "setups": 100, "seed": 5},
     }  # fmt: skip
 
 
@@ -112,7 +112,9 @@ def unpack(packages: Path, extra: Path) -> None:
 
 def divide_photographs(photos: Path, sides: Path) -> None:
     """Links to every other photograph of a class and source, by name, on either side."""
-    rows = [row for row in csv.DictReader((photos / TABLE).open()) if row["source_tag"] not in LEFT_OUT]
+    rows = [
+        row for row in csv.DictReader((photos / TABLE).read_text().splitlines()) if row["source_tag"] not in LEFT_OUT
+    ]
     ordered = sorted(rows, key=lambda row: (row["class"], row["source_tag"], row["path"]))
     for offset, side in enumerate(("choosing", "reporting")):
         write_csv(sides / side / "photographs" / TABLE, ordered[offset::2])
@@ -134,10 +136,11 @@ def make(args: argparse.Namespace) -> None:
 
 def log_looks(args: argparse.Namespace, folders: list[Path]) -> None:
     """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
-    looks, images = list(csv.DictReader(LOG.open(encoding="utf-8"))), hashlib.sha256()
+    looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
         images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     for name in args.networks:
         weights = content_hash(load_run(name).state_dict())[:12]
         if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights)]:
@@ -149,31 +152,43 @@ def log_looks(args: argparse.Namespace, folders: list[Path]) -> None:
 
 
 def score(args: argparse.Namespace) -> None:
-    """A table of the side's folders, of their sources and of their objects; with DATA of its part of CIFAR-100, too."""
+    """A table of the side's folders, of their sources and of their objects; with DATA of its part of CIFAR-100, too;
+    and how far the other networks are from the first."""
     side = {"choose": "choosing", "report": "reporting"}[args.command]
     folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
     folders = [folder for folder in folders if not args.part or folder.name in args.part]
     if side == "reporting":
         log_looks(args, folders)
     lines = []
-    for path in args.networks:
+    outs = {path: Path("runs/sides", side, path.strip("/").replace("/", "_")) for path in args.networks}
+    for path, out in outs.items():
         network = load_run(path)
         model = MixedPrecision(network, choose_precision("auto", torch.device("cpu")))
         for folder in folders:
-            out = Path("runs/sides", side, path.strip("/").replace("/", "_"), folder.name)
-            by = BY.get(folder.name, "mesh")
-            summary = evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by)
+            options = {"by": BY.get(folder.name, "mesh"), "point": network.operating_point}
+            given = model, network.classes, folder, LABEL, out / folder.name, network.size
+            summary = evaluate_photographs(*given, **options)
             for name, group in {"all": summary, **summary["by_source"], **summary.get("by_mesh", {})}.items():
                 cells = (format_interval(find_metric(group, metric)) for metric in METRICS)
                 lines.append([path, folder.name, Path(name).stem, *cells])
         if args.data:
             data = load_npz(str(args.data / "cifar100.npz"))
             split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
-            lines.append([path, "CIFAR-100", "accuracy", evaluate(model, split)["accuracy"], *[""] * 5])
+            lines.append(
+                [path, "CIFAR-100", "accuracy", evaluate(model, split)["accuracy"], *[""] * (len(METRICS) - 1)]
+            )
+    for name in (folder.name for folder in folders):
+        files = (out / name / PREDICTIONS for out in outs.values())
+        first, *others = (pool_by(read_predictions(file, LABEL), LABEL, "source")[OVERALL] for file in files)
+        for path, pool in zip(args.networks[1:], others, strict=True):  # intervals of the same draws
+            ends = {metric: interval(pool.replicates[metric] - first.replicates[metric]) for metric in RANKED}
+            values = {m: find_metric(pool.metrics, m)["value"] - find_metric(first.metrics, m)["value"] for m in ends}
+            cells = (format_interval({"value": values.get(m), **ends.get(m, {})}, "+") for m in METRICS)
+            lines.append([f"{path} - {args.networks[0]}", name, "all", *cells])
     print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
 
 
-if __name__ == "__main__":
+def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=["make", "choose", "report"])
     parser.add_argument("networks", nargs="*", help="run folders, or names under pretrained/")
@@ -181,5 +196,9 @@ if __name__ == "__main__":
         parser.add_argument(option, type=Path, required=option == "--sides")
     parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
     parser.add_argument("--table", default="", help="of report: the name of the table that the scores are for")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     make(arguments) if arguments.command == "make" else score(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -50,15 +50,19 @@ BACKGROUNDS = 5  # of each view
 SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
 
 
-def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
+def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict[str, float]:
     """The metrics of the second of two epochs of `python -m train`; the first compiles and warms up."""
-    command = [sys.executable, "-m", "train", "experiment=paper", "train.epochs=2", f"run={run}"]
+    command = [sys.executable, *launcher, "-m", "train", "experiment=paper", "train.epochs=2", f"run={run}"]
+    subprocess.run([*command, *overrides], check=True, stdout=subprocess.DEVNULL)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return next(line for line in reversed(lines) if "epoch" in line)
+
+
+def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
     settings = ["data=npz", f"data.path={options.data}", "data.validation=0.05", f"scene.meshes={options.meshes}"]
     settings += [f"train.images_per_epoch={options.images}", f"train.device={options.device}"]
     settings += [f"model.depth={options.depth}", f"model.width={options.width}"]
-    subprocess.run([*command, *settings, *overrides, *options.overrides], check=True, stdout=subprocess.DEVNULL)
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return next(line for line in reversed(lines) if "epoch" in line)
+    return last_epoch(run, *settings, *overrides, *options.overrides)
 
 
 def make_sure(head: dict[str, Tensor], label: int = 0) -> None:

@@ -18,7 +18,7 @@ from train.settings import keyed
 @dataclass
 class Settings:
     light: str = MISSING  # grace | eucalyptus | st_peters | uniform | a map (.npy, .hdr, .exr) | coefficients (.json)
-    out: str = MISSING  # the map's file: .hdr (negative radiance becomes 0), .exr or .npy
+    out: str = MISSING  # the map's file, .hdr, .exr or .npy, in which negative radiance becomes 0
     height: int = 256  # rows; there are twice as many columns
 
     def __post_init__(self) -> None:
@@ -32,11 +32,10 @@ def main(settings: Settings) -> None:
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
     radiance = to_map(load_light(settings.light), settings.height)
     with keyed("out"):
-        write_map(out, radiance)
-    negative = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
+        write_map(out, radiance.clamp(min=0))  # negative light is refused where maps are read
     print(
         f"{out}: {radiance.shape[1]} × {radiance.shape[0]} texels, radiance {radiance.min():.3g} to "
-        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of it is negative and {negative}"
+        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of its power is negative and stored as 0"
     )
 
 

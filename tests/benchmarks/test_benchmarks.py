@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 
-from benchmarks import common, lights, renderer, scene, training
-from renderer.mesh import Mesh
+from benchmarks import common, gpu, lights, renderer, scene, training
 from renderer.rasterizer import choose
 from renderer.transport import precomputed
 
@@ -81,18 +79,6 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     assert all(0 < float(row[name]) < 0.4 for row in rows for name in ("image_error", "gradient_error"))
 
 
-def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):
-    pytest.importorskip("mitsuba")
-    monkeypatch.setattr(lights, "SEEDS", 2)
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    mesh, light = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.2)), lights.load_light("st_peters")
-    image, coverage, noise = lights.mitsuba_image(mesh, 12, "direct", light)
-    inside, operator = coverage > 0.999, lights.operators(mesh, 12, 8, lights.DIRECT)[0]
-    ours = torch.zeros(3, 144).index_copy(1, operator.pixels, operator.radiance(light))
-    assert inside.sum() > 20 and noise[:, inside].mean() > 0
-    assert (ours - image)[:, inside].abs().max() < 0.05 * image.max()
-
-
 @pytest.mark.slow
 def test_training_is_timed_beside_a_plain_loop(tmp_path):
     """With attacks that take all their steps."""
@@ -123,3 +109,10 @@ def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, 
     assert loads == [(10, 1, 2), (20, 2, 4)]
     assert all(row["attack_seconds"] > 0 and row["ms_per_render_and_pass"] > 0 for row in rows)
     assert len(read(path)) == 2
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
+def test_the_gpus_questions_are_refused_without_one(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        gpu.main([])
+    assert capsys.readouterr().err.count("error: torch finds no GPU here") == 1

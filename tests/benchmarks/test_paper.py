@@ -1,5 +1,6 @@
 """The paper's benchmarks, at a tiny size."""
 
+import json
 import math
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import trimesh
 from augment import Classifier, attack
 from augment.objects import SceneObject
 from augment.utils import generator
-from benchmarks.paper import common, norm_balls, rendering_quality, run_time, survival, table, transfer
+from benchmarks.paper import common, light_change, norm_balls, rendering_quality, run_time, survival, table, transfer
 from renderer import orbit_cameras
 from renderer.mesh import Mesh
 
@@ -84,6 +85,15 @@ def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path,
     assert lamp["refusal"].startswith("error: ") and "versions" not in lamp
     table.main([str(out)])
     assert capsys.readouterr().out.splitlines()[2].split()[:4] == ["|", "lighting", "|", "1"]
+
+
+def test_the_change_of_light_is_drawn_over_the_epochs_that_have_attacks(tmp_path):
+    first, last = ({"epoch": n, **{f"augment/{name}": n / 2 for name in light_change.MEASURES}} for n in (1, 2))
+    lines = "".join(json.dumps(line) + "\n" for line in (first, last, {"test/accuracy": 0.5}))
+    (tmp_path / "metrics.jsonl").write_text(lines)
+    light_change.main([str(tmp_path), "--out", str(tmp_path / "figure.png")])
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "figure.csv").read_text().splitlines()[1:] == ["1,0.5,0.5,0.5", "2,1.0,1.0,1.0"]
 
 
 @pytest.mark.parametrize(("excess", "success"), [(0.9, True), (1.1, False)])

@@ -1,6 +1,8 @@
 """The commands' settings and outputs."""
 
 import json
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
+from renderer.light.environment import to_map
+from renderer.light.harmonics import project
+from renderer.light.presets import load_light, save_light
 from train.checkpoint import BEST, save
 from train.networks import WideResNet, describe, load_run
 from train.run_folder import LOCK, sole_writer
@@ -57,6 +62,19 @@ def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_i
     assert tables[0] == tables[1]
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".exr", ".hdr"])
+def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_read(call, here, capsys, suffix):
+    """1 + 2 z: of its magnitude's integral over z, 2.5, a tenth is negative."""
+    light = torch.zeros(49, 3)
+    light[0], light[2] = math.sqrt(4 * math.pi), 2 * math.sqrt(4 * math.pi / 3)
+    save_light(here / "light.json", light)
+    assert call("light", "light=light.json", f"out=map{suffix}", "height=64") == 0
+    fraction = float(re.search("([0-9.]+)% of its power is negative", capsys.readouterr().out)[1])
+    assert fraction == pytest.approx(10, abs=0.02)  # by the map's midpoint rule
+    expected, read = project(to_map(light, 64).clamp(min=0), 6), load_light(str(here / f"map{suffix}"))
+    torch.testing.assert_close(read / read[0], (expected / expected[0]).float(), rtol=0, atol=1e-3)
+
+
 WRONG = [
     ([*EVALUATE, "skip_unreadable=maybe"], "Error merging override skip_unreadable=maybe: Value 'maybe' is not"),
     ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
@@ -89,7 +107,7 @@ def test_a_mistake_is_one_line_and_status_2_before_the_work(call, here, capsys, 
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
     with sole_writer("out", here / "out"):
         assert call(*command, "out=out") == USER_ERROR
-    assert capsys.readouterr().err.startswith("error: out=out is being written by another process")
+    assert "error: out=out is being written by another process" in capsys.readouterr().err
     assert not (here / "out").exists()
 
 
