@@ -11,7 +11,7 @@ from train.tables import Table, format_fraction, format_interval, fraction
 def test_a_fraction_has_the_wilson_interval():
     """p = 0.2 of 40 ± 1.96 standard errors about (8 + z² / 2) / (40 + z²), z = 1.96 (Wilson 1927)."""
     assert fraction(8, 40) == pytest.approx(
-        {"value": 0.2, "low": 0.10498, "high": 0.34758, "hits": 8, "n": 40}, rel=1e-4
+        {"value": 0.2, "low": 0.10500, "high": 0.34757, "hits": 8, "n": 40}, rel=1e-4
     )
 
 
