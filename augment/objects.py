@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.mesh import Mesh, concatenate, load_mesh, normalize, subdivide
+from renderer.mesh import PER_FACE, Mesh, concatenate, load_mesh, normalize, subdivide
 from renderer.shapes import solid
 
 TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
@@ -153,8 +153,20 @@ def another_instance(item: SceneObject, seed: int) -> SceneObject:
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    other = replace(item, mesh=normalize(solid(rest[0], seed)), own=None)
-    return on_ground(with_props(other, item.props), item.ground)
+    return _with_mesh(item, normalize(solid(rest[0], seed)))
+
+
+def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
+    """The object after a rotation (3, 3) about the origin, with the same props and table at its new lowest point."""
+    own = slice(item.own)
+    mesh = replace(item.mesh, **{name: getattr(item.mesh, name)[own] for name in PER_FACE})
+    vertices = (mesh.vertices @ rotation.T).astype(np.float32)  # rounded as by `normalize`
+    return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
+
+
+def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
+    """The same props and table with another object's mesh."""
+    return on_ground(with_props(replace(item, mesh=mesh, own=None), item.props), item.ground)
 
 
 def _prop(item: PropSettings) -> Mesh:

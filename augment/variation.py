@@ -1,8 +1,9 @@
-"""Rows of a scene drawn anew: instance, view, light, background and camera effects of each example."""
+"""Rows of a scene drawn anew: instance, pose, view, light, background and camera effects of each example."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.objects import another_instance
+from augment import room
+from augment.objects import another_instance, rotated
 from augment.scene import Example, Scene
 from augment.utils import progress
-from renderer.camera import Camera
+from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import HARMONICS
 from renderer.light.presets import directional, load_light
+from renderer.transport.rays import Rays
 
-UNCHANGED = (1.0, 1.0)
+UNCHANGED, NONE = (1.0, 1.0), (0.0, 0.0)
+WIDEST = 45.0  # degrees, of a lens that a normalized mesh is in front of
+ELEVATION = math.radians(15), math.radians(75)  # least and most, of a camera above a table
+WALL = 1.8, 8.0  # least and largest distance of a wall behind the object
 DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, around the mesh and up or down, at most
 BLUR_RADIUS = 3  # pixels to either side that a blur averages over
 
@@ -54,9 +60,13 @@ class VariationSettings:
     scale, exposure: [least, most] factor of the mesh's size in the frame, and of the light; log-uniform. backgrounds:
     a folder of images, one behind each example. instances: every solid that is named without a seed is another instance
     in each of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and
-    down. environments: each example is in one of these lights, as `load_light` takes them. directional_fraction: of the
-    examples, in a directional light from the camera's side, up to 70° off, plus [least, most] `fill_light` of their own
-    light. lit_background: a background is a wall that faces the camera, in the example's light.
+    down. fov: [least, most] degrees between the image's sides, of cameras in perspective. rotation: degrees by which
+    the object itself is turned in each of its views, at most, about a random axis. environments: each example is in one
+    of these lights, as `load_light` takes them. directional_fraction: of the examples, in a directional light from the
+    camera's side, up to 70° off, plus [least, most] `fill_light` of their own light. lit_background: a background is a
+    wall that faces the camera, in the example's light. tables: fraction of the examples that stand on a table before a
+    wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75°
+    above. background_saturation: of random colors that multiply the backgrounds, at most.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
@@ -68,77 +78,122 @@ class VariationSettings:
     backgrounds: str | None = None
     instances: bool = False
     azimuth: float = 0.0
+    fov: list[float] = field(default_factory=lambda: list(NONE))
+    rotation: float = 0.0
     environments: list[str] = field(default_factory=list)
     directional_fraction: float = 0.0
-    fill_light: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    fill_light: list[float] = field(default_factory=lambda: list(NONE))
     lit_background: bool = False
+    tables: float = 0.0
+    background_saturation: float = 0.0
     camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
 
     def __post_init__(self) -> None:
-        for name, most in (("shift", 1), ("azimuth", 180), ("directional_fraction", 1)):
+        fractions = {name: 1 for name in ("shift", "directional_fraction", "tables", "background_saturation")}
+        for name, most in (fractions | {"azimuth": 180, "rotation": 180}).items():
             require_range(name, getattr(self, name), 0, most)
         require_limits("fill_light", self.fill_light, 0, 1)
+        if tuple(self.fov) != NONE:
+            require_limits("fov", self.fov, 1, WIDEST)
         for name in ("scale", "exposure"):
             require_limits(name, getattr(self, name), 1 / FACTOR, FACTOR)
 
     @property
     def moves(self) -> bool:
         """Whether views change, which then are rasterized in every regeneration."""
-        return self.shift > 0 or tuple(self.scale) != UNCHANGED or self.azimuth > 0 or self.instances
+        angles = self.azimuth, self.rotation, *self.fov
+        return self.shift > 0 or tuple(self.scale) != UNCHANGED or any(angles) or self.instances or self.tables > 0
 
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
     """The scene with rows drawn anew around its own; the scene itself where nothing varies.
 
-    All views of a row are moved alike. once: they are rendered in one light only. InputError: a folder without images.
+    All views of a row are moved alike. once: they are rendered in one light only. InputError: a folder without images,
+    or tables under objects that stand on one, or seen by several cameras.
     """
+    on_table = torch.zeros(len(scene), dtype=torch.bool)
+    if settings.tables:
+        if scene.views > 1 or scene.basis != HARMONICS or any(item.ground is not None for item in scene.objects):
+            raise InputError("tables are for one view, without ground, projector and lamps: leave these out, or tables")
+        on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
-        scene = _with_moved_rows(scene, settings, draws, once)
-    return scene if settings == VariationSettings() else _with_other_light(scene, settings, draws)
+        scene = _with_moved_rows(scene, settings, draws, once, on_table)
+    return scene if settings == VariationSettings() else _with_other_light(scene, settings, draws, on_table)
 
 
-def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool) -> Scene:
+def _with_moved_rows(
+    scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool, on_table: Tensor
+) -> Scene:
     shifts = _offsets(settings.shift, len(scene), draws)
     scales = _log_uniform(settings.scale, len(scene), draws)
     angles = _offsets(math.radians(settings.azimuth), len(scene), draws)
+    fovs = [0.0] * len(scene)
+    if any(settings.fov):
+        low, high = map(math.radians, settings.fov)
+        fovs = (low + (high - low) * torch.rand(len(scene), generator=draws, dtype=torch.float64)).tolist()
     rows, changed = list[Example](), dict[str, Any]()
-    for row, (right, up), scale, angle in zip(scene.examples, shifts, scales, angles, strict=True):
+    drawn = zip(scene.examples, shifts, scales, angles, fovs, on_table.tolist(), strict=True)
+    for row, (right, up), scale, angle, fov, above in drawn:
         cameras = []
         for camera in row.cameras:
             width = camera.width / scale
             shift = {"right": camera.right + right * width, "up": camera.up + up * width}
-            cameras.append(replace(_turned(camera, *angle), width=width, **shift))
+            moved = replace(_turned(camera, *angle), width=width, **shift)
+            moved = _above_table(moved) if above else moved
+            cameras.append(_in_perspective(moved, fov) if fov else moved)
         rows.append(replace(row, cameras=tuple(cameras)))
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    if settings.instances:
+    if settings.instances or settings.rotation:
         views = dict.fromkeys((row.object, row.cameras) for row in scene.examples)
         numbers = {view: index for index, view in enumerate(views)}
-        instances = zip(views, torch.randint(2**31, (len(views),), generator=draws).tolist(), strict=True)
-        counted = progress(instances, "new instances", len(views))
-        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in counted]
+        objects = [scene.objects[index] for index, _ in views]
+        if settings.instances:
+            seeds = torch.randint(2**31, (len(views),), generator=draws).tolist()
+            counted = progress(zip(objects, seeds, strict=True), "new instances", len(views))
+            objects = [another_instance(item, seed) for item, seed in counted]
+        if settings.rotation:
+            rotations = _rotations(math.radians(settings.rotation), len(views), draws)
+            objects = [rotated(item, rotation) for item, rotation in zip(objects, rotations, strict=True)]
+        changed["objects"] = objects
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
     return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
-def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Generator, on_table: Tensor) -> Scene:
     exposures = _log_uniform(settings.exposure, len(scene), draws)
     rows = [replace(row, exposure=row.exposure * factor) for row, factor in zip(scene.examples, exposures, strict=True)]
     changed: dict[str, Any] = {}
+    sky, lamps = scene.lights, torch.zeros(len(rows), 3, dtype=torch.float64)
     if settings.environments:
         chosen = torch.randint(len(settings.environments), (len(rows),), generator=draws)
         lights = torch.stack([load_light(light) for light in settings.environments])
-        changed["lights"] = lights[chosen].to(scene.lights)
+        sky = lights[chosen].to(scene.lights)
     if settings.directional_fraction > 0:
-        changed["lights"] = _in_directional_light(changed.get("lights", scene.lights), scene, settings, draws)
+        sky, lamps = _with_lamps(sky, scene, settings, draws, on_table)
     if settings.camera != CameraEffectSettings():
         device = scene.lights.device
         changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws, device)
-    varied = replace(scene, examples=rows, **changed)
-    return _with_lit_walls(varied) if settings.lit_background else varied
+    if not (settings.lit_background or settings.tables or settings.background_saturation):
+        return replace(scene, examples=rows, lights=_with_directional(sky, lamps), **changed)
+    albedo = decode(scene.backgrounds[[row.background for row in rows]], scene.settings.encoding)
+    if settings.background_saturation:
+        colors = _colors(torch.rand(len(rows), 2, generator=draws) * torch.tensor([1, settings.background_saturation]))
+        albedo = albedo * colors.to(albedo)
+    if settings.tables:
+        sky = sky.clone()
+        sky[on_table] = room.above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
+    lights = _with_directional(sky, lamps)
+    varied = replace(scene, examples=rows, lights=lights, **changed)
+    values = albedo * _facing(varied) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
+    if settings.tables:
+        walls = _log_uniform(WALL, len(rows), draws)
+        values[on_table] = albedo[on_table] * _in_rooms(varied, sky, lamps, walls, on_table).to(albedo)
+    rows = [replace(row, background=index) for index, row in enumerate(rows)]
+    return replace(varied, examples=rows, backgrounds=encode(clamp(values), scene.settings.encoding))
 
 
 def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
@@ -164,8 +219,29 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
     return torch.stack([read_image(files[index], size) for index in progress(chosen, "reading backgrounds")])
 
 
-def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
-    """The lights (E, 49, 3), a fraction of them dimmed, plus a white directional light of irradiance 1.
+def _rotations(most: float, count: int, draws: torch.Generator) -> np.ndarray:
+    """(count, 3, 3) by an angle up to `most` about a random axis."""
+    axes = torch.randn(count, 3, 1, generator=draws, dtype=torch.float64)
+    angles = most * torch.rand(count, 1, 1, generator=draws, dtype=torch.float64)
+    turned = torch.linalg.cross((angles * axes / axes.norm(dim=1, keepdim=True)).mT, torch.eye(3).double()[None])
+    return torch.linalg.matrix_exp(turned.mT).numpy()
+
+
+def _above_table(camera: Camera) -> Camera:
+    """The camera mirrored to above a table."""
+    elevation = abs(math.asin(math.cos(camera.polar)))
+    return replace(camera, polar=math.pi / 2 - min(max(elevation, ELEVATION[0]), ELEVATION[1]))
+
+
+def _in_perspective(camera: Camera, fov: float) -> Camera:
+    shared = {item.name: getattr(camera, item.name) for item in fields(Camera)}
+    return PerspectiveCamera(**shared, distance=camera.width / 2 / math.tan(fov / 2))
+
+
+def _with_lamps(
+    sky: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator, on_table: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The lights (E, 49, 3), a fraction of them dimmed, and the directions (E, 3) of white light beside those, or zero.
 
     An object on a table has no light from below: a direction that is drawn there is mirrored.
     """
@@ -176,23 +252,39 @@ def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSetti
     angles = _offsets(DIRECTIONAL_ANGLE, len(scene), draws)
     cameras = [_turned(row.cameras[0], *turn) for row, turn in zip(scene.examples, angles, strict=True)]
     towards = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
-    on_table = torch.tensor([scene.objects[row.object].ground is not None for row in scene.examples])
+    on_table = on_table | torch.tensor([scene.objects[row.object].ground is not None for row in scene.examples])
     towards[on_table, 2] = towards[on_table, 2].abs()
-    lit = directional(towards, torch.ones(3)).to(lights) + fill.to(lights) * lights
-    return torch.where(chosen.to(lights.device), lit, lights)
+    return torch.where(chosen.to(sky.device), fill.to(sky) * sky, sky), towards * chosen[:, 0]
 
 
-def _with_lit_walls(scene: Scene) -> Scene:
-    """Each row before its own background, times the irradiance of a surface that faces the row's first camera."""
+def _with_directional(sky: Tensor, lamps: Tensor) -> Tensor:
+    """The lights (E, 49, 3) and those of irradiance 1 from directions (E, 3), where these are not zero."""
+    lit = lamps.any(1)
+    if not lit.any():
+        return sky
+    return torch.where(lit[:, None, None].to(sky.device), directional(lamps, torch.ones(3)).to(sky) + sky, sky)
+
+
+def _facing(scene: Scene) -> Tensor:
+    """(E, 3, 1, 1) irradiance of a surface that faces the row's first camera, in the backgrounds' type."""
     towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
     coefficients = scene.lights.cpu().double()[:, HARMONICS.nonzero]
     irradiance = torch.einsum("ek,ekc->ec", HARMONICS.irradiance(towards), coefficients) * exposures
-    images = scene.backgrounds[[row.background for row in scene.examples]]
-    encoding = scene.settings.encoding
-    lit = encode(clamp(decode(images, encoding) * irradiance.to(images)[:, :, None, None]), encoding)
-    rows = [replace(row, background=index) for index, row in enumerate(scene.examples)]
-    return replace(scene, examples=rows, backgrounds=lit)
+    return irradiance.to(scene.backgrounds)[:, :, None, None]
+
+
+def _in_rooms(scene: Scene, sky: Tensor, lamps: Tensor, walls: Sequence[float], on_table: Tensor) -> Tensor:
+    """(N, 3, size, size) irradiance of table and wall in the N examples on tables."""
+    rows, lights, images = torch.nonzero(on_table).squeeze(1).tolist(), sky.cpu().double(), []
+    counted = progress(rows, "tables")
+    for number, group in groupby(counted, lambda row: scene.examples[row].object):
+        item, rays = scene.objects[number], Rays(scene.objects[number].mesh)
+        for row in group:
+            camera, exposure = scene.examples[row].cameras[0], scene.examples[row].exposure
+            seen = item.radius, item.lowest, walls[row], camera, scene.settings, lights[row], lamps[row]
+            images.append(exposure * room.irradiance(rays, *seen))
+    return torch.stack(images) if images else torch.zeros(0, 3, scene.settings.size, scene.settings.size)
 
 
 def draw_camera_effects(

@@ -105,6 +105,12 @@ class Mesh:
         """Whether the corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
+    def moved(self, vertices: np.ndarray) -> Mesh:
+        """The mesh with vertices (V, 3) in place of its own, and its packed textures."""
+        mesh = replace(self, vertices=vertices)
+        mesh.__dict__["packed_textures"] = self.packed_textures  # which take long to pack
+        return mesh
+
     @cached_property
     def packed_textures(self) -> tuple[np.ndarray, ...]:
         """Textures (H, W) int32, red, green and blue in the bits from 0, 8 and 16: one number is looked up faster."""

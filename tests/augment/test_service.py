@@ -131,10 +131,6 @@ def test_a_folders_images_are_all_shown_before_any_is_shown_again_and_the_round_
     assert torch.equal(passes.sort(1).values, torch.arange(7).expand_as(passes)) and len(passes.unique(dim=0)) > 1
     assert torch.equal(torch.cat([made.labels for made in rounds]), drawn % 3)
     assert rounds[4].diagnostics["attack_success"] == pytest.approx(float((rounds[4].labels > 0).float().mean()))
-    again = AugmentationService(settings, None, labels, 5, Phases(), images=images).regenerate(model, 4)
-    assert torch.equal(again.images, rounds[4].images)
-    with pytest.raises(InputError, match="images is None"):
-        AugmentationService(settings, None, labels, 5, Phases())
 
 
 def test_random_light_has_its_norm_and_diagnostics_of_its_images(serve, model):

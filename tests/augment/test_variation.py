@@ -9,15 +9,18 @@ import trimesh
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import augment
-from augment.build import load_background
+from augment.build import LampsSettings, load_background
+from augment.objects import ObjectSettings, PropSettings
 from augment.scene import Conditions, Scene
 from augment.utils import generator
 from augment.variation import VariationSettings, draw_camera_effects, draw_patterns, vary
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode
+from renderer.light.basis import HARMONICS
 from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh
 
@@ -73,6 +76,61 @@ def test_in_perspective_the_lens_varies_and_the_distance_stays():
     assert {camera.distance for camera in cameras} == {before} and len({camera.angle for camera in cameras}) == 6
     assert 0.3 < np.abs(origins).max() <= 0.6
     assert len(torch.unique(images(rows), dim=0)) == 6
+
+
+def test_views_in_perspective_have_the_lens_drawn_and_the_width_of_their_own():
+    """Half the angle is that of a point in the plane of the mesh, at the image's edge."""
+    cameras = [view for (view,) in drawn(built("solid:orange", views=8), fov=[15.0, 35.0], scale=[0.5, 1.0]).cameras]
+    lenses = [math.degrees(2 * math.atan(camera.width / 2 / camera.distance)) for camera in cameras]
+    assert 15 <= min(lenses) < 22 and 28 < max(lenses) <= 35 and all(2 <= camera.width <= 4 for camera in cameras)
+    edge = np.array([camera.project(camera.width / 2 * camera.axes()[:1])[0, 0] for camera in cameras])
+    np.testing.assert_allclose(edge, 1, rtol=1e-12)
+
+
+def test_each_view_of_an_object_is_turned_about_an_axis_of_its_own_and_its_props_stay():
+    """The least-squares rotation between the vertices (Kabsch) is exact, and by at most the angle."""
+    prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0])
+    scene = augment.build_scene([ObjectSettings("solid:pear:1", "pear", props=[prop])], 8, 6, rasterizer="numpy")
+    before, angles = scene.objects[0], []
+    rows = drawn(scene, rotation=40.0)
+    for item in (rows.objects[row.object] for row in rows.examples):
+        own, turned = before.mesh.faces[: before.own], item.mesh.faces[: item.own]
+        pairs = item.mesh.vertices[turned].reshape(-1, 3), before.mesh.vertices[own].reshape(-1, 3)
+        rotation, distance = Rotation.align_vectors(*pairs)
+        assert distance < 1e-4 and np.array_equal(item.mesh.corner_colors, before.mesh.corner_colors)
+        angles.append(math.degrees(rotation.magnitude()))
+        rest = item.mesh.vertices[item.mesh.faces[item.own :]]
+        assert rest.min((0, 1))[2] == pytest.approx(item.lowest) == pytest.approx(pairs[0][:, 2].min())
+    assert len(rows.objects) == 6 and len(set(angles)) == 6 and 20 < max(angles) <= 40
+
+
+def test_on_a_table_views_come_from_above_and_darken_the_table_under_the_object_alone():
+    """White plates before white in an even sky; the plate hardly blocks any of it from the image's corner."""
+    even = {"backgrounds": [1.0], "light": ambient(torch.full((3,), 0.2)), "width": 6.0}
+    scene = built("solid:plate", views=12, **even)
+    rows = drawn(scene, tables=0.5, azimuth=90.0)
+    polar = torch.tensor([camera.polar for (camera,) in rows.cameras])
+    corners = rows.backgrounds[[row.background for row in rows.examples]]
+    on_table = corners.flatten(2).amin((1, 2)) < 0.9 * corners.flatten(2).amax((1, 2))
+    assert 0 < on_table.sum() < 12 and torch.equal(rows.backgrounds[~on_table].unique(), torch.tensor([1.0]))
+    assert (polar[on_table] >= math.radians(15)).all() and (polar[on_table] <= math.radians(75)).all()
+    assert (corners[on_table][..., 0, 0] - 0.2 * math.pi).abs().max() < 0.06
+    from_below = HARMONICS.irradiance(torch.tensor([[0.0, 0.0, -1.0]])) @ rows.lights[on_table][:, HARMONICS.nonzero]
+    assert (from_below - 0.2 * math.pi).abs().max() < 0.01  # what a white table reflects
+
+
+def test_backgrounds_take_colors_up_to_the_saturation():
+    white = built("solid:plate", views=60, backgrounds=[1.0], encoding="srgb")
+    for most in (0.3, 1.0):
+        colors = drawn(white, background_saturation=most).backgrounds
+        saturation = 1 - colors[:, :, 0, 0].amin(1)
+        assert torch.allclose(colors.amax(1), torch.ones(())) and 0.8 * most < saturation.max() <= most + 1e-6
+
+
+@pytest.mark.parametrize("options", [{"ground": [0, 0, 0]}, {"lamps": LampsSettings()}, {"views": 2, "shared": True}])
+def test_tables_are_refused_where_they_would_be_wrong(options):
+    with pytest.raises(InputError, match=r"^tables are for"):
+        drawn(built("solid:plate", **options), tables=0.5)
 
 
 def test_an_exposure_multiplies_the_light_and_keeps_the_cameras(scene):

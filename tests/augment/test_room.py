@@ -1,0 +1,70 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import renderer
+from augment import room
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.image import ImageSettings
+from renderer.light.basis import HARMONICS
+from renderer.light.local import Lamps
+from renderer.light.presets import ambient, probe
+from renderer.mesh import Mesh, concatenate, normalize
+from renderer.transport.rays import Rays
+
+SIZE, FAR = 32, 1000.0
+BALL = normalize(renderer.solid("ball"))
+CAMERAS = PerspectiveCamera(1.1, 0.4, 3.0, 0.1, -0.2, distance=7.0), OrthographicCamera(1.1, 0.4, 3.0, 0.1, -0.2)
+LAMP = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
+SKY, NONE = probe("grace").double() / 5, torch.zeros(3).double()
+
+
+def square(middle: list[float], first: list[float], second: list[float]) -> Mesh:
+    corners = [
+        np.add(middle, 6 * (a * np.array(first) + b * np.array(second)))
+        for a, b in [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    ]
+    return Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
+@pytest.mark.parametrize("surface", ["table", "wall"])
+def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
+    """By a sky, and by a lamp so far away that its light is parallel; pixels with the ball are left out."""
+    towards = [math.cos(camera.azimuth), math.sin(camera.azimuth), 0.0]
+    aside = [-towards[1], towards[0], 0.0]
+    if surface == "table":
+        height, wall, mesh = -1.0, 50.0, square([0, 0, -1], [1, 0, 0], [0, 1, 0])
+    else:
+        height, wall, mesh = -50.0, 1.5, square([-1.5 * x for x in towards], aside, [0, 0, 1])
+    options = {"size": SIZE, "samples": 3, "normals": "flat", "shadows": True, "background": 0.0, "rasterizer": "numpy"}
+    even, camera = ambient(torch.full((3,), 0.2)), camera.seeing(9.0)
+    ball, flat = (renderer.render(part, camera, even, **options)[0, 0] for part in (BALL, mesh))
+    compared = (ball == 0) & (flat > 0.999 * flat.max())
+    lamp = [(Lamps((tuple((FAR * LAMP).tolist()),), 1e5), torch.full((1, 3), 0.1 * FAR**2).double())]
+    both, image = concatenate([BALL, mesh]), ImageSettings(SIZE, samples=3)
+    for light, lights, ours in [(SKY, [], (SKY, NONE)), (None, lamp, (0 * SKY, LAMP))]:
+        there = renderer.render(both, camera, light, lights=lights, **options)[0].double()
+        seen = room.irradiance(Rays(BALL), 1.8, height, wall, camera, image, *ours) * (0.1 if lights else 1)
+        seen, expected = seen[:, compared], there[:, compared]
+        most, errors = expected.max(), (seen - expected).abs()
+        assert most < 1 and expected.min() < 0.6 * most  # a shadow is in sight
+        mean, typical = (0.01, 0.02) if lights else (0.02, 0.07)  # an edge; 48 directions, at every second pixel
+        assert errors.mean() < mean * most and errors.quantile(0.98) < typical * most
+
+
+def test_an_even_sky_stays_even_on_a_white_table_and_loses_its_lower_half_on_a_black_one():
+    """White reflects what it gets. In closed form, a surface tilted by an angle gets (1 + cos) / 2 of the sky."""
+    light, tilts = ambient(torch.ones(3)).double(), torch.tensor([0.0, 0.5, 1.5, 2.5, 3.1]).double()
+    normals = torch.stack([tilts.sin(), 0 * tilts, tilts.cos()], dim=1)
+    white, black = room.above_table(
+        light.expand(2, -1, -1), torch.zeros(2, 3), torch.tensor([1.0, 0.0])[:, None].expand(2, 3)
+    )
+    for lights, expected in [(white, 0 * tilts + math.pi), (black, math.pi * (1 + tilts.cos()) / 2)]:
+        arriving = HARMONICS.irradiance(normals) @ lights[HARMONICS.nonzero]
+        torch.testing.assert_close(arriving, expected[:, None].expand(-1, 3), rtol=0, atol=0.03)
+    lit = room.above_table(0 * light[None], torch.tensor([[0.6, 0.0, 0.8]]), torch.full((1, 3), 0.5))[0]
+    down = HARMONICS.irradiance(torch.tensor([[0.0, 0.0, -1.0]]).double()) @ lit[HARMONICS.nonzero]
+    torch.testing.assert_close(down, torch.full((1, 3), 0.5 * 0.8).double(), rtol=0, atol=0.01)
