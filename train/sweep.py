@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
@@ -28,29 +28,24 @@ from train.run import load_data, prepare
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, quoted, read_settings
 
-LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
+LONGEST_PART, LONGEST_NAME = 48, 200  # characters in a folder's name; file systems take 255
 HYDRAS_OWN = re.compile(r"\+*hydra[./]")  # overrides that do not concern the run
 
 
-def run_name(overrides: Sequence[str]) -> str:
-    """The name of a run's folder, in alphabetical order: `augment-none+seed-0` for seed=0 augment=none.
+def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str = "") -> str:
+    """The name of a run's folder: `augment-none+seed-0@7d0a3f52` for seed=0 augment=none, in alphabetical order, and a
+    hash of its overrides, but of those that only say where and how it runs.
 
-    Overrides that only say where and how it runs are left out. Long texts are cut, and characters that a file system or
-    Hydra's command line might refuse are replaced; both then end in @ and a hash of the original, so that different
-    runs have different names, also where capitals do not count.
+    fixed: keys that all runs of the sweep share, which are not shown. parent: the sweep's folder, where a run keeps the
+    name that it has. Characters that a file system or Hydra's command line might refuse are replaced.
     """
-    pairs = sorted(override.partition("=")[::2] for override in overrides)
-    name = "+".join(f"{_safe(key)}-{_safe(value)}" for key, value in pairs if key not in CIRCUMSTANCES) or "defaults"
-    return name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + _hash(name)
-
-
-def _safe(text: str) -> str:
-    safe = re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII)
-    return text if text == safe.lower() and len(text) <= LONGEST_VALUE else safe[-LONGEST_VALUE:] + _hash(text)
-
-
-def _hash(text: str) -> str:
-    return f"@{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    own = (override.partition("=")[::2] for override in overrides if not HYDRAS_OWN.match(override))
+    pairs = sorted((key, value) for key, value in own if key not in CIRCUMSTANCES)
+    ending = f"@{hashlib.sha256(repr(pairs).encode(errors='surrogatepass')).hexdigest()[:8]}"
+    if parent and (known := next(Path(parent).glob(f"*{ending}"), None)):
+        return known.name
+    texts = (re.sub(r"[^\w.-]+", "_", f"{key}-{value}", flags=re.ASCII) for key, value in pairs if key not in fixed)
+    return ("+".join(text[:LONGEST_PART] for text in texts) or "run")[:LONGEST_NAME] + ending
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # Hydra hands it to the launchers' processes
@@ -63,7 +58,8 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     """
     runs = _runs(overrides)
     parent = writable_folder(str(compose("train", runs[0]).sweep), "sweep")
-    folders = [parent / run_name([text for text in words if not HYDRAS_OWN.match(text)]) for words in runs]
+    fixed = [text.partition("=")[0] for text in set.intersection(*map(set, runs))]
+    folders = [parent / run_name(words, fixed, str(parent)) for words in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has a run twice: give each value once")
     for folder, words in zip(folders, runs, strict=True):
@@ -71,6 +67,7 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
             settings = read_settings(ExperimentSettings, compose("train", words))
             require_same_run(folder, settings, finished=True)
     handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that launchers end theirs
+    sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, fixed))}]")
     try:
         start()
     finally:
