@@ -26,7 +26,7 @@ from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
 
-ARMS = ("none", "random", "adversarial", "folder")
+ARMS = {"none": "no renders", "random": "randomized renders", "adversarial": "attacked renders", "folder": "images"}
 INITS = ("scene", "random")
 MOST_EXAMPLES = 10**6
 MOST_EVERY = 10**9

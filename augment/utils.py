@@ -97,11 +97,11 @@ def _free(device: torch.device) -> int | None:
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
     """The items; after 2 seconds, with a bar on a terminal, or else a line, which comes again with the number of items
-    that are done, each time after twice as long, up to 30 seconds; by the first process.
+    that are done and the time that is left, each time after twice as long, up to 30 seconds; by the first process.
 
     total: their number, where they have no length. done: how many came before.
     """
-    terminal, first = sys.stderr.isatty(), rank() == 0
+    terminal, first, before, start = sys.stderr.isatty(), rank() == 0, done, time.perf_counter()
     bar = tqdm(items, description, total, leave=False, delay=PATIENCE, disable=not (terminal and first), initial=done)
     ended, wait = Event(), PATIENCE
 
@@ -113,6 +113,9 @@ def progress(items: Iterable[Item], description: str, total: int | None = None, 
                 bar.refresh()
                 return
             counted = f": {done} of {bar.total}" if done and bar.total else ""
+            if bar.total and done > before:
+                left = (time.perf_counter() - start) / (done - before) * (bar.total - done)
+                counted += f", about {tqdm.format_interval(left)} left"
             print(f"{description}{counted} ...", file=sys.stderr, flush=True)
             wait = min(2 * wait, 30.0)
 

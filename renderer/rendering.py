@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
 _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `orbit_cameras`
 _choose = cache(choose)  # "opengl" checks the driver, which takes longer than an image
+_white_ball = cache(lambda: Mesh.plain(*sphere(5)))
 
 
 def render(
@@ -175,7 +176,7 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     local = [(part, values) for part, values in parts if isinstance(part, LocalBasis)]
     sky = next((values / math.pi for part, values in parts if isinstance(part, Harmonics)), None)
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
-    return render(Mesh.plain(*sphere(5)), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
+    return render(_white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:

@@ -19,9 +19,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from augment import utils
+from augment.service import ARMS
 from renderer.errors import InputError
-from train import console
-from train.command_help import format_help
+from train import checkpoint, console
 from train.errors import writable_folder
 from train.processes import Interrupted, broadcast, process_group
 from train.report.compare import format_table
@@ -50,9 +50,7 @@ def start() -> None:
         overrides = [argument for argument in arguments if argument not in flags]
         if flags and "TORCHELASTIC_RUN_ID" in os.environ:
             raise InputError("torchrun trains one run in several processes: start a sweep with pnb-train --multirun")
-        if flags & cli.HELP:
-            print(format_help("train", str(__doc__), ExperimentSettings, compose("train", overrides)))
-        elif flags & SWEEP_FLAGS:
+        if flags & SWEEP_FLAGS:
             sweep(main, overrides)
         elif flags:
             main()
@@ -90,20 +88,22 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             require_same_run(path, arm_settings)  # before anything is written
     if first:
         log_to(writable_folder(run, "run") / LOG)
-    data = load_data(settings)
-    with sole_writer("run", *arms) if first else nullcontext():
-        runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake
-        for path, train_and_score in runs.items():
-            console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
-            try:
+    try:
+        with sole_writer("run", *arms) if first else nullcontext():
+            data = load_data(settings)
+            runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake
+            for path, train_and_score in runs.items():
+                arm = arms[path].augment.arm
+                console.info("\n== augment=%s: %s%s", arm, ARMS[arm], "" if path == folder else ", for comparison")
                 train_and_score()
-            except Interrupted as stop:
-                again = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
-                console.info("ended by %s; to go on: %s", stop.signal, shlex.join(again))
-                raise
-        if first:
-            console.info("\n%s", format_table([summarize(path) for path in arms]))
-            console.info("%s", report_of([folder], folder))
+            if first:
+                console.info("\n%s", format_table([summarize(path) for path in arms]))
+                console.info("%s", report_of([folder], folder))
+    except (Interrupted, KeyboardInterrupt) as stop:
+        again = shlex.join([*program("train", as_called=True), f"run={folder}", "train.resume=true"])
+        advice = f"to go on: {again}" if any(map(checkpoint.exists, arms)) else "no checkpoint yet: start again"
+        console.info("%s%s", f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else "", advice)
+        raise
 
 
 def log_to(path: Path) -> None:

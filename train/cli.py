@@ -3,6 +3,7 @@
 Commands import this module before all others, which take seconds to import; no other module imports it.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -36,31 +37,30 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's b
     signal.signal(signal.SIGINT, _interrupt)
 
 
-def _complete() -> None:
-    """Let Hydra complete words for a shell, and end: the imports that follow take longer than anyone waits at a key."""
-    import conf
+def _answer_at_once() -> None:
+    """Print --help or complete words for a shell, and end: the imports that follow take longer than anyone waits."""
+    import hydra
 
-    name = Path(sys.argv[0]).stem.removeprefix(PREFIX)
-    if (Path(conf.__path__[0]) / f"{name}.yaml").exists():
-        import hydra
+    from train.command_help import CONF, format_help
 
+    name = Path(sys.argv[0]).stem.removeprefix(PREFIX).replace("__main__", "train")
+    if not HELP.isdisjoint(sys.argv):
+        with handled_errors():
+            print(format_help(name, sys.argv[1:]))
+        sys.exit()
+    if (CONF / f"{name}.yaml").exists():
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)(lambda config: None)()
         sys.exit()
 
-
-if sys.argv[1:2] in (["-sc"], ["--shell-completion"]):
-    _complete()
 
 _loaded = threading.Event()
 
 
 def _announce_imports() -> None:
-    while not _loaded.wait(5):
-        print("loading PyTorch and other libraries ...", file=sys.stderr, flush=True)
-
-
-if "torch" not in sys.modules:
-    threading.Thread(target=_announce_imports, daemon=True).start()
+    waited, wait = 0, 5
+    while not _loaded.wait(wait):
+        waited, wait = waited + wait, 2 * wait
+        print(f"loading PyTorch and other libraries: {waited} s ...", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -71,8 +71,8 @@ def handled_errors() -> Iterator[None]:
     status 141. Characters that the terminal lacks are printed as escapes.
     """
     global _started, _interrupted
-    from train.errors import one_sentence
-
+    if not _started:
+        gc.freeze()  # or Python looks for cycles among all that was imported, for seconds at its end
     _started, _interrupted = True, False
     if Path(sys.argv[0]).stem.startswith(PREFIX):  # in further processes, train is no train.py of the current folder
         os.environ["PYTHONSAFEPATH"] = "1"
@@ -90,6 +90,8 @@ def handled_errors() -> Iterator[None]:
         if _interrupted or isinstance(error, KeyboardInterrupt):
             print(INTERRUPTED, file=sys.stderr)
             sys.exit(128 + signal.SIGINT)
+        from train.errors import one_sentence  # with PyTorch, which --help does without
+
         sentence = one_sentence(error)
         if sentence is None:
             raise
@@ -111,22 +113,23 @@ def command(as_overrides: Callable[[list[str]], list[str]] = list) -> Callable[.
                 from hydra.core.config_store import ConfigStore
 
                 from renderer.errors import InputError
-                from train.command_help import CONF, format_help
+                from train.command_help import CONF
                 from train.settings import compose, read_settings
 
                 name, settings = Path(main.__globals__["__file__"]).stem, main.__annotations__["settings"]
                 if not (CONF / f"{name}.yaml").exists():
                     ConfigStore.instance().store(name, settings)
                 arguments = as_overrides(sys.argv[1:])
-                flags = {argument for argument in arguments if argument.startswith("-")}
-                if unknown := sorted(flags - HELP):
-                    raise InputError(f"{unknown[0]} is not an option: give settings as key=value; --help shows them")
-                config = compose(name, [argument for argument in arguments if argument not in flags])
-                if flags:
-                    print(format_help(name, main.__globals__["__doc__"], settings, config))
-                else:
-                    main(read_settings(settings, config))
+                if unknown := next((argument for argument in arguments if argument.startswith("-")), None):
+                    raise InputError(f"{unknown} is not an option: give settings as key=value; --help shows them")
+                main(read_settings(settings, compose(name, arguments)))
 
         return start
 
     return decorate
+
+
+if not ({*HELP, "-sc", "--shell-completion"}).isdisjoint(sys.argv):
+    _answer_at_once()
+if "torch" not in sys.modules:
+    threading.Thread(target=_announce_imports, daemon=True).start()

@@ -1,45 +1,55 @@
-"""--help of a command: its choices and settings, with their comments in conf/ or beside the dataclass's fields."""
+"""--help of a command, read as text, since its modules take seconds to import: choices, settings and their comments."""
 
-import inspect
+import ast
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+import hydra
+from hydra import initialize_config_module
+from omegaconf import OmegaConf
 
 import conf
 
 CONF = Path(conf.__path__[0])
-LINE = re.compile(r"( *)(\w+):(?: .*?)?(?: +# (.*))?$")  # of YAML, or a dataclass's field: its key and comment
+FIELD = re.compile(r"^    (\w+): [^=\n]+ = (?:field\(default_factory=(?:lambda: )?(.+?)\)|(.+?))(?:  # (.*))?$", re.M)
+LINE = re.compile(r"( *)(\w+):(?: .*?)?(?: +# (.*))?$")  # of YAML: its key and comment
 GROUPS = {  # by command: folders of conf/ whose files are choices, some for a key of another name
     "train": ("experiment", "data", "augment", "launcher", "attack@augment.attack"),
     "attack": ("attack",),
 }
 
 
-def format_help(name: str, about: str, settings: type, config: DictConfig) -> str:
-    """The text of a command, from its docstring, the dataclass of its settings, and its composed configuration."""
+def format_help(name: str, arguments: Sequence[str]) -> str:
+    """The text of a command, under the choices among its arguments."""
     file, groups = CONF / f"{name}.yaml", GROUPS.get(name, ())
-    parts, comments = [about.strip(), ""], dict(_comments(inspect.getsource(settings)))
-    packages = {key.partition("@")[0]: key.rpartition("@")[2] for key in groups}
-    if file.exists():
-        parts += [f"The defaults are in {file}", ""]
-        for path in sorted(CONF.glob("*/*.yaml")):
-            group = path.parent.name
-            if group not in ("experiment", "launcher"):
-                comments |= _comments(path.read_text(encoding="utf-8"), f"{packages.get(group, group)}.")
-        comments |= _comments(file.read_text(encoding="utf-8"))
+    own = "train/__main__.py" if name == "train" else f"*scripts/{name}.py"  # in pnb_scripts/, once installed
+    code = min(CONF.parent.glob(own)).read_text(encoding="utf-8")
+    parts = [str(ast.get_docstring(ast.parse(code))), ""]
+    if not file.exists():
+        code += (CONF.parent / "train/lab/shots.py").read_text(encoding="utf-8") if name == "lab" else ""
+        schema = code.partition("Settings:\n")[2].partition("\n    def ")[0].replace("= MISSING", "= ???")
+        return "\n".join([*parts, "Settings:", *(_aligned(f"{k}={a or b}", c) for k, a, b, c in FIELD.findall(schema))])
+    packages, comments = {key.partition("@")[0]: key.rpartition("@")[2] for key in groups}, dict[str, str]()
+    parts += [f"The defaults are in {file}", ""]
+    for path in sorted(CONF.glob("*/*.yaml")):
+        group = path.parent.name
+        if group not in ("experiment", "launcher"):
+            comments |= _comments(path.read_text(encoding="utf-8"), f"{packages.get(group, group)}.")
+    comments |= _comments(file.read_text(encoding="utf-8"))
     for key, group in zip(groups, packages, strict=True):
         choices = [path for path in sorted((CONF / group).glob("*.yaml")) if path.stem != "default"]
         parts += [_aligned(f"{key}={path.stem}", _summary(path)) for path in choices]
+    with initialize_config_module("conf", version_base="1.3"):
+        config = hydra.compose(name, [text for text in arguments if text.split("=")[0] in groups and "+" not in text])
     plain: Any = OmegaConf.to_container(config)
-    return "\n".join([*parts, "" if groups else "Settings:", *_settings(plain, comments)])
+    return "\n".join([*parts, "", *_settings(plain, comments)])
 
 
 def _comments(text: str, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """The comments that end lines of YAML, or of a dataclass, by dotted key."""
+    """The comments that end lines of YAML, by dotted key."""
     outer: list[tuple[int, str]] = []
     for indent, key, comment in (match.groups() for match in map(LINE.match, text.splitlines()) if match):
         outer = [*((depth, name) for depth, name in outer if depth < len(indent)), (len(indent), key)]

@@ -1,6 +1,7 @@
 """Labeled images as uint8 arrays: CIFAR-100, an .npz file, or a folder of class folders."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from augment.classifiers.adapter import class_index
 from augment.utils import generator, progress
 from renderer.errors import InputError, in_one_line
 from train import console
+from train.checkpoint import content_hash
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
@@ -25,6 +27,8 @@ class Split:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    content_hash = cached_property(lambda self: content_hash([self.images, self.labels]))
 
     def to(self, device: torch.device) -> "Split":
         return Split(self.images.to(device), self.labels.to(device))

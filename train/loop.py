@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim.swa_utils import AveragedModel, get_swa_avg_fn
+from tqdm import tqdm
 
 from augment import utils
 from augment.service import AugmentationService, Renders
@@ -149,7 +150,8 @@ class Trainer:
                     norm.eval()
                 first = state.step - sum(steps[:index])
                 batches = training_batches(images, settings.batch_size, self.seed, rounds[index], settings.flips, first)
-                for batch in progress(batches, f"epoch {self.epoch + 1}", total, state.step):
+                name = f"epoch {self.epoch + 1}" + f", round {index + 1} of {len(rounds)}" * (len(rounds) > 1)
+                for batch in progress(batches, name, steps[index], first):
                     state.sums += self._step(*batch, state.step / total, self.epoch * total + state.step)
                     state.step += 1
                     if interruption.requested():
@@ -213,12 +215,15 @@ class Trainer:
         self.history.append({"epoch": self.epoch, **metrics})
         if log:
             log.scalars(metrics, self.epoch)
+        total = sum(seconds[name] for name in PHASES)
+        left = total * (self.settings.epochs - self.epoch)
         success, correct = attack_success(diagnostics), 1 - diagnostics.get("attack_success_before", 1)
         console.info(
             f"epoch {self.epoch}/{self.settings.epochs}  train loss {trained['loss']:.3f} accuracy "
             f"{trained['accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
             f"{'' if success is None else f'  attack success {success:.2f} of the {correct:.0%} clean-correct'}"
-            f"  {sum(seconds[name] for name in PHASES):.0f} s (renders {seconds['attack']:.1f} s)"
+            f"  {total:.0f} s (renders {seconds['attack']:.1f} s)"
+            f"{f'; about {tqdm.format_interval(left)} left' if left else ''}"
         )
 
     def _require_finite(self, loss: float, epoch: int) -> None:

@@ -68,7 +68,7 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
         hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
-        write_config(folder, settings, hardware=hardware, command=command)
+        write_config(folder, settings, hardware=hardware, command=command, test_images=_test_images(settings, data))
 
     def train_and_score() -> dict[str, float]:
         torch.set_num_threads(threads)  # of this run, after others were prepared
@@ -115,11 +115,14 @@ def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple
     the smallest along its ancestors, since parts of one seed are nested, or None where `base` does not know its own."""
     asked, init_from = settings.data.validation, settings.train.init_from
     fraction = VALIDATION if asked is None else asked
-    own = {"fraction": fraction, "seed": 0, "images": checkpoint.content_hash([split.images, split.labels])}
+    rendered = {"data": "shapes"} if settings.data.name == "shapes" else {}
+    own = {"fraction": fraction, "seed": 0, "images": split.content_hash, **rendered}
     if base is None:
         return fraction, own
     stored = base[1]["architecture"].get("validation")
     known = stored.get("fraction") if isinstance(stored, dict) else None
+    if rendered and known is not None and "data" not in stored:  # it learned from other images than rendered ones
+        return fraction, own
     if not isinstance(known, float) or own | {"fraction": known} != stored:
         console.info("validation: %s does not say whether it learned from these images, too", init_from)
         return fraction, None
@@ -187,6 +190,13 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[torch.Ten
     return images, labels
 
 
+def _test_images(settings: ExperimentSettings, data: DataSet) -> str:
+    """What the test accuracy is of, in words."""
+    kind = "rendered solids" if settings.data.name == "shapes" else f"the test images of {settings.data.name}"
+    others = len(data.classes) - len(data.train.labels.unique())  # the test's labels are looked at once, later
+    return f"{kind}, not of the network's {others} other classes" if others else kind
+
+
 def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
     """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs.
 
@@ -208,7 +218,7 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
 
     logits = compute_logits(predict, data.test.images, len(data.classes), device)
     accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
-    console.info("before: %s has test accuracy %.4f", settings.train.init_from, accuracy)
+    console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, _test_images(settings, data))
     _score_photographs(settings, predict, data, trainer.folder / BEFORE, device)
     return {"test/accuracy_before": accuracy}
 

@@ -1,6 +1,7 @@
 import io
 import itertools
 import logging
+import re
 import sys
 import time
 from dataclasses import fields
@@ -50,6 +51,15 @@ def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(monk
         assert lines[:1] == (["attack ..."] if seconds else []) and len(lines) < 5  # at 0.1, 0.3, 0.7 seconds ...
     else:
         assert sys.stderr.getvalue().rpartition("\r")[2].strip() == ""
+
+
+def test_lines_of_progress_say_how_much_time_is_left(monkeypatch):
+    monkeypatch.setattr(utils, "PATIENCE", 0.4)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    for _ in progress([1, 2, 3], "attack", 1000, 10):
+        time.sleep(0.3)
+    (minutes, seconds), *_ = re.findall(r"11 of 1000\D* (\d+):(\d+) left", sys.stderr.getvalue())
+    assert 0.3 * 989 <= 60 * int(minutes) + int(seconds) < 0.6 * 989
 
 
 class Small(nn.Module):

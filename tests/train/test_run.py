@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -15,9 +16,9 @@ from PIL import Image
 
 from augment.losses import complementary_label
 from renderer.errors import InputError
-from train import batches, checkpoint, loop
+from train import batches, checkpoint, loop, run
 from train.errors import one_sentence
-from train.networks import load_run
+from train.networks import load_run, load_selected
 from train.processes import Interrupted
 from train.report.summary import summarize
 from train.run import load_data, prepare
@@ -349,6 +350,23 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
         assert f"{60 - images} images, 3 classes" in caplog.text
         assert sum(line.startswith("validation: ") for line in caplog.messages) == warned
     assert load_run(unknown).classes == ("apple", "orange", "pear")
+
+
+def test_rendered_solids_are_new_to_a_network_of_other_images_alone(tiny, finished):
+    settings, base, split = tiny(f"train.init_from={finished}"), load_selected(finished), load_data(tiny()).train
+    settings.data.name = "shapes"
+    _, own = run._validation(settings, split, base)
+    base[1]["architecture"]["validation"] = own
+    assert (
+        own
+        and run._validation(settings, split, base)[1] == own
+        and run._validation(settings, split[:9], base)[1] is None
+    )
+
+
+def test_the_test_accuracy_says_how_many_classes_it_leaves_out(tiny):
+    data = load_data(tiny())
+    assert " 2 " in run._test_images(tiny(), replace(data, classes=(*data.classes, "worm", "tulip")))
 
 
 def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, photos, tmp_path):

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from augment.service import ARMS
 from augment.utils import progress
 from renderer.errors import InputError
 from train.photographs import metrics
-from train.photographs.metrics import METRICS, Pool, find_metric, metric_title
+from train.photographs.metrics import METRICS, OVERALL, Pool, find_metric, metric_title
 from train.photographs.predictions import PREDICTIONS, read_predictions
 from train.report.summary import INITIAL, RunSummary, Scored, arms_of, by_images, run_tables, seconds_table
 from train.settings import PHOTOGRAPHS
@@ -103,13 +104,13 @@ def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> boo
 
 
 def difference_tables(arms: Evaluations, pooled: str = "all", by: str = "source") -> list[Table]:
-    """The differences by source or mesh and metric of each of `pairs_of`. pooled: OVERALL's name."""
+    """The differences by source or mesh ("": of all alone) and metric of each of `pairs_of`. pooled: OVERALL's name."""
     tables = []
     for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]
-            for source in reference[0].pools
+            for source in (reference[0].pools if by else [OVERALL])
         ]
         paired = ", paired" if _paired(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
@@ -119,7 +120,7 @@ def difference_tables(arms: Evaluations, pooled: str = "all", by: str = "source"
 
 def overall_differences(arms: Evaluations) -> Table:
     """The rows for all images of `difference_tables`."""
-    rows = [[table.title, *table.rows[0][1:]] for table in difference_tables(arms)]
+    rows = [[table.title, *table.rows[0][1:]] for table in difference_tables(arms, by="")]
     return Table("differences on the same images", ["networks", *TITLES], rows)
 
 
@@ -129,7 +130,8 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     groups = by_images(arms)
     tables = run_tables(arms, groups) + [overall_differences(read_evaluations(group)) for group in groups.values()]
     sheets = [f"image: {run.folder / name / 'contact_sheet.png'}" for run in runs for name in run.photographs]
-    return "\n\n".join(filter(None, [*(str(table.known) for table in tables if table.rows), "\n".join(sheets)]))
+    legend = "; ".join(f"{arm}: {renders}" for arm, renders in ARMS.items() if arm in {run.arm for run in runs})
+    return "\n\n".join(filter(None, [*(str(table.known) for table in tables if table.rows), legend, "\n".join(sheets)]))
 
 
 def format_comparison(

@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from PIL import Image
 
+from augment.service import ARMS
 from augment.utils import announced
 from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
@@ -63,6 +64,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         date=f"{datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "",
         lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
+        captions=ARMS,
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
         curves=_curves(epochs),
         seconds=summary.seconds_table(drawn),
@@ -155,8 +157,8 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     for arm, group in arms.items():
         if bases := [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]:
             after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
-            data = OmegaConf.select(group[0].config, "data.name")
-            sentences.append(f"{arm}: accuracy on the test images of {data} went from {before:.1%} to {after:.1%}.")
+            images = group[0].config.get("test_images", "the test images")
+            sentences.append(f"{arm}: accuracy went from {before:.1%} to {after:.1%}, on {images}.")
     return sentences
 
 

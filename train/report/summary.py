@@ -170,7 +170,9 @@ def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
         for arm, runs in arms.items()
         if runs[0].accuracy is not None
     }
-    tables = [_run_table("", ["test accuracy", "of the last epoch"], accuracies)]
+    tested = dict.fromkeys(run.config.get("test_images", "") for runs in arms.values() for run in runs)
+    title = " or ".join(f"accuracy on {images}" for images in tested if images)
+    tables = [_run_table(title, ["test accuracy", "of the last epoch"], accuracies)]
     tables += [score_table(title, group) for title, group in groups.items()]
     heads = {arm: runs[0] for arm, runs in arms.items() if runs[0].seed is not None}
     if varied := varied_settings([*heads.values()]):
@@ -279,7 +281,7 @@ def find(folders: Sequence[Path]) -> Findings:
                 unfinished.append((path, run_folder.state(path), epochs))
         except (InputError, OSError) as error:  # the latter of the lock in another user's folder
             unfinished.append((path, f"cannot be read: {error}", []))
-    runs.sort(key=lambda run: ARMS.index(run.arm) if run.arm in ARMS else -1)
+    runs.sort(key=lambda run: [*ARMS].index(run.arm) if run.arm in ARMS else -1)
     return runs, attacks, unfinished
 
 
