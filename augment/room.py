@@ -14,8 +14,8 @@ from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.image import ImageSettings
-from renderer.light.basis import HARMONICS
-from renderer.light.harmonics import per_degree
+from renderer.light.basis import HARMONICS, Harmonics
+from renderer.light.harmonics import bands, per_degree
 from renderer.transport.rays import Rays, sphere
 
 DIRECTIONS = 48  # of the sky, from a point
@@ -29,7 +29,7 @@ def _upper(degree: int) -> tuple[Tensor, Tensor]:
     """(size, size) what is above the horizon of a light's coefficients, and (size,) even light from below, radiance 1;
     projected onto the harmonics of the degree."""
     directions = sphere(NODES)
-    radiance = type(HARMONICS)(degree).radiance(directions)
+    radiance = Harmonics(degree).radiance(directions)
     above = radiance[directions[:, 2] > 0]
     whole, upper = radiance.sum(0), above.sum(0)
     return above.T @ above * (4 * math.pi / NODES), (whole - upper) * (4 * math.pi / NODES)
@@ -61,36 +61,30 @@ def irradiance(
     distance of the wall behind the origin; it faces the camera's azimuth. sky: coefficients (49, 3). lamp: the
     direction (3,) of white light of irradiance 1, or zero for none. InputError: Embree is not installed.
     """
+    sine, cosine = math.sin(camera.azimuth), math.cos(camera.azimuth)
+    turn = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    directions, radiance, irradiance = _directions(HARMONICS.degree)
+    directions, sky = directions @ turn, _turned(sky, camera.azimuth)
+    normals = torch.stack([turn[2], turn[0]])
     fine = image if lamp.any() else replace(image, samples=1)  # a lamp's shadow has edges
-    points, on_wall, normals = _surfaces(camera, fine, height, wall)
-    arriving = (HARMONICS.irradiance(normals) @ sky[HARMONICS.nonzero]).clamp(min=0)
-    fraction = on_wall.double().mean(0)[:, None]
+    points, on_wall = _surfaces(camera, fine, height, wall, normals)
+    arriving, fraction = (irradiance @ sky).clamp(min=0), on_wall.double().mean(0)[:, None]
     open_sky = arriving[0] + fraction * (arriving[1] - arriving[0])
     lit = (normals @ lamp).clamp(min=0)[on_wall.long()]
     shaded = torch.nonzero((lit > 0) & _near(points, lamp, radius), as_tuple=True)
     starts = points[shaded] + rays.offset * normals[on_wall[shaded].long()]
     lit[shaded] *= rays.first_hit(starts, lamp.expand(len(starts), 3)) < 0
     coarse = replace(image, size=-(-image.size // COARSE), samples=1)
-    blocked = _blocked_sky(rays, radius, sky, *_surfaces(camera, coarse, height, wall))
-    blocked = F.interpolate(blocked.T.unflatten(1, (1, coarse.size, -1)).swapaxes(0, 1), image.size, mode="bilinear")[0]
+    points, on_wall = (part[0] for part in _surfaces(camera, coarse, height, wall, normals))
+    blocked = torch.zeros(len(points), 3, dtype=torch.float64)
+    for surface, sent in enumerate(radiance @ sky * (math.pi / DIRECTIONS)):
+        pixels = torch.nonzero(on_wall == surface).squeeze(1)
+        starts = points[pixels] + rays.offset * normals[surface]
+        row, number = torch.nonzero(_near(starts, directions[surface].T, radius), as_tuple=True)
+        hit = rays.first_hit(starts[row], directions[surface, number]) >= 0
+        blocked.index_add_(0, pixels[row[hit]], sent[number[hit]])
+    blocked = F.interpolate(blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear")[0]
     return ((open_sky.T + lit.mean(0)).unflatten(1, (image.size, -1)) - blocked).clamp(min=0)
-
-
-def _blocked_sky(rays: Rays, radius: float, sky: Tensor, points: Tensor, on_wall: Tensor, normals: Tensor) -> Tensor:
-    """(P, 3) of the sky's irradiance at points (1, P, 3) that the object keeps off them."""
-    blocked = torch.zeros(points.shape[1], 3, dtype=torch.float64)
-    for surface, normal in enumerate(normals):
-        pixels = torch.nonzero(on_wall[0] == surface).squeeze(1)
-        directions, radiance = _table_directions(HARMONICS.degree)
-        if surface:
-            directions = directions @ torch.stack([normals[0], torch.linalg.cross(normal, normals[0]), normal])
-        starts = points[0, pixels] + rays.offset * normal
-        row, number = torch.nonzero(_near(starts, directions.T, radius), as_tuple=True)
-        hit = rays.first_hit(starts[row], directions[number]) >= 0
-        if hit.any():
-            lost = (HARMONICS.radiance(directions) if surface else radiance) @ sky * (math.pi / DIRECTIONS)
-            blocked.index_add_(0, pixels[row[hit]], lost[number[hit]])
-    return blocked
 
 
 def _near(points: Tensor, directions: Tensor, radius: float) -> Tensor:
@@ -100,17 +94,30 @@ def _near(points: Tensor, directions: Tensor, radius: float) -> Tensor:
 
 
 @per_degree
-def _table_directions(degree: int) -> tuple[Tensor, Tensor]:
-    """Directions (D, 3) above a table, as dense as their cosine (Malley), and the harmonics (D, size) there."""
+def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Above a table and a wall that faces +x: directions (2, D, 3), as dense as their cosine (Malley), the harmonics
+    (2, D, size) there, and what each of these sends the surface (2, size)."""
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
     squared, angle = (index + 0.5) / DIRECTIONS, math.pi * (3 - math.sqrt(5)) * index
-    across = squared.sqrt()
-    directions = torch.stack([across * angle.cos(), across * angle.sin(), (1 - squared).sqrt()], dim=1)
-    return directions, type(HARMONICS)(degree).radiance(directions)
+    table = torch.stack([squared.sqrt() * angle.cos(), squared.sqrt() * angle.sin(), (1 - squared).sqrt()], dim=1)
+    directions, harmonics = torch.stack([table, table.roll(1, 1)]), Harmonics(degree)
+    irradiance = torch.zeros(2, harmonics.size, dtype=torch.float64)
+    irradiance[:, harmonics.nonzero] = harmonics.irradiance(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).double())
+    return directions, harmonics.radiance(directions.flatten(0, 1)).unflatten(0, (2, -1)), irradiance
 
 
-def _surfaces(camera: Camera, image: ImageSettings, height: float, wall: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Where a camera's rays through S samples of P pixels end: (S, P, 3), on the wall (S, P) or the table, with the
+def _turned(sky: Tensor, azimuth: float) -> Tensor:
+    """The coefficients (size, 3) of a sky turned back by an azimuth: Y_lm and Y_l-m are as cos mφ and sin mφ."""
+    l = bands(HARMONICS.degree)
+    order = torch.arange(len(l)) - l * (l + 1)
+    angle = (order * azimuth).double()[:, None]
+    return angle.cos() * sky + angle.sin() * sky[l * (l + 1) - order]
+
+
+def _surfaces(
+    camera: Camera, image: ImageSettings, height: float, wall: float, normals: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where a camera's rays through S samples of P pixels end: (S, P, 3), and whether on the wall (S, P); by the
     normals of table and wall (2, 3)."""
     count = image.size * image.samples
     middles = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
@@ -123,9 +130,7 @@ def _surfaces(camera: Camera, image: ImageSettings, height: float, wall: float) 
     if isinstance(camera, PerspectiveCamera):
         starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(ends)
     forward = ends - starts
-    towards = [math.cos(camera.azimuth), math.sin(camera.azimuth), 0.0]
-    normals = torch.tensor([[0.0, 0.0, 1.0], towards], dtype=torch.float64)
     levels = torch.tensor([height, -wall], dtype=torch.float64)
     falling = (forward @ normals.T).clamp(max=-1e-9)  # of rays that never reach a surface, far away
     lengths = (levels - starts @ normals.T) / falling
-    return starts + lengths.amin(2, keepdim=True) * forward, lengths[..., 1] < lengths[..., 0], normals
+    return starts + lengths.amin(2, keepdim=True) * forward, lengths[..., 1] < lengths[..., 0]
