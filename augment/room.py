@@ -39,7 +39,7 @@ def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
     """Lights (E, 49, 3) on infinite tables of albedo (E, 3): that from above, and what the tables reflect of it and of
     white lamps of irradiance 1 in directions (E, 3), or zero for none."""
     upper, below = _upper(HARMONICS.degree)
-    above = upper @ lights.double()
+    above, albedo = upper @ lights.cpu().double(), albedo.cpu()
     normal, nonzero = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), HARMONICS.nonzero
     arriving = (HARMONICS.irradiance(normal)[0] @ above[:, nonzero]).clamp(min=0) + lamps[:, 2:].clamp(min=0)
     return (above + below[:, None] * (albedo * arriving / math.pi)[:, None]).to(lights)

@@ -66,7 +66,8 @@ class VariationSettings:
     camera's side, up to 70° off, plus [least, most] `fill_light` of their own light. lit_background: a background is a
     wall that faces the camera, in the example's light. tables: fraction of the examples that stand on a table before a
     wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75°
-    above. background_saturation: of random colors that multiply the backgrounds, at most.
+    above. background_saturation: of random colors that multiply the backgrounds, at most. Backgrounds keep the light
+    that was drawn, also where an attack changes the object's.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
