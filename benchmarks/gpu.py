@@ -33,8 +33,7 @@ from renderer.rasterizer import choose
 from train.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
 from train.networks import load_run
 
-NETWORK, MESHES, VIEWS, STEPS, ROUNDS = "pretrained/none", 2, 10, 10, 5
-SAMPLES = (64, 512, 2048)  # per side, rasterized
+NETWORK, MESHES, VIEWS, STEPS, ROUNDS, SAMPLES = "pretrained/none", 2, 10, 10, 5, (64, 512, 2048)
 SHAPE = {"geometry": StepSettings("linf", 0.002, "sign", 0.001)}
 
 
@@ -65,7 +64,8 @@ def tests(device: str) -> Iterator[Row]:
     file = Path(__file__).parents[1] / "tests" / "train" / "test_gpu.py"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
     done = subprocess.run(command, cwd=file.parents[2], capture_output=True, text=True, check=False)
-    yield {"question": "tests", "way": file.name, "value": done.returncode, "output": done.stdout[-2000:]}
+    printed = (done.stdout + done.stderr)[-2000:]
+    yield {"question": "tests", "way": file.name, "value": done.returncode, "output": printed}
 
 
 def rasterizers(device: str) -> Iterator[Row]:
@@ -141,8 +141,7 @@ def training(device: str) -> Iterator[Row]:
             yield from (row | {"way": phase, "value": epoch[f"seconds/{phase}"]} for phase in ("training", "attack"))
 
 
-ASKED = (tests, rasterizers, attack, shrinking, synchronizations, training)
-QUESTIONS = {ask.__name__: ask for ask in ASKED}
+QUESTIONS = {ask.__name__: ask for ask in (tests, rasterizers, attack, shrinking, synchronizations, training)}
 NEED_CUDA = ("tests", "synchronizations")
 
 

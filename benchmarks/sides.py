@@ -152,8 +152,7 @@ def log_looks(args: argparse.Namespace, folders: list[Path]) -> None:
 
 
 def score(args: argparse.Namespace) -> None:
-    """A table of the side's folders, of their sources and of their objects; with DATA of its part of CIFAR-100, too;
-    and how far the other networks are from the first."""
+    """A table of the side's folders, sources and objects, with DATA of CIFAR-100, and differences from the first."""
     side = {"choose": "choosing", "report": "reporting"}[args.command]
     folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
     folders = [folder for folder in folders if not args.part or folder.name in args.part]

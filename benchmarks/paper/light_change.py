@@ -10,14 +10,13 @@ from pathlib import Path
 
 from train.run_folder import read_metrics
 
-# of attacks on all renders of a round, which end once they succeed
 MEASURES = {"light_change": "L2 norm of the light's change", "steps": "steps", "attack_success": "success"}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     from matplotlib.figure import Figure
 
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("run", type=Path, help="a run with augment=adversarial")
     options.add_argument("--out", type=Path, required=True, help="a .png; its numbers go into a .csv beside it")
     args = options.parse_args(argv)
