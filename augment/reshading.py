@@ -16,6 +16,7 @@ from augment.objects import SceneObject
 from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
+from renderer.gloss import sample_gloss
 from renderer.image import ImageSettings
 from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
@@ -162,7 +163,9 @@ class Reshading:
             return frozen.radiance(camera, fragments, albedo, light)
 
         extra = indirect if settings.global_illumination else None
-        return fragments, view_radiance(fragments, corners, albedo, lights, normals, local_view, extra, positions)
+        gloss = sample_gloss(item.mesh, fragments)
+        shaded = fragments, corners, albedo, lights, normals
+        return fragments, view_radiance(*shaded, local_view, extra, positions, gloss)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = attach(
     {
         "camera": ["OrthographicCamera", "PerspectiveCamera", "orbit_cameras"],
         "errors": ["InputError"],
+        "gloss": ["Gloss"],
         "image": ["ImageSettings"],
         "light.harmonics": ["harmonics"],
         "light.presets": ["load_light", "save_light"],

@@ -70,6 +70,10 @@ class Camera(ABC):
         axes, position = self.axes(), np.array([-self.right, -self.up, self.distance])
         return np.vstack([np.column_stack([axes.T, position @ axes]), [0, 0, 0, 1]])
 
+    def eye(self) -> np.ndarray:
+        """(4,) homogeneous: the direction to the camera and 0."""
+        return np.append(self.axes()[2], 0.0)
+
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
         """World points (V, 3) to normalized device coordinates (V, 3): x right, y up, z depth.
@@ -117,6 +121,10 @@ class PerspectiveCamera(Camera):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_range("distance", self.distance, 1 / LARGEST, LARGEST)
+
+    def eye(self) -> np.ndarray:
+        """(4,) homogeneous: the position and 1."""
+        return self.pose()[:, 3]
 
     @property
     def angle(self) -> float:

@@ -4,8 +4,8 @@ Rasterized once and then fixed, while light, albedo or the positions of the vert
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ class Fragments:
     pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
     sample: (S,) int64, their position in the image: pixel by pixel, and row by row within a pixel.
     depths: (G, 3) float64 of the corners, by which perspective divides (`Camera.depths`); None without perspective.
+    eye: (4,) float64, homogeneous: the camera's position and 1, or the direction to it and 0.
     """
 
     size: int
@@ -47,6 +48,7 @@ class Fragments:
     face: Tensor
     sample: Tensor
     depths: Tensor | None = None
+    eye: Tensor = field(default_factory=partial(torch.zeros, 4))
 
     @cached_property
     def barycentric(self) -> Tensor:
@@ -156,7 +158,8 @@ def build_fragments(
     closed = closed and bool((points[..., 2] >= -1).all())
     ids = rasterizer.rasterize(points, faces, settings.size * settings.samples, closed=closed)
     depths = [camera.depths(vertices) for camera in cameras]
-    return [_fragments(*view, faces, settings) for view in zip(points, depths, ids, strict=True)]
+    views = (_fragments(*view, faces, settings) for view in zip(points, depths, ids, strict=True))
+    return [replace(view, eye=torch.from_numpy(camera.eye())) for view, camera in zip(views, cameras, strict=True)]
 
 
 def _fragments(

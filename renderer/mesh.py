@@ -20,7 +20,7 @@ from renderer.errors import LARGEST, InputError, require_choice, require_range
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 MOST_VERTICES = 10**7  # some 5 GB
-PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids")
+PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
 
@@ -35,6 +35,8 @@ class Mesh:
     corner_uvs     (F, 3, 2) float32, origin at the bottom left of the texture; zeros where there is none
     texture_ids    (F,) int32, index into `textures`, -1 where there is none
     textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
+    gloss          (F, 3) float32: roughness, metallic and strength in [0, 1] (`renderer.Gloss`); None for a matte mesh
+    gloss_textures tuple of (H, W, 2) uint8, for each of `textures`, that multiply roughness and metallic; or empty
 
     InputError: arrays of other shapes, no faces, faces of vertices that are not there.
 
@@ -49,6 +51,8 @@ class Mesh:
     corner_uvs: np.ndarray
     texture_ids: np.ndarray
     textures: tuple[np.ndarray, ...] = ()
+    gloss: np.ndarray | None = None
+    gloss_textures: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
         count, numbers = len(self.faces), "fiu"  # NumPy's letters for types
@@ -58,8 +62,11 @@ class Mesh:
             ("corner_colors", (count, 3, 3), numbers),
             ("corner_uvs", (count, 3, 2), numbers),
             ("texture_ids", (count,), "iu"),
+            ("gloss", (count, 3), numbers),
         ):
             values = getattr(self, name)
+            if name == "gloss" and values is None:
+                continue
             if values.shape != shape or values.dtype.kind not in kinds:
                 raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
         require_range("the number of faces", count, 1, np.inf)
@@ -150,6 +157,8 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh with the faces of all, in order; vertices are not merged."""
     faces, texture_ids, vertices, textures = [], [], 0, 0
+    glossy = any(mesh.gloss is not None for mesh in meshes)
+    matte, plain = np.array([[1, 0, 0]], dtype=np.float32), np.full((1, 1, 2), 255, dtype=np.uint8)
     for mesh in meshes:
         faces.append(mesh.faces + vertices)
         texture_ids.append(np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + textures).astype(np.int32))
@@ -161,10 +170,20 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
         texture_ids=np.concatenate(texture_ids),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
+        gloss=np.concatenate(
+            [matte.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss for mesh in meshes]
+        )
+        if glossy
+        else None,
+        gloss_textures=tuple(
+            texture for mesh in meshes for texture in mesh.gloss_textures or (plain,) * len(mesh.textures)
+        )
+        if any(mesh.gloss_textures for mesh in meshes)
+        else (),
     )
 
 
-def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
+def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or another format of trimesh.
 
     All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
@@ -173,6 +192,8 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     material properties and the texture's wrap mode are left out. glTF's colors other than textures are linear
     by its standard and are encoded here.
 
+    gloss: read glTF's roughness, metallic (factors and texture) and specularFactor; surfaces are matte otherwise, since
+    most files have values that nobody chose. Formats other than glTF are matte.
     up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
     are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
@@ -186,7 +207,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     path = Path(path)
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    placed = [transformed(*part) for part in read_parts(path, linear=is_gltf)]
+    placed = [transformed(*part) for part in read_parts(path, is_gltf, gloss)]
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = concatenate(placed)
@@ -257,13 +278,15 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     if large.all():
         return refine(_quartered(mesh), area)
     small, finer = _select(mesh, ~large), refine(_quartered(_select(mesh, large)), area)
-    joined: dict[str, Any] = {name: np.concatenate([getattr(small, name), getattr(finer, name)]) for name in PER_FACE}
+    halves = {name: (getattr(small, name), getattr(finer, name)) for name in PER_FACE}
+    joined: dict[str, Any] = {name: np.concatenate(both) for name, both in halves.items() if both[0] is not None}
     return replace(finer, **joined)
 
 
 def _select(mesh: Mesh, faces: np.ndarray) -> Mesh:
     """Some of the faces, over all vertices."""
-    return replace(mesh, **{name: getattr(mesh, name)[faces] for name in PER_FACE})
+    per_face = {name: getattr(mesh, name) for name in PER_FACE}
+    return replace(mesh, **{name: values[faces] for name, values in per_face.items() if values is not None})
 
 
 def _quartered(mesh: Mesh) -> Mesh:
@@ -279,6 +302,7 @@ def _quartered(mesh: Mesh) -> Mesh:
         corner_colors=_interpolated(mesh.corner_colors),
         corner_uvs=_interpolated(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
+        gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
     )
 
 

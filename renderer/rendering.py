@@ -15,12 +15,13 @@ from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
+from renderer.gloss import Gloss, SampleGloss, sample_gloss
 from renderer.image import ImageSettings, as_background, composite
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.shading import normals_in_sight, radiance
+from renderer.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.shapes import sphere
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
@@ -47,6 +48,7 @@ def render(
     vertices: Float[Tensor, "N 3"] | None = None,
     albedo: Float[Tensor, "F 3"] | Float[Tensor, "height width 3"] | None = None,
     albedo_scale: float = 1.0,
+    gloss: Gloss | None = None,
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
@@ -54,16 +56,16 @@ def render(
     bounces: int = 0,
     rasterizer: str = "auto",
 ) -> Float[Tensor, "V 3 size size"]:
-    """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
+    """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices, albedo and gloss.
 
     light: (degree + 1)² coefficients (`load_light`), in whose dtype and on whose device the images are computed; None
     for no environment light. lights: lamps and projectors, alone for full white power, or with coefficients (size, 3);
     they cast shadows and do not bounce. background: see `renderer.image.as_background`; one for all views, or an image
     for each. vertices: in place of the mesh's. albedo: linear, in place of the mesh's colors per face, or of its only
-    texture. albedo_scale multiplies the albedo. samples: per pixel side. encoding: linear or srgb. normals: flat or
-    smooth. shadows: that the mesh casts on itself. bounces: of light between its surfaces, shadows included.
-    rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold visibility constant; those by vertices and
-    albedo also hold shadows and bounces of environment light constant.
+    texture. albedo_scale multiplies the albedo. gloss: in place of the mesh's. samples: per pixel side. encoding:
+    linear or srgb. normals: flat or smooth. shadows: that the mesh casts on itself. bounces: of light between its
+    surfaces, shadows included. rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold visibility
+    constant; those by vertices, albedo and gloss also hold shadows and bounces of environment light constant.
     InputError: NaN, shapes that do not fit, unknown choices.
 
     >>> light = renderer.load_light("grace").requires_grad_()
@@ -93,11 +95,12 @@ def render(
     for view, behind in zip(views, backgrounds, strict=True):
         fragments = view.to(like.device)
         colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
-        surface = Surface(moved, view, settings)
+        surface = Surface(moved, view, settings, given_gloss=gloss)
         indirect = partial(transport.radiance, surface) if transport else None
-        in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices))
+        in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices, gloss))
         of_vertices = normals_in_sight(fragments, vertices, faces) if smooth else None
-        shade = view_radiance(fragments, vertices, colors, emitters, of_vertices, in_local_light, indirect)
+        shine = sample_gloss(mesh, fragments, gloss)
+        shade = view_radiance(fragments, vertices, colors, emitters, of_vertices, in_local_light, indirect, gloss=shine)
         images.append(composite(shade, fragments.coverage.to(like), fragments.pixels, behind, encoding))
     return torch.stack(images)
 
@@ -111,19 +114,21 @@ def view_radiance(
     in_local_light: Callable[[], LocalLightView],
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
     positions: Tensor | None = None,
+    gloss: SampleGloss | None = None,
 ) -> Tensor:
     """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, and local lights.
 
     albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). normals: as for `radiance`. indirect: of
     albedo and coefficients of environment light, the radiance that shadows and bounces add to it. positions: of lamps
-    that moved, (L, 3).
+    that moved, (L, 3). gloss: in environment light.
     """
     radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not lights else []
     for basis, light in lights:
         if isinstance(basis, LocalBasis):
             radiances.append(in_local_light().radiance(basis, albedo, light, positions))
             continue
-        radiances.append(radiance(fragments, vertices, light, albedo, normals))
+        shaded = fragments, vertices, light, albedo, normals
+        radiances.append(radiance(*shaded) if gloss is None else glossy_radiance(*shaded, gloss))
         if indirect is not None:
             radiances.append(indirect(albedo, light))
     return reduce(torch.add, radiances)
@@ -144,6 +149,7 @@ def precompute_transfer(
     size: int = 224,
     *,
     albedo_scale: float = 1.0,
+    gloss: Gloss | None = None,
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
@@ -162,7 +168,7 @@ def precompute_transfer(
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
-    return build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale)
+    return build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
 
 
 def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:

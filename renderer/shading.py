@@ -26,6 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.fragments import Fragments
+from renderer.gloss import SampleGloss, toward_camera
 from renderer.light import harmonics
 from renderer.normals import area_vectors, vertex_normals
 
@@ -61,6 +62,29 @@ def radiance(
     if fragments.samples > 1:  # a sample is a pixel otherwise
         seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
     return seen.to(vertices.dtype)
+
+
+def glossy_radiance(
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    light: Float[Tensor, "coefficients 3"],
+    albedo: Float[Tensor, "S 3"],
+    normals: Float[Tensor, "V 3"] | None,
+    gloss: SampleGloss,
+) -> Float[Tensor, "3 P"]:
+    """`radiance` of a surface with gloss at the samples (`renderer.gloss`); differentiable in that, too."""
+    wide = torch.promote_types(vertices.dtype, torch.float32)
+    if normals is None:
+        planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
+        at_samples = harmonics.unit(planes).T[fragments.face].to(wide)
+    else:
+        at_samples = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
+    shaded = at_samples, toward_camera(fragments, vertices.to(wide))
+    albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(at_samples)
+    colored, white = gloss.transfer(*shaded, harmonics.degree_of(light))
+    shine = (albedo * (colored @ light) + white @ light) / fragments.samples**2
+    diffuse = radiance(fragments, vertices, light, albedo * gloss.diffuse(*shaded)[:, None], normals)
+    return diffuse + shine.new_zeros(3, len(fragments.pixels)).index_add(1, fragments.pixel, shine.T).to(diffuse)
 
 
 def irradiance(

@@ -1,8 +1,8 @@
 """A scene as a linear operator on its light: (mesh, camera) → T, rasterized once and multiplied for every light.
 
-Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
-radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
-and bounces (package `renderer.transport`).
+Before clamping, every pixel is linear in the lighting coefficients U (the paper's appendix B.2):
+radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do gloss
+(`renderer.gloss`), shadows and bounces (package `renderer.transport`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import Camera
 from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
+from renderer.gloss import Gloss
 from renderer.image import ImageSettings, as_background, composite
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
@@ -48,7 +49,7 @@ class TransferOperator:
     coverage: in (0, 1], the fraction of a pixel's samples that the mesh covers.
     pixels: row-major indices of the covered pixels; row 0 is the top of the image.
     nonzero: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
-    under an open sky (`Harmonics.nonzero`), and all in a view with shadows.
+    under an open sky (`Harmonics.nonzero`), and all in a view with shadows or gloss.
     settings: of the image. basis: of the lights.
     sparse: of three channels, added to the dense transfer: that of patterns, most of whose entries are zero; or None.
 
@@ -164,11 +165,13 @@ def build_operators(
     albedo_scale: float = 1.0,
     basis: Basis = HARMONICS,
     dtype: torch.dtype = torch.float32,
+    gloss: Gloss | None = None,
 ) -> list[TransferOperator]:
     """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
 
     albedo_scale multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side
-    that the camera sees, with normals as the settings say. InputError: bounces of local lights.
+    that the camera sees, with normals as the settings say. gloss: in place of the mesh's. InputError: bounces of local
+    lights.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
@@ -176,9 +179,10 @@ def build_operators(
     rays = transport.rays if transport else Rays(mesh)
 
     def build(fragments: Fragments) -> TransferOperator:
-        surface, pixels = Surface(mesh, fragments, settings), len(fragments.pixels)
+        surface, pixels = Surface(mesh, fragments, settings, given_gloss=gloss), len(fragments.pixels)
         albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
-        factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
+        by_channel = surface.gloss is not None or (transport and transport.colors)
+        factor = None if by_channel else _pixel_albedo(fragments, albedo, dtype)
         if factor is None:
             factor = torch.ones(pixels, 3)
         else:
@@ -194,7 +198,8 @@ def build_operators(
                     continue
                 transfer, indices = entries.dense(pixels)
             else:
-                transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
+                transfer = _box_filter(surface, albedo, part, dtype)
+                indices = part.nonzero if surface.gloss is None else torch.arange(part.size)
                 change = transport.change(surface, albedo) if transport else None
                 if change is not None:
                     transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
@@ -222,22 +227,32 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 
 def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
-    """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64."""
-    fragments, pixels = surface.fragments, len(surface.fragments.pixels)
-    smooth = surface.settings.normals == "smooth"
-    if smooth:
-        pixel, weights = fragments.pixel, albedo / fragments.samples**2
-    else:
+    """(C, K, P): albedo (S, C) × A_l Y_lm(n), and what gloss makes of it, summed over each pixel's samples, by blocks
+    of pixels in float64. K: the nonzero coefficients, with gloss all."""
+    fragments, pixels, gloss = surface.fragments, len(surface.fragments.pixels), surface.gloss
+    by_face = surface.settings.normals == "flat" and gloss is None
+    if by_face:
         pixel, face, weights = fragments.merge(albedo)
         shading = basis.irradiance(surface.face_planes)
+    else:
+        pixel, weights = fragments.pixel, albedo / fragments.samples**2
     starts = torch.arange(0, pixels, BLOCK)
     ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
-    filtered = torch.empty(albedo.shape[1], len(basis.nonzero), pixels, dtype=dtype)
+    size = len(basis.nonzero) if gloss is None else basis.size
+    filtered = torch.empty(albedo.shape[1], size, pixels, dtype=dtype)
     for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
         some = slice(begin, end)
-        rows = basis.irradiance(surface.normals[some]) if smooth else shading.index_select(0, face[some])
+        rows = shading.index_select(0, face[some]) if by_face else basis.irradiance(surface.normals[some])
+        white = None
+        if gloss is not None:
+            at, seen = gloss.at(some), (surface.normals[some], surface.toward[some])
+            colored, white = at.transfer(*seen, basis.degree)
+            rows = colored.index_add(1, basis.nonzero, rows * at.diffuse(*seen)[:, None])
         block = filtered[..., first : first + BLOCK]
         for channel, weight in zip(block, weights[some].T, strict=True):
             summed = rows.new_zeros(channel.shape[::-1])
-            channel.copy_(summed.index_add_(0, pixel[some] - first, rows * weight[:, None]).T)
+            summed.index_add_(0, pixel[some] - first, rows * weight[:, None])
+            if white is not None:
+                summed.index_add_(0, pixel[some] - first, white, alpha=1 / fragments.samples**2)
+            channel.copy_(summed.T)
     return filtered

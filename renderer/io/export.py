@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 # glTF's names for colors and normals after an underscore, under which trimesh writes any attribute.
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
+SPECULAR = "specularFactor"  # in the name of a material, since trimesh does not write it elsewhere
 
 
 def export_mesh(
@@ -27,9 +28,9 @@ def export_mesh(
 ) -> None:
     """Write a mesh to a .glb file. A vertex whose corners differ in color, uv or normal is written for each.
 
-    `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture; a diffuse
-    material that is seen from both sides. A mesh of several textures has its faces ordered by texture, the `first` so
-    many of them before the others.
+    `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture and gloss; a material
+    that is seen from both sides, diffuse if the mesh is matte. A mesh of several has its faces ordered by texture and
+    gloss, the `first` so many of them before the others.
     normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
     InputError where the suffix is another or the file cannot be written.
 
@@ -52,13 +53,15 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
 
     later = np.arange(len(mesh.faces)) >= (len(mesh.faces) if first is None else first)
     order = np.stack([later, mesh.texture_ids], axis=1)
-    parts = [_textured_part(mesh, normals, part[1], (order == part).all(1)) for part in np.unique(order, axis=0)]
+    if mesh.gloss is not None:
+        order = np.concatenate([order, mesh.gloss], axis=1)  # float64, which holds either exactly
+    parts = [_textured_part(mesh, normals, part, (order == part).all(1)) for part in np.unique(order, axis=0)]
     finish = partial(_as_one_mesh, cameras=cameras)
     return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
 
 
-def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, selected: np.ndarray) -> "trimesh.Trimesh":
-    """The selected faces (F,) bool, of one texture or of none, y up."""
+def _textured_part(mesh: Mesh, normals: np.ndarray, part: np.ndarray, selected: np.ndarray) -> "trimesh.Trimesh":
+    """The selected faces (F,) bool, y up. part: 0 or 1, their texture or -1 and their gloss, if any."""
     import trimesh
     from trimesh.visual.material import PBRMaterial
     from trimesh.visual.texture import TextureVisuals
@@ -66,11 +69,15 @@ def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, selected: n
     corners = np.concatenate([mesh.corner_colors[selected], mesh.corner_uvs[selected], normals[selected]], axis=-1)
     ids, values, faces = _split(mesh.faces[selected], corners)
     colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
-    material = PBRMaterial(
-        name=f"texture {texture_id}",  # trimesh would take images of the same bytes and other sizes for one
+    texture_id, gloss = int(part[1]), part[2:].tolist()
+    roughness, metallic = gloss[:2] or (1.0, 0.0)
+    factors = mesh.gloss_textures[texture_id] if mesh.gloss_textures and texture_id >= 0 else None
+    material = PBRMaterial(  # trimesh would take images of the same bytes and other sizes for one, but for the name
+        name=", ".join([f"texture {texture_id}", *(f"{SPECULAR} {strength}" for strength in gloss[2:])]),
         baseColorTexture=Image.fromarray(mesh.textures[texture_id]) if texture_id >= 0 else None,
-        metallicFactor=0.0,
-        roughnessFactor=1.0,
+        metallicRoughnessTexture=None if factors is None else Image.fromarray(np.insert(factors, 0, 0, axis=2)),
+        metallicFactor=metallic,
+        roughnessFactor=roughness,
         doubleSided=True,
     )
     return trimesh.Trimesh(
@@ -93,6 +100,11 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
         primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_COLOR)
         primitive["attributes"]["NORMAL"] = primitive["attributes"].pop(_NORMAL)
     tree["meshes"], tree["nodes"] = [{"primitives": primitives}], [{"mesh": 0}]
+    for material in tree["materials"]:
+        _, strength = f"{material['name']}, {SPECULAR} ".split(f", {SPECULAR} ")[:2]
+        if strength:
+            material["extensions"] = {"KHR_materials_specular": {"specularFactor": float(strength)}}
+            tree["extensionsUsed"] = ["KHR_materials_specular"]
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
     for index, camera in enumerate(cameras):

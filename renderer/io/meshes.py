@@ -11,6 +11,7 @@ import re
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -35,9 +36,10 @@ TRANSFORM = "KHR_texture_transform"
 HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions that move no vertex, as they begin
 
 
-def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
+def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
     """Every part of a file in its own coordinates, with the affine matrix (4, 4) that its node places it by.
-    linear: the file's colors, textures aside, are linear. InputError: as `renderer.mesh.load_mesh`."""
+    linear: the file's colors, textures aside, are linear. gloss: read that of glTF, too. InputError: as
+    `renderer.mesh.load_mesh`."""
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     formats = set(trimesh.available_formats()) - ARCHIVES
@@ -45,10 +47,13 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
         raise InputError(f"{path} has no known mesh format: use one of {', '.join(sorted(formats))}")
     try:
         content, files = path.read_bytes(), _Files(path)
-        textured_parts = _textured_parts(content) if suffix in ("gltf", "glb") else 0
+        tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
+        textured_parts, strengths = _textured_parts(tree, gloss), _strengths(tree)
         scene = _load(_utf8(content) if suffix == "obj" else content, suffix, files)
         named = [(name, part) for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)]
         parts = {name: _part(part, linear) for name, part in named if len(part.faces)}
+        if gloss:
+            parts = {name: _with_gloss(part, scene.geometry[name].visual, strengths) for name, part in parts.items()}
         if sum(len(part.textures) for part in parts.values()) < textured_parts:
             raise ValueError("the image of a texture is missing, or cannot be decoded")
     except Exception as error:  # readers of meshes and images raise almost anything at a damaged file
@@ -106,13 +111,28 @@ def _utf8(text: bytes) -> bytes:
     return text
 
 
-def _textured_parts(content: bytes) -> int:
-    """How many parts of a glTF file have an image as their color.
-    ValueError, KeyError and the like where trimesh would read shape or texture coordinates otherwise than meant."""
+def _gltf_tree(content: bytes) -> dict[str, Any]:
+    """The JSON of a .gltf or .glb file; ValueError and the like where it is damaged."""
     if content.startswith(b"glTF"):
         (length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + length]
-    tree = json.loads(content, parse_constant=int)  # ValueError for NaN, which JSON has not
+    tree: dict[str, Any] = json.loads(content, parse_constant=int)  # ValueError for NaN, which JSON has not
+    return tree
+
+
+def _strengths(tree: dict[str, Any]) -> dict[str | None, float]:
+    """The specularFactor of a glTF file's materials, by name; ValueError where a name has two."""
+    strengths: dict[str | None, float] = {}
+    for material in tree.get("materials", []):
+        factor = material.get("extensions", {}).get("KHR_materials_specular", {}).get("specularFactor", 1.0)
+        if strengths.setdefault(material.get("name"), factor) != factor:
+            raise ValueError(f"materials of the name {material.get('name')} differ in specularFactor")
+    return strengths
+
+
+def _textured_parts(tree: dict[str, Any], gloss: bool) -> int:
+    """How many parts of a glTF file have an image as their color.
+    ValueError, KeyError and the like where trimesh would read shape or texture coordinates otherwise than meant."""
     for name in tree.get("extensionsRequired", []):
         if not name.startswith(HARMLESS):
             raise ValueError(f"it needs the extension {name}, which is not supported")
@@ -128,9 +148,11 @@ def _textured_parts(content: bytes) -> int:
             raise ValueError("texture coordinates that are not floating-point numbers are not supported")
         material = tree["materials"][part["material"]] if "material" in part else {}
         glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-        colors = material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), glossy.get("diffuseTexture")
+        roughness = material.get("pbrMetallicRoughness", {})
+        colors = roughness.get("baseColorTexture"), glossy.get("diffuseTexture")
         textures = [texture for texture in colors if texture is not None]
-        if any(texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}) for texture in textures):
+        used = [*textures, roughness.get("metallicRoughnessTexture") or {}] if gloss else textures
+        if any(texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}) for texture in used):
             raise ValueError("a texture has a second set of coordinates or is transformed, which is not supported")
         textured += bool(textures)
     return textured
@@ -156,6 +178,26 @@ def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
         texture_ids=np.zeros(len(faces), dtype=np.int32),
         textures=(np.array(eight_bits(image).convert("RGB")),),
     )
+
+
+def _with_gloss(mesh: Mesh, visual: Visuals, strengths: dict[str | None, float]) -> Mesh:
+    """A part with the gloss of its glTF material; matte without one. glTF's defaults are a rough metal."""
+    material = getattr(visual, "material", None)
+    if not isinstance(material, PBRMaterial):
+        return mesh
+    factors = material.roughnessFactor, material.metallicFactor, strengths.get(material.name)
+    row = np.clip([1.0 if factor is None else factor for factor in factors], 0, 1).astype(np.float32)
+    mesh = replace(mesh, gloss=row[None].repeat(len(mesh.faces), axis=0))
+    if material.metallicRoughnessTexture is None:
+        return mesh
+    if visual.uv is None:
+        raise ValueError("an image has no texture coordinates")
+    if not mesh.textures:
+        white = np.full((1, 1, 3), 255, dtype=np.uint8)
+        uvs, ids = visual.uv[:, :2].astype(np.float32)[mesh.faces], np.zeros(len(mesh.faces), dtype=np.int32)
+        mesh = replace(mesh, corner_uvs=uvs, texture_ids=ids, textures=(white,))
+    texels = np.array(eight_bits(material.metallicRoughnessTexture).convert("RGB"))
+    return replace(mesh, gloss_textures=(texels[..., 1:],))
 
 
 def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Image.Image | None]:

@@ -6,8 +6,9 @@ is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` g
 
 Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
 and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
-here, a concave mesh has dark places there. Its radiance is premultiplied with alpha, as ours with the
-coverage.
+here, a concave mesh has dark places there. Gloss is its `principled`, with the same lobe; the diffuse part below it
+is Disney's there (some 6 % brighter), and Fresnel's term is not Schlick's. Its radiance is premultiplied with alpha, as
+ours with the coverage.
 """
 
 import math
@@ -24,6 +25,7 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
+from renderer.gloss import DIELECTRIC
 from renderer.image import ImageSettings, decode
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Harmonics, LocalBasis
@@ -31,6 +33,7 @@ from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
+from renderer.microfacets import LEAST
 from renderer.normals import corner_normals
 
 Scene = dict[str, Any]
@@ -42,8 +45,8 @@ TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
 PLUGINS = {  # by the tags that they have in files
     "integrator": ("path", "direct"), "emitter": ("envmap", "projector", "point", "area"), "shape": ("ply", "disk"),
-    "sensor": ("perspective", "orthographic"), "bsdf": ("twosided", "diffuse"), "texture": ("bitmap", "mesh_attribute"),
-    "film": ("hdrfilm",), "rfilter": ("box",), "sampler": ("multijitter",),
+    "sensor": ("perspective", "orthographic"), "bsdf": ("twosided", "diffuse", "principled"),
+    "texture": ("bitmap", "mesh_attribute"), "film": ("hdrfilm",), "rfilter": ("box",), "sampler": ("multijitter",),
 }  # fmt: skip
 
 
@@ -149,18 +152,21 @@ def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Part:
-    """F faces of one texture (H, W, 3) uint8, or of none, with corners of their own.
-    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), as in `Mesh`."""
+    """F faces of one texture (H, W, 3) uint8, or of none, and of one gloss, if any, with corners of their own.
+    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), and gloss: (3,), as in `Mesh`. factors: the
+    gloss texture (H, W, 2)."""
 
     positions: np.ndarray
     normals: np.ndarray
     uvs: np.ndarray
     colors: np.ndarray
     texture: np.ndarray | None
+    gloss: np.ndarray | None = None
+    factors: np.ndarray | None = None
 
 
 def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
-    """The faces of each texture, and those of none. normals: (F, 3, 3), of the corners.
+    """The faces of each texture and gloss, and those of none. normals: (F, 3, 3), of the corners.
 
     Textures are on white corners: where they are on others they are painted anew, since Mitsuba has no product of the
     two.
@@ -168,11 +174,13 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    parts = []
-    for index in np.unique(mesh.texture_ids):
-        faces, texture = mesh.texture_ids == index, mesh.textures[index] if index >= 0 else None
-        corners = mesh.vertices[mesh.faces[faces]]
-        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture))
+    parts, kinds = [], mesh.texture_ids[:, None]
+    kinds = kinds if mesh.gloss is None else np.concatenate([kinds, mesh.gloss], axis=1)
+    for kind in np.unique(kinds, axis=0):
+        faces, index = (kinds == kind).all(axis=1), int(kind[0])
+        texture, factors = (of[index] if of and index >= 0 else None for of in (mesh.textures, mesh.gloss_textures))
+        corners, gloss = mesh.vertices[mesh.faces[faces]], None if mesh.gloss is None else kind[1:]
+        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture, gloss, factors))
     return parts
 
 
@@ -224,7 +232,7 @@ def write_mitsuba_scene(
     for entry in (integrator(settings.bounces, int(bool(emitters))), sky, *emitters, *sensors):
         _append(scene, "", entry)
     for number, part in enumerate(split_parts(mesh, corner_normals(mesh, settings.normals), settings.encoding)):
-        _append(scene, "", _write_part(folder, number, part, settings.encoding))
+        _append(scene, "", _write_part(folder, number, part, settings.encoding, albedo_scale))
     xml.indent(scene, "    ")
     (folder / SCENE).write_text(xml.tostring(scene, "unicode") + "\n", encoding="utf-8")
 
@@ -271,7 +279,7 @@ def _emitters(
         yield projector(pose_of(camera), math.degrees(basis.fov), pattern, albedo_scale * basis.distance**2)
 
 
-def _write_part(folder: Path, number: int, part: Part, encoding: str) -> Scene:
+def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:
     """A shape of part_0.ply and so on, with its texture_0.png."""
     import trimesh
 
@@ -288,5 +296,17 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str) -> Scene:
     if part.texture is not None:
         Image.fromarray(part.texture).save(folder / texture)
         albedo = {"type": "bitmap", "filename": texture, "raw": encoding == "linear"}
-    surface = {"type": "twosided", "material": {"type": "diffuse", "reflectance": albedo}}
+    material: Scene = {"type": "diffuse", "reflectance": albedo}
+    if part.gloss is not None:
+        roughness, metallic, strength = part.gloss.tolist()
+        # The light's scale has the albedo's. F0 is 0.08 × specular.
+        specular = min(strength * DIELECTRIC / 0.08 / max(albedo_scale, 1e-6), 1.0)
+        material = {"type": "principled", "base_color": albedo, "specular": specular}
+        for index, (name, factor, least) in enumerate((("roughness", roughness, LEAST), ("metallic", metallic, 0.0))):
+            material[name] = max(factor, least)
+            if part.factors is not None:
+                image = np.maximum(part.factors[..., index] * factor, 255 * least).round().astype(np.uint8)
+                Image.fromarray(image).save(folder / f"{name}_{number}.png")
+                material[name] = {"type": "bitmap", "filename": f"{name}_{number}.png", "raw": True}
+    surface = {"type": "twosided", "material": material}
     return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": surface}

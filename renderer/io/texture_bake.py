@@ -41,13 +41,15 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale
         bright = albedo * albedo_scale
         return encode((bright + offset[faces]).clamp(min=0).minimum(bright.clamp(min=1)) / ceiling, encoding)
 
-    colors, uvs, textures = np.ones_like(mesh.corner_colors), mesh.corner_uvs.copy(), []
+    colors, uvs, textures, gloss_textures = np.ones_like(mesh.corner_colors), mesh.corner_uvs.copy(), [], []
     plain = np.flatnonzero(mesh.texture_ids < 0)
     colors[plain] = painted(corner_albedo[plain].flatten(0, 1), plain.repeat(3)).view(-1, 3, 3).numpy()
     for index, source in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.texture_ids == index)
         charts = _Charts(mesh.corner_uvs[faces], source.shape[1::-1])
         texture = np.zeros((*charts.sheet[::-1], 3), dtype=np.uint8)
+        factors = mesh.gloss_textures[index] if mesh.gloss_textures else np.zeros((1, 1, 0), dtype=np.uint8)
+        gloss = np.zeros((*texture.shape[:2], factors.shape[2]), dtype=np.uint8)
         for owners in np.array_split(np.arange(len(faces)), 1 + charts.texels // BLOCK):
             owner, texel, center = charts.grid(owners)
             column, row = (np.floor(center / charts.scale).astype(np.int64) % source.shape[1::-1]).T  # it repeats
@@ -59,9 +61,13 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale
                 albedo *= corner_albedo[faces[owner], 0]
             columns, rows = (charts.corner[owner] + texel).T
             texture[rows, columns] = to_bytes(painted(albedo, faces[owner])).numpy()
+            across, down = (center / charts.scale / source.shape[1::-1] % 1 * factors.shape[1::-1]).astype(np.int64).T
+            gloss[rows, columns] = factors[down, across]  # the nearest
         textures.append(texture)
+        gloss_textures.append(gloss)
         uvs[faces] = charts.uvs
-    return replace(mesh, corner_colors=colors, corner_uvs=uvs, textures=tuple(textures)), ceiling
+    baked = replace(mesh, corner_colors=colors, corner_uvs=uvs, textures=tuple(textures))
+    return replace(baked, gloss_textures=tuple(gloss_textures) if mesh.gloss_textures else ()), ceiling
 
 
 class _Charts:

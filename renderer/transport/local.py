@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from renderer.fragments import Fragments
+from renderer.gloss import Gloss
 from renderer.image import ImageSettings
 from renderer.light.basis import LightPaths, LocalBasis
-from renderer.light.harmonics import unit_vectors
+from renderer.light.harmonics import unit, unit_vectors
 from renderer.light.local import Lamps
 from renderer.mesh import Mesh
 from renderer.transport.rays import Rays, Surface
@@ -65,17 +66,28 @@ def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBas
     fragments = surface.fragments
     paths = unoccluded(rays, surface, basis)
     index, entry = (fragments.pixel[paths.point] * basis.size + paths.function).unique(return_inverse=True)
-    weights = albedo[paths.point] * paths.irradiance[:, None] / fragments.samples**2
+    weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None] / fragments.samples**2
     summed = weights.new_zeros(len(index), albedo.shape[1]).index_add_(0, entry, weights)
     return SparseTransfer(index % basis.size, index // basis.size, summed)
 
 
-def local_radiance(fragments: Fragments, albedo: Tensor, paths: LightPaths, light: Tensor) -> Tensor:
+def local_radiance(surface: Surface, albedo: Tensor, paths: LightPaths, light: Tensor) -> Tensor:
     """(3, P) float64 radiance of a view in a light (size, 3) along unoccluded paths; differentiable in the light, the
-    albedo (S, 3) at the samples and the irradiance of the paths."""
-    arriving = paths.irradiance[:, None] * light[paths.function]
-    weights = albedo[paths.point] / fragments.samples**2 * arriving
+    albedo (S, 3) at the samples, the irradiance of the paths and the gloss."""
+    fragments, arriving = surface.fragments, paths.irradiance[:, None] * light[paths.function]
+    weights = _reflectance(surface, albedo, paths) / fragments.samples**2 * arriving
     return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[paths.point], weights).T
+
+
+def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
+    """(E, C) radiance per irradiance along paths: the albedo (S, C), and what gloss makes of it."""
+    values, gloss, point = albedo[paths.point], surface.gloss, paths.point
+    if gloss is None:
+        return values
+    directions = unit((paths.source - surface.points[point]).T).T
+    colored, white = gloss.at(point).along(surface.normals[point], surface.toward[point], directions)
+    diffuse = gloss.diffuse(surface.normals, surface.toward)[point]
+    return values * (diffuse + colored)[:, None] + white[:, None]
 
 
 def unoccluded(rays: Rays, surface: Surface, basis: LocalBasis, positions: Tensor | None = None) -> LightPaths:
@@ -94,14 +106,20 @@ class LocalLightView:
     """A view of one shape in local light, computed on the CPU, where the rays are cast: once for lights that stay, and
     again for lamps that moved. Derivatives hold fixed which lamps and which pixel of a pattern reach a sample.
 
-    rays: among the shape's faces. vertices: of the shape (V, 3), unless they are the mesh's.
+    rays: among the shape's faces. vertices: of the shape (V, 3), unless they are the mesh's. gloss: likewise.
     """
 
     def __init__(
-        self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
+        self,
+        rays: Rays,
+        mesh: Mesh,
+        fragments: Fragments,
+        settings: ImageSettings,
+        vertices: Tensor | None = None,
+        gloss: Gloss | None = None,
     ):
         vertices = None if vertices is None else vertices.cpu()
-        self._rays, self._surface = rays, Surface(mesh, fragments.to("cpu"), settings, vertices)
+        self._rays, self._surface = rays, Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
         self._fixed: dict[LocalBasis, LightPaths] = {}
 
     def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None = None) -> Tensor:
@@ -113,4 +131,4 @@ class LocalLightView:
             if basis not in self._fixed:
                 self._fixed[basis] = unoccluded(self._rays, self._surface, basis)
             paths = self._fixed[basis]
-        return local_radiance(self._surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)
+        return local_radiance(self._surface, albedo.cpu().double(), paths, light.cpu().double()).to(light)

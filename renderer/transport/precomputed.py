@@ -117,14 +117,21 @@ class Transport:
         coverage; None for no change. albedo: (S, C) linear, at the samples; C is 3 if the light has `colors`.
         """
         change, fragments = None, surface.fragments
-        weights = albedo.T / fragments.samples**2
+        weights, gloss = albedo.T / fragments.samples**2, surface.gloss
+        diffuse = weights if gloss is None else weights * gloss.diffuse(surface.normals, surface.toward)
         for hits in self.rays.hits(surface, self._directions):
             if not hits.weight.any():
                 continue
             if change is None:
                 change = self._sky.new_zeros(len(weights), self._sky.shape[1], len(fragments.pixels))
-            for channel, (added, weight) in enumerate(zip(change, weights, strict=True)):
-                blocked = hits.weight * weight[hits.sample]
+            if gloss is not None:
+                at, of_samples = gloss.at(hits.sample), (surface.normals[hits.sample], surface.toward[hits.sample])
+                colored, white = at.along(*of_samples, self._directions)
+            for channel, added in enumerate(change):
+                reflected = diffuse[channel][hits.sample]
+                if gloss is not None:
+                    reflected = reflected + weights[channel][hits.sample] * colored + white / fragments.samples**2
+                blocked = hits.weight * reflected
                 added[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
                     sent = self._sent[..., channel if self.colors else 0].numpy()
@@ -134,7 +141,8 @@ class Transport:
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
         """(3, P) in the light's dtype: `change` in a light (size, 3); differentiable in it, not in the albedo."""
-        change = self.change(surface, albedo.detach().cpu().double())
+        with torch.no_grad():
+            change = self.change(surface, albedo.detach().cpu().double())
         if change is None:
             return light.new_zeros(3, len(surface.fragments.pixels))
         return torch.einsum("ckp,kc->cp", change.to(light), light)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from renderer.errors import InputError
 from renderer.fragments import Fragments
+from renderer.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
 from renderer.image import ImageSettings
 from renderer.light.harmonics import per_degree, unit
 from renderer.mesh import Mesh
@@ -34,12 +35,13 @@ BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 @dataclass(frozen=True)
 class Surface:
     """Points and normals at the S samples of a view, in float64, as they are needed. moved: vertices (V, 3) in place
-    of the mesh's; points and normals are differentiable in them."""
+    of the mesh's; points and normals are differentiable in them. given_gloss: in place of the mesh's."""
 
     mesh: Mesh
     fragments: Fragments
     settings: ImageSettings
     moved: Tensor | None = None
+    given_gloss: Gloss | None = None
 
     @cached_property
     def vertices(self) -> Tensor:
@@ -71,6 +73,15 @@ class Surface:
     def points(self) -> Tensor:
         """(S, 3)"""
         return self.fragments.interpolate(self.vertices[self.fragments.corners])
+
+    @cached_property
+    def gloss(self) -> SampleGloss | None:
+        return sample_gloss(self.mesh, self.fragments, self.given_gloss)
+
+    @cached_property
+    def toward(self) -> Tensor:
+        """(S, 3) unit vectors to the camera."""
+        return toward_camera(self.fragments, self.vertices)
 
 
 class RayHits(NamedTuple):

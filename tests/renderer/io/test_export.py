@@ -11,6 +11,9 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, linear_of
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
@@ -166,3 +169,51 @@ def test_a_path_that_cannot_be_written_is_refused(tmp_path, name):
     (tmp_path / "folder.glb").mkdir()
     with pytest.raises(InputError, match=name):
         export_mesh(box(), tmp_path / name)
+
+
+def glossy(mesh: Mesh) -> Mesh:
+    """Three kinds of gloss by face, and gloss textures."""
+    rng = np.random.default_rng(3)
+    kinds = rng.random((3, 3), dtype=np.float32)
+    textures = tuple(rng.integers(0, 256, (5, 3 + i, 2), dtype=np.uint8) for i in range(len(mesh.textures)))
+    return replace(mesh, gloss=kinds[rng.integers(0, 3, len(mesh.faces))], gloss_textures=textures)
+
+
+@pytest.mark.parametrize("textures", [0, 2])
+def test_a_glb_gives_back_the_gloss_to_those_who_ask(tmp_path, textures):
+    mesh = glossy(painted(box(), textures) if textures else box())
+    order = np.lexsort([*mesh.gloss.T[::-1], mesh.texture_ids])
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    loaded, matte = load_mesh(tmp_path / "mesh.glb", gloss=True), load_mesh(tmp_path / "mesh.glb")
+    assert matte.gloss is None and matte.gloss_textures == ()
+    assert_array_equal(corners_of(loaded), corners_of(mesh)[order].astype(np.float32))
+    assert_array_equal(loaded.gloss, mesh.gloss[order])
+    for face, other in enumerate(order):
+        if mesh.texture_ids[other] >= 0:
+            expected = mesh.gloss_textures[mesh.texture_ids[other]]
+            assert_array_equal(loaded.gloss_textures[loaded.texture_ids[face]], expected)
+
+
+def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
+    """A rough metal where factors are missing, as the standard has it; green is roughness and blue metallic."""
+    texels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False)
+    material = PBRMaterial(metallicRoughnessTexture=Image.fromarray(texels))
+    triangle.visual = TextureVisuals(uv=np.eye(3)[:, :2], material=material)
+    triangle.export(tmp_path / "mesh.glb")
+    mesh = load_mesh(tmp_path / "mesh.glb", gloss=True)
+    assert mesh.gloss.tolist() == [[1, 1, 1]] and mesh.textures[0].tolist() == [[[255, 255, 255]]]
+    assert_array_equal(mesh.gloss_textures[0], texels[..., 1:])
+
+
+def test_materials_of_one_name_and_two_strengths_are_refused(tmp_path):
+    export_mesh(glossy(box()), tmp_path / "mesh.glb")
+    content = (tmp_path / "mesh.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    tree = json.loads(content[20 : 20 + length])
+    for material in tree["materials"]:
+        material["name"] = ""
+    text = json.dumps(tree, separators=(",", ":")).encode().ljust(length)
+    (tmp_path / "mesh.glb").write_bytes(content[:20] + text + content[20 + length :])
+    with pytest.raises(InputError, match="differ in specularFactor"):
+        load_mesh(tmp_path / "mesh.glb", gloss=True)

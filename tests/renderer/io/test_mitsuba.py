@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.gloss import Gloss
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import write_map
@@ -76,6 +77,25 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, encoding, norm
         off, inside = ours.view(4, 24, 24) - seen, (ours[3].view(24, 24) == 1) & (seen[3] == 1)
         assert inside.sum() > 100 and off[3].abs().max() < 1 / 8
         assert off[:3, inside].mean().abs() < 0.5 / 255 and off[:3, inside].square().mean().sqrt() < 0.005
+
+
+def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
+    """Factors and textures: metals to 5 %, dielectrics to 10 %, since the diffuse part of `principled` is Disney's."""
+    textured, light = normalize(ball()), load_light("st_peters")
+    rough, settings = np.random.default_rng(0).integers(100, 255, (9, 6, 2), dtype=np.uint8), ImageSettings(24, 8)
+    shiny = replace(Gloss(0.6, metallic=1.0).on(textured), gloss_textures=(rough,))
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
+    images = {}
+    for name, mesh in {"matte": textured, "shiny": shiny, "varnished": Gloss(0.4).on(textured)}.items():
+        write_mitsuba_scene(tmp_path / name, mesh, 1.0, CAMERAS[:1], settings, "../light.exr")
+        [theirs] = render_mitsuba_scene(tmp_path / name / SCENE, 1).double()
+        [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"))
+        ours = torch.zeros(3, 24 * 24, dtype=torch.float64)
+        ours[:, operator.pixels] = operator.radiance(light).double()
+        images[name] = ours.view(3, 24, 24), theirs[:3]
+    for name, most in (("shiny", 0.05), ("varnished", 0.1)):
+        off = {other: (images[other][0] - images[name][1]).norm() / images[name][1].norm() for other in (name, "matte")}
+        assert off[name] < most and off[name] < 0.8 * off["matte"]
 
 
 def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):

@@ -123,7 +123,7 @@ def moved_image(
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
     surface, albedo = Surface(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
     paths = unoccluded(Rays(mesh), surface, basis, positions)
-    return operator(mesh, basis, size, samples), local_radiance(view, albedo, paths, powers)
+    return operator(mesh, basis, size, samples), local_radiance(surface, albedo, paths, powers)
 
 
 @pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
@@ -155,7 +155,7 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences_at_fixed_visi
 
     def image(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
         surface = Surface(mesh, view, settings, vertices)
-        return local_radiance(view, albedo, unoccluded(rays, surface, basis), powers)
+        return local_radiance(surface, albedo, unoccluded(rays, surface, basis), powers)
 
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()

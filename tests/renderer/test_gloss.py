@@ -1,0 +1,277 @@
+"""Gloss: lobes against quadrature, images against Mitsuba, gradients against finite differences, energy."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from renderer.camera import orbit_cameras
+from renderer.errors import InputError
+from renderer.fragments import build_fragments
+from renderer.gloss import DIELECTRIC, Gloss, SampleGloss, sample_gloss
+from renderer.image import ImageSettings
+from renderer.io.mitsuba import environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
+from renderer.light.basis import Harmonics
+from renderer.light.harmonics import bands, basis
+from renderer.light.local import Lamps
+from renderer.mesh import Mesh, concatenate, normalize, subdivide
+from renderer.microfacets import KEPT, LEAST, axes, degree_for, lobe_weights, reflectance
+from renderer.rasterizer import choose
+from renderer.rendering import precompute_transfer, render, view_radiance
+from renderer.shading import normals_in_sight
+from renderer.shapes import solid, sphere
+from renderer.transfer import build_operators
+from renderer.transport.local import LocalLightView
+from renderer.transport.rays import Rays
+
+ROUGHNESS = [0.2, 0.3, 0.5, 0.8]
+[CAMERA] = orbit_cameras(1, 2.2)
+NEARBY = orbit_cameras(1, 2.2, fov=0.7)[0]
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+UP = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
+
+
+def double(value: float) -> torch.Tensor:
+    return torch.tensor([value], dtype=torch.float64)
+
+
+def toward(cosine: float) -> torch.Tensor:
+    return torch.tensor([[-math.sqrt(1 - cosine**2), 0, cosine]], dtype=torch.float64)
+
+
+def gltf_reflectance(cosine: float, light: np.ndarray, roughness: float, f0: float, f90: float) -> np.ndarray:
+    """π f as in the appendix of glTF 2.0, of light from directions (N, 3)."""
+    view, alpha = toward(cosine)[0].numpy(), roughness**2
+    half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
+    nl, nv, nh, vh = light[:, 2], view[2], half[:, 2], half @ view
+    distribution = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+    masking = [2 * x / (x + np.sqrt(alpha**2 + (1 - alpha**2) * x**2)) for x in (nl, nv)]
+    return np.pi * (f0 + (f90 - f0) * (1 - vh) ** 5) * distribution * masking[0] * masking[1] / (4 * nl * nv)
+
+
+def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (N, 3) above z = 0 and their solid angles: Gauss and Legendre's in z."""
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    z, azimuth = (node[:, None] + 1) / 2, 2 * np.pi * (np.arange(2 * rings) + 0.5) / (2 * rings)
+    radius = np.sqrt(1 - z**2)
+    directions = np.stack(np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=-1)
+    return directions.reshape(-1, 3), np.repeat(weight / 2 * 2 * np.pi / len(azimuth), len(azimuth))
+
+
+@pytest.mark.parametrize(("roughness", "most"), [(0.2, 0.01), (0.3, 0.02), (0.5, 0.025), (0.8, 0.045), (1.0, 0.08)])
+def test_lobes_are_those_of_the_reflectance_by_quadrature(roughness, most):
+    """To degree 6, in the L2 norm; and exactly in band 0, the reflection of an even sky."""
+    directions, solid_angles = hemisphere(int(45 / roughness))
+    harmonics, degrees = basis(torch.from_numpy(directions), 6), bands(6)
+    for cosine in (0.95, 0.6, 0.25):
+        weights = lobe_weights(double(cosine), double(roughness), 6)[..., degrees, 0]
+        about = torch.stack([basis(axis.T, 6)[0] for axis in axes(UP, toward(cosine), double(roughness))])
+        for f0, f90 in ((1, 0), (1, 1), (DIELECTRIC, 1)):
+            ours = weights.new_tensor([f0, f90]) @ (weights * about).sum(1)
+            lobe = gltf_reflectance(cosine, directions, roughness, f0, f90) * directions[:, 2] * solid_angles
+            exact = torch.from_numpy(lobe) @ harmonics
+            assert (ours - exact).norm() <= most * exact.norm()
+            assert float(ours[0]) == pytest.approx(float(exact[0]), rel=2e-3)
+
+
+def test_reflectance_is_that_of_gltf():
+    directions, _ = hemisphere(5)
+    for cosine, roughness in ((0.9, 0.2), (0.3, 0.7), (1.0, 1.0)):
+        ours = reflectance(UP, toward(cosine), torch.from_numpy(directions), double(roughness))
+        for value, fresnel in zip(ours, ((1, 0), (0, 1)), strict=True):
+            expected = gltf_reflectance(cosine, directions, roughness, *fresnel)
+            np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-14)
+
+
+def test_degree_for_is_the_least_that_holds_the_fraction_of_a_lobes_power():
+    directions, solid_angles = hemisphere(120)
+    for roughness in (LEAST, 0.3, 0.6):
+        lobe = gltf_reflectance(1.0, directions, roughness, 1, 0) * directions[:, 2]
+        zonal = torch.from_numpy(lobe * solid_angles) @ basis(torch.from_numpy(directions), 20)
+        held = zonal.square().cumsum(0) / (lobe**2 * solid_angles).sum()
+        degree = degree_for(roughness)
+        assert degree <= 20 and held[degree**2 - 1] < KEPT <= held[(degree + 1) ** 2 - 1]
+
+
+def test_an_even_sky_is_never_exceeded():
+    """A white furnace: white surfaces of any gloss, from every side. Dielectrics meet it."""
+    steps = [torch.linspace(0, 1, count, dtype=torch.float64) for count in (41, 17, 3, 2)]
+    cosine, rough, metallic, strength = (values.flatten() for values in torch.meshgrid(*steps, indexing="ij"))
+    gloss = SampleGloss(LEAST + (1 - LEAST) * rough, metallic, strength)
+    views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
+    colored, white = gloss.transfer(UP.expand_as(views), views, 0)
+    diffuse = gloss.diffuse(UP.expand_as(views), views)
+    reflected = diffuse + (colored + white)[:, 0] * math.sqrt(4 * math.pi) / math.pi
+    assert diffuse.min() >= 0 and reflected.max() <= 1 + 1e-12
+    dielectric = metallic == 0
+    torch.testing.assert_close(reflected[dielectric], torch.ones_like(reflected[dielectric]))
+
+
+def positive_light(degree: int) -> torch.Tensor:
+    """Random coefficients whose radiance is nowhere negative, of less power in higher bands, as in nature."""
+    random = torch.randn((degree + 1) ** 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(degree))
+    light = random / (1 + bands(degree)[:, None])
+    light[0] = 0
+    return light / (-1.1 * mitsuba_map(light, 64).min()) + torch.eye(len(light), 3)[:, :1] * math.sqrt(4 * math.pi)
+
+
+def mitsuba_radiance(mesh: Mesh, light: torch.Tensor, surface: dict, spp: int, size: int = 16) -> torch.Tensor:
+    """(3, size, size) in our units, of one with interpolated normals."""
+    with mitsuba() as module:
+        bitmap = module.Bitmap(mitsuba_map(light, 256).float().numpy())
+        even = {"sampler": {"type": "multijitter", "sample_count": spp}}
+        mesh_of = shape(module, surface, mesh.vertices, mesh.faces, mesh.vertex_normals)
+        entries = {"integrator": integrator(0), "sky": environment({"bitmap": bitmap}), "shape": mesh_of}
+        scene = load(module, {"type": "scene", **entries, "sensor": sensor_of(CAMERA, size) | even})
+        image = np.array(module.render(scene, spp=spp, seed=1))
+    return math.pi * torch.from_numpy(image[..., :3]).double().permute(2, 0, 1)
+
+
+def our_radiance(mesh: Mesh, light: torch.Tensor, gloss: Gloss, size: int = 16, **given: bool) -> torch.Tensor:
+    settings, degree = ImageSettings(size, 8, normals="smooth", **given), math.isqrt(len(light)) - 1
+    basis = Harmonics(degree)
+    [operator] = build_operators(mesh, [CAMERA], settings, choose("numpy"), basis=basis, dtype=light.dtype, gloss=gloss)
+    canvas = light.new_zeros(3, size * size).index_copy(1, operator.pixels, operator.radiance(light))
+    return canvas.unflatten(1, (size, size))
+
+
+def difference(ours: torch.Tensor, theirs: torch.Tensor) -> float:
+    return float((ours - theirs).norm() / theirs.norm())
+
+
+BALL = Mesh.plain(*sphere(4))
+EGG = normalize(replace(BALL, vertices=BALL.vertices * [1.0, 0.7, 0.8]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "roughness", "model", "cut"),
+    [
+        (EGG, 0.3, 0.016, 0.032),
+        pytest.param(BALL, 0.8, 0.02, 0.04, marks=pytest.mark.slow),
+        pytest.param(BALL, 0.2, 0.016, 0.018, marks=pytest.mark.slow),
+        pytest.param(BALL, 0.3, 0.016, 0.035, marks=pytest.mark.slow),
+        pytest.param(EGG, 0.5, 0.019, 0.05, marks=pytest.mark.slow),
+    ],
+)
+def test_conductors_look_as_mitsubas(mesh, roughness, model, cut):
+    """A mirror's, without Fresnel's term. `model`: the root mean square error of the lobes, in light of degree 6, with
+    Mitsuba's noise. `cut`: that in light of degree 20, of which `degree_for` is left."""
+    mirror = {"type": "roughconductor", "distribution": "ggx", "alpha": roughness**2, "material": "none"}
+    gloss, light, wide = Gloss(roughness, metallic=1.0), positive_light(6), positive_light(20)
+    assert difference(our_radiance(mesh, light, gloss), mitsuba_radiance(mesh, light, mirror, 144)) < model
+    few, theirs = wide[: (degree_for(roughness) + 1) ** 2], mitsuba_radiance(mesh, wide, mirror, 144)
+    assert difference(our_radiance(mesh, few, gloss), theirs) < cut
+    assert difference(our_radiance(mesh, wide, gloss), theirs) < 1.25 * model
+
+
+@pytest.mark.parametrize("roughness", [0.4, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_varnish_looks_as_mitsubas(roughness):
+    """Its highlight, over black, to 13 %: Schlick's term is up to 20 % below Fresnel's at 45° to 65°."""
+    varnish = {"type": "roughplastic", "distribution": "ggx", "alpha": roughness**2, "int_ior": 1.5}
+    varnish["diffuse_reflectance"] = {"type": "rgb", "value": [0.0, 0.0, 0.0]}
+    black, light = replace(BALL, corner_colors=0 * BALL.corner_colors), positive_light(6)
+    ours, theirs = our_radiance(black, light, Gloss(roughness)), mitsuba_radiance(BALL, light, varnish, 256)
+    assert difference(ours, theirs) < 0.13
+
+
+LAMP = Lamps(((1.5, 0.4, 1.2),), radius=0.0)
+PARAMETERS = ("environment", "lamp", "vertices", "albedo", "roughness", "metallic", "strength")
+
+
+@pytest.mark.parametrize("normals", ["smooth", "flat"])
+@pytest.mark.parametrize("camera", [CAMERA, NEARBY], ids=["orthographic", "perspective"])
+def test_derivatives_by_all_parameters_are_those_of_finite_differences(normals, camera):
+    """Of a view with fixed visibility, along a random direction of each parameter."""
+    mesh, settings = normalize(solid("apple")), ImageSettings(12, 2, normals=normals)
+    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
+    random, rays = torch.Generator().manual_seed(0), Rays(mesh)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return 0.3 + 0.5 * torch.rand(shape, dtype=torch.float64, generator=random)
+
+    faces, count = torch.from_numpy(mesh.faces), len(mesh.faces)
+    start = [positive_light(6), uniform(1, 3), torch.from_numpy(mesh.vertices), uniform(len(view.face), 3)]
+    start += [uniform(count), uniform(count), uniform(count)]
+    upstream = uniform(3, len(view.pixels))
+
+    def total(values: list[torch.Tensor]) -> torch.Tensor:
+        environment, lamp, vertices, albedo, *gloss = values
+        local = LocalLightView(rays, mesh, view, settings, vertices, Gloss(*gloss))
+        lights = [(Harmonics(6), environment), (LAMP, lamp)]
+        smooth = normals_in_sight(view, vertices, faces) if normals == "smooth" else None
+        gloss = sample_gloss(mesh, view, Gloss(*gloss))
+        return (view_radiance(view, vertices, albedo, lights, smooth, lambda: local, gloss=gloss) * upstream).sum()
+
+    variables = [value.clone().requires_grad_() for value in start]
+    gradients = torch.autograd.grad(total(variables), variables)
+    for index, (name, gradient) in enumerate(zip(PARAMETERS, gradients, strict=True)):
+        direction = torch.randn(gradient.shape, dtype=torch.float64, generator=random)
+        step = 1e-5 * direction / direction.abs().max()
+        ends = [total([*start[:index], start[index] + sign * step, *start[index + 1 :]]) for sign in (1, -1)]
+        expected = float(ends[0] - ends[1]) / 2
+        assert abs(float((gradient * step).sum()) - expected) <= 1e-6 * abs(expected), name
+
+
+@pytest.mark.parametrize("given", [{}, {"normals": "flat"}, {"shadows": True}, {"bounces": 2}])
+def test_an_operator_gives_the_images_of_render(given):
+    mesh, light = normalize(solid("cup")), positive_light(6).float()
+    gloss = Gloss(torch.rand(len(mesh.faces)), 0.3, torch.rand(len(mesh.faces)))
+    with pytest.warns(UserWarning, match="roughness"):
+        images = render(mesh, [CAMERA, NEARBY], light, 24, gloss=gloss, **given)
+        operators = precompute_transfer(gloss.on(mesh), [CAMERA, NEARBY], 24, **given)
+    torch.testing.assert_close(torch.stack([each.image(light) for each in operators]), images, rtol=0, atol=2e-6)
+
+
+def test_no_highlight_shines_through_the_object():
+    """A metal cup, of whose own reflection in itself Mitsuba's direct light has nothing, either. Rays in 512 directions
+    leave an error; without them, light comes through the wall."""
+    cup, light, gloss = normalize(solid("cup")), positive_light(6), Gloss(0.5, metallic=1.0)
+    mirror = {"type": "roughconductor", "distribution": "ggx", "alpha": 0.25, "material": "none"}
+    white = replace(cup, corner_colors=np.ones_like(cup.corner_colors))
+    theirs = mitsuba_radiance(white, light, {"type": "twosided", "material": mirror}, 64)
+    shadowed, open_sky = (difference(our_radiance(white, light, gloss, shadows=on), theirs) for on in (True, False))
+    assert shadowed < 0.1 < 0.2 < open_sky
+
+
+def test_a_lamps_highlight_is_mitsubas():
+    """A rough conductor and a point light, which has no noise but the pixels' edges."""
+    gloss, lamp = Gloss(0.4, metallic=1.0), Lamps(((2.0, 1.0, 2.5),), power=1.0)
+    settings = ImageSettings(24, 4, normals="smooth")
+    [operator] = build_operators(EGG, [CAMERA], settings, choose("numpy"), basis=lamp, dtype=UP.dtype, gloss=gloss)
+    ours = UP.new_zeros(3, 24**2).index_copy(1, operator.pixels, operator.radiance(UP.new_ones(1, 3)))
+    with mitsuba() as module:
+        surface = {"type": "roughconductor", "distribution": "ggx", "alpha": 0.16, "material": "none"}
+        point = {
+            "type": "point",
+            "position": list(lamp.positions[0]),
+            "intensity": {"type": "rgb", "value": [math.pi] * 3},
+        }
+        mesh_of = shape(module, surface, EGG.vertices, EGG.faces, EGG.vertex_normals)
+        film = sensor_of(CAMERA, 24) | {"sampler": {"type": "multijitter", "sample_count": 64}}
+        scene = load(
+            module, {"type": "scene", "integrator": integrator(0, 1), "lamp": point, "shape": mesh_of, "sensor": film}
+        )
+        theirs = torch.from_numpy(np.array(module.render(scene, seed=0))[..., :3]).double().permute(2, 0, 1)
+    assert difference(ours.unflatten(1, (24, 24)), theirs) < 0.02
+
+
+def test_roughness_that_no_light_shows_is_said_and_values_out_of_range_are_refused():
+    mesh, light = solid("pear"), positive_light(6)
+    with pytest.warns(UserWarning, match="0.2"):
+        mirror = render(mesh, CAMERA, light, 8, gloss=Gloss(0.0))
+    assert torch.equal(mirror, render(mesh, CAMERA, light, 8, gloss=Gloss(LEAST)))
+    for gloss in (Gloss(1.5), Gloss(0.5, -0.1), Gloss(0.5, strength=torch.ones(3)), Gloss(float("nan"))):
+        with pytest.raises(InputError, match=r"roughness|metallic|strength"):
+            render(mesh, CAMERA, light, 8, gloss=gloss)
+
+
+def test_parts_and_subdivisions_keep_their_gloss():
+    """A matte part of a mesh of several is rendered as it was alone."""
+    pear, light = Gloss(0.3).on(solid("pear")), positive_light(6)
+    whole = concatenate([pear, solid("table")])
+    assert whole.gloss[0].tolist() == pytest.approx([0.3, 0, 1]) and whole.gloss[-1].tolist() == [1, 0, 0]
+    assert (subdivide(whole, 10**4).gloss == np.repeat(whole.gloss, 4, axis=0)[:1]).any()
+    matte, table = replace(whole, gloss=whole.gloss * [[1, 0, 0]]), concatenate([solid("pear"), solid("table")])
+    torch.testing.assert_close(*(render(mesh, CAMERA, light, 16) for mesh in (matte, table)), rtol=0, atol=1e-12)
