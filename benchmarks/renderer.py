@@ -11,6 +11,7 @@ radiance before clamping, and of the gradient of Σ image × normal random numbe
 import argparse
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -22,9 +23,11 @@ from torch import Tensor
 from benchmarks import reference, scene
 from benchmarks.common import Row, machine, medians, write_csv
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
-from renderer import shading
+from renderer import rendering, shading
 from renderer.fragments import Fragments
+from renderer.gloss import Gloss
 from renderer.image import tonemap
+from renderer.mesh import Mesh
 from renderer.rasterizer import NAMES, choose
 from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator
 
@@ -231,6 +234,22 @@ def savings(view: View) -> Iterator[tuple[str, Call, Call]]:
     yield f"back faces of a closed mesh are not drawn, {view.rasterizer.name}", draw, partial(draw, closed=True)
     step = light_step(view, operator, coefficients(DEGREE, torch.float32, view.device))
     yield "a step by the light does not rasterize", lambda: (view.operator(), step()), step
+    light, shiny = coefficients(DEGREE, torch.float32, view.device), replace(view, mesh=Gloss(0.4).on(view.mesh))
+    glossy, vertices = shiny.operator(), view.vertices()
+    by_light = light_step(view, glossy, light)
+    yield "a step by the light without gloss", by_light, step
+    dense = replace(glossy, transfer=torch.rand_like(glossy.transfer))
+    yield "as many coefficients and channels without gloss", by_light, light_step(view, dense, light)
+    yield "building an operator without gloss", shiny.operator, view.operator
+
+    def by_vertices(mesh: Mesh) -> Call:
+        moved = vertices.clone().requires_grad_()
+        image = partial(
+            rendering.render, mesh, CAMERA, light, view.size, vertices=moved, rasterizer=view.rasterizer.name
+        )
+        return lambda: torch.autograd.grad(image().sum(), moved)
+
+    yield "a step by the vertices without gloss", by_vertices(shiny.mesh), by_vertices(view.mesh)
 
 
 # ---------------------------------------------------------------------------- results
