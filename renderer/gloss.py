@@ -84,10 +84,16 @@ class SampleGloss(NamedTuple):
         dielectric = (1 - self.metallic) * self.strength
         return self.metallic * first, dielectric * (DIELECTRIC * first + second) + self.metallic * second
 
+    def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor, Tensor]:
+        """(colored, white) reflection (S,) of an even sky of irradiance 1. normals, toward the camera: (S, 3) unit."""
+        cosine = (normals * toward).sum(1)
+        first, second = lobe_weights(cosine, self.roughness, 0).sum((1, 2)) / math.pi
+        return self.split(first, second)
+
     def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
-        """(S,) the fraction of the albedo that is left below the coat. normals, toward the camera: (S, 3) unit."""
-        first, second = lobe_weights((normals * toward).sum(1), self.roughness, 0).sum((1, 2)) / math.pi
-        return (1 - self.metallic) * (1 - self.strength * (DIELECTRIC * first + second))
+        """(S,) the fraction of the albedo that is left below the coat: of a dielectric, what that does not reflect."""
+        _, coat = self._replace(metallic=torch.zeros_like(self.metallic)).even(normals, toward)
+        return (1 - self.metallic) * (1 - coat)
 
     def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor, Tensor]:
         """(colored, white) radiance (S, (degree + 1)²) per unit coefficient of environment light; differentiable."""

@@ -26,6 +26,7 @@ from torch import Tensor
 from renderer.albedo import surface_albedo
 from renderer.errors import InputError
 from renderer.fragments import Fragments
+from renderer.gloss import SampleGloss
 from renderer.image import ImageSettings
 from renderer.light.basis import Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh, refine
@@ -125,8 +126,7 @@ class Transport:
             if change is None:
                 change = self._sky.new_zeros(len(weights), self._sky.shape[1], len(fragments.pixels))
             if gloss is not None:
-                at, of_samples = gloss.at(hits.sample), (surface.normals[hits.sample], surface.toward[hits.sample])
-                colored, white = at.along(*of_samples, self._directions)
+                colored, white = self._lobes(gloss, surface, hits.sample)
             for channel, added in enumerate(change):
                 reflected = diffuse[channel][hits.sample]
                 if gloss is not None:
@@ -138,6 +138,17 @@ class Transport:
                     received = self._patches.weights_by_patch(hits, self._directions, blocked) @ sent
                     added[:, hits.pixels] += torch.from_numpy(received).T
         return change
+
+    def _lobes(self, gloss: SampleGloss, surface: Surface, sample: Tensor) -> tuple[Tensor, Tensor]:
+        """(colored, white) radiance (B, D) per irradiance from the directions at samples (B, D). Lobes may be narrower
+        than the directions are apart: they are scaled to reflect as much of an even sky as they do in closed form."""
+        normals, toward = surface.normals[sample], surface.toward[sample]
+        colored, white = gloss.at(sample).along(normals, toward, self._directions)
+        cosine = torch.einsum("bdi,di->bd", normals, self._directions).clamp(min=0)
+        sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
+        exact = torch.stack(gloss.even(surface.normals, surface.toward)).sum(0)
+        scale = exact[sample].mean(1, keepdim=True) / sampled.clamp(min=torch.finfo(sampled.dtype).tiny)
+        return colored * scale, white * scale
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
         """(3, P) in the light's dtype: `change` in a light (size, 3); differentiable in it, not in the albedo."""
