@@ -115,7 +115,7 @@ def progress(items: Iterable[Item], description: str, total: int | None = None, 
             counted = f": {done} of {bar.total}" if done and bar.total else ""
             if bar.total and done > before:
                 left = (time.perf_counter() - start) / (done - before) * (bar.total - done)
-                counted += f", about {tqdm.format_interval(left)} left"
+                counted += f", {tqdm.format_interval(left)} left at this rate"
             print(f"{description}{counted} ...", file=sys.stderr, flush=True)
             wait = min(2 * wait, 30.0)
 

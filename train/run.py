@@ -79,7 +79,7 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         before = _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(data.train.to(trainer.device), held_out, log)
-        scores = before | _test_scores(trainer, data)
+        scores = before | _test_scores(trainer, data, _test_images(settings, data))
         summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
         for name, summary in summaries.items():
             console.info("%s: %s", name, format_summary(summary))
@@ -223,7 +223,7 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
     return {"test/accuracy_before": accuracy}
 
 
-def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
+def _test_scores(trainer: Trainer, data: DataSet, images: str) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(trainer.device)
     last = selected = evaluate(trainer.selected, test)["accuracy"]
@@ -231,7 +231,7 @@ def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
     if best["epoch"] != trainer.epoch:
         trainer.selected.network.load_state_dict(best["model"])
         selected = evaluate(trainer.selected, test)["accuracy"]
-    console.info("test accuracy %.4f (the selected network, epoch %d), %.4f (the last)", selected, best["epoch"], last)
+    console.info("accuracy %.4f (epoch %d, selected), %.4f (the last) on %s", selected, best["epoch"], last, images)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
 

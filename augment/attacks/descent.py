@@ -148,7 +148,7 @@ def _descend_once(
     length = values.new_ones(len(values), 1)
     predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
     with as_found(model):
-        for step in progress(range(settings.max_steps + 1), "attack"):
+        for step in progress(range(settings.max_steps + 1), "attack, until all succeed"):
             chosen, active_goal = candidate[active].requires_grad_(True), goal.of(active)
             rendered = problem.render(chosen, examples[active])
             shown = rendered.detach()
