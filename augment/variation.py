@@ -180,7 +180,7 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws, device)
     if not (settings.lit_background or settings.tables or settings.background_saturation):
         return replace(scene, examples=rows, lights=_with_directional(sky, lamps), **changed)
-    albedo = decode(scene.backgrounds[[row.background for row in rows]], scene.settings.encoding)
+    albedo = decode(scene.backgrounds, scene.settings.encoding)[[row.background for row in rows]]
     if settings.background_saturation:
         colors = _colors(torch.rand(len(rows), 2, generator=draws) * torch.tensor([1, settings.background_saturation]))
         albedo = albedo * colors.to(albedo)
@@ -353,7 +353,7 @@ def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points and a shift, both of x and y first
     lambda points, shift: ((points + shift) % 1 < 0.5)[0],  # stripes
     lambda points, shift: ((points + shift) % 1 < 0.5).sum(0) == 1,  # checkers
-    lambda points, shift: ((points + shift) % 1 - 0.5).norm(dim=0) < 0.4,  # spots on a square grid, over half its area
+    lambda points, shift: ((points + shift) % 1 - 0.5).square().sum(0) < 0.4**2,  # spots, over half the area
     lambda points, shift: (points > shift - 0.5)[0],  # a half
     lambda points, shift: torch.ones_like(points[0]),  # a solid color
 )
