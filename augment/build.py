@@ -115,7 +115,7 @@ class RendererSettings:
     """How `build_scene` renders; the schema of a command's `renderer`, too.
 
     rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples: per pixel side. encoding,
-    normals, shadows, bounces: as for `renderer.render`.
+    normals, shadows, bounces, silhouettes: as for `renderer.render`.
     """
 
     rasterizer: str = "auto"
@@ -124,6 +124,7 @@ class RendererSettings:
     normals: str = "smooth"
     shadows: bool = False
     bounces: int = 0
+    silhouettes: bool = False
 
     def __post_init__(self) -> None:
         self.image(size=1)  # which checks most
@@ -132,7 +133,7 @@ class RendererSettings:
 
     def image(self, size: int) -> ImageSettings:
         """The settings of an image of `size` pixels per side."""
-        return ImageSettings(size, self.samples, self.encoding, self.normals, self.shadows, self.bounces)
+        return ImageSettings(size, **{name: value for name, value in vars(self).items() if name != "rasterizer"})
 
 
 Shown = str | Path | Mesh

@@ -17,11 +17,11 @@ from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import sample_gloss
-from renderer.image import ImageSettings
+from renderer.image import ImageSettings, decode
 from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.rendering import view_radiance
+from renderer.rendering import view_radiance, view_with_outlines
 from renderer.shading import normals_in_sight
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
@@ -128,13 +128,16 @@ class Reshading:
         vertices: Tensor | None,
         added: Tensor | None,
         positions: Tensor | None,
-    ) -> tuple[Fragments, Tensor]:
-        """Fragments of an object, and its radiance (3, P) in a light (size, 3), differentiable in all tensors.
+        background: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Pixels (P,) of an object, their coverage (P,), and its radiance (3, P) in a light (size, 3); differentiable
+        in all tensors, with `settings.silhouettes` also in tensors among the camera's fields.
 
         example: whose shapes change little from call to call. vertices: (V, 3), and positions of lamps: (L, 3); None
-        where they have not moved. added: offsets of each face's linear albedo, (F, 3).
+        where they have not moved. added: offsets of each face's linear albedo, (F, 3). background: image values behind
+        the object, (3 or 1, size²).
         """
-        item, settings = self.objects[number], self.settings
+        item, settings, moving_camera, camera = self.objects[number], self.settings, camera, camera.fixed()
         if vertices is None:
             corners, shape = self.vertices[number], item.mesh.vertices
             fragments, albedo = self.view(number, camera)
@@ -160,12 +163,18 @@ class Reshading:
 
         def indirect(albedo: Tensor, light: Tensor) -> Tensor:
             frozen = self._transport_near(example, number, camera, shape)
-            return frozen.radiance(camera, fragments, albedo, light)
+            added = frozen.radiance(camera, fragments, albedo, light)
+            if camera is not moving_camera:  # it will not come back
+                del frozen.views[camera]
+            return added
 
         extra = indirect if settings.global_illumination else None
         gloss = sample_gloss(item.mesh, fragments)
-        shaded = fragments, corners, albedo, lights, normals
-        return fragments, view_radiance(*shaded, local_view, extra, positions, gloss)
+        shading = corners, albedo, lights, normals, local_view, extra, positions, gloss
+        if vertices is None or not settings.silhouettes:
+            return fragments.pixels, fragments.coverage.to(self.like), view_radiance(fragments, *shading)
+        behind = decode(background, settings.encoding).expand(3, -1)
+        return view_with_outlines(moving_camera, fragments, self._faces[number], behind, *shading)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""

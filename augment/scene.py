@@ -51,8 +51,9 @@ class Conditions:
     """The light, shape and colors that A examples are rendered with.
 
     light: coefficients of the scene's basis. vertices: None for those of the meshes. albedo: added to each face's
-    linear albedo. pixels: added to the values of the V images. positions: of the lamps, None for those of the basis. N
-    and F are the largest mesh's; a smaller mesh has the first of them.
+    linear albedo. pixels: added to the values of the V images. positions: of the lamps, None for those of the basis.
+    cameras: what is added to the polar angle, the azimuth and the logarithm of the distance of all V cameras. N and F
+    are the largest mesh's; a smaller mesh has the first of them.
     """
 
     light: Float[Tensor, "A coefficients 3"]
@@ -60,6 +61,7 @@ class Conditions:
     albedo: Float[Tensor, "A F 3"] | None = None
     pixels: Float[Tensor, "A V 3 size size"] | None = None
     positions: Float[Tensor, "A L 3"] | None = None
+    cameras: Float[Tensor, "A 3"] | None = None
 
 
 @dataclass(eq=False, repr=False)
@@ -168,6 +170,14 @@ class Scene:
         """The light's basis for a row of conditions, with lamps at its positions."""
         return self.basis if conditions.positions is None else moved(self.basis, conditions.positions[row].detach())
 
+    def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
+        """The cameras of an example under a row of conditions."""
+        cameras = self.cameras[example]
+        if conditions.cameras is None:
+            return cameras
+        radius = 0.0 if conditions.vertices is None else float(conditions.vertices[row].detach().norm(dim=1).max())
+        return tuple(camera.moved(*conditions.cameras[row]).seeing(radius) for camera in cameras)
+
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """The unattacked conditions of some examples."""
         return Conditions(self.lights[examples])
@@ -227,9 +237,10 @@ class Scene:
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
             added = None if conditions.albedo is None else conditions.albedo[row, : len(mesh.faces)]
             positions = None if conditions.positions is None else conditions.positions[row]
-            shown = index, example.object, example.cameras[view]
-            fragments, radiance = self._reshading.radiance(*shown, light[row], vertices, added, positions)
-            coverage = fragments.coverage.to(radiance)[None]
-            behind = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
-            composite = radiance + background_term(coverage, behind, self.settings.encoding)
-            yield Layer(slice(image, image + 1), fragments.pixels, composite[None])
+            cameras = self.cameras_under(conditions, row, index)
+            shown, behind = (index, example.object, cameras[view]), self.backgrounds[example.background].flatten(1)
+            pixels, coverage, radiance = self._reshading.radiance(
+                *shown, light[row], vertices, added, positions, background=behind
+            )
+            term = background_term(coverage[None], behind.index_select(1, pixels), self.settings.encoding)
+            yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])

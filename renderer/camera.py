@@ -6,9 +6,11 @@ World axes are right-handed with z up.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from renderer.errors import LARGEST, InputError, require_range
 
@@ -56,6 +58,19 @@ class Camera(ABC):
         """The same camera, with a reach that contains a ball around the origin."""
         return self if radius <= self.reach else replace(self, reach=math.floor(radius) + 1.0)
 
+    def fixed(self) -> Self:
+        """The same camera with numbers in place of tensors, if it has any."""
+        numbers = {name: value.item() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **numbers) if numbers else self
+
+    def moved(self, polar: Tensor, azimuth: Tensor, log_distance: Tensor) -> Self:
+        """Turned by angles and, with the same field of view, farther by a factor exp(log_distance); without
+        perspective, its image is wider by that factor. Its fields are tensors."""
+        factor = log_distance.exp()
+        moved: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
+        moved |= {name: getattr(self, name) * factor for name in ("width", "distance") if name in vars(self)}
+        return replace(self, **moved)
+
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
         sin_polar, cos_polar = math.sin(self.polar), math.cos(self.polar)
@@ -82,6 +97,26 @@ class Camera(ABC):
         stay planes in it.
         """
 
+    def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Image positions (V, 3) of world points (V, 3) as (x w, y w, w), and how near these are (V,), which is linear
+        in the image. Differentiable in the points, and in the camera's fields if they are tensors."""
+        polar, azimuth = (torch.as_tensor(angle).to(points) for angle in (self.polar, self.azimuth))
+        (sin_polar, cos_polar), (sin, cos) = ((angle.sin(), angle.cos()) for angle in (polar, azimuth))
+        rows = (
+            [-sin, cos, 0 * sin],
+            [-cos_polar * cos, -cos_polar * sin, sin_polar],
+            [sin_polar * cos, sin_polar * sin, cos_polar],
+        )
+        right, up, back = torch.stack([torch.stack(row) for row in rows]) @ points.T
+        w, nearness = self._w(back)
+        return torch.stack(
+            [(right + self.right) * (2 / self.width), (up + self.up) * (2 / self.width), w], dim=1
+        ), nearness
+
+    @abstractmethod
+    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        """(w, nearness) of points so far (V,) from the origin to the camera."""
+
     def depths(self, points: np.ndarray) -> np.ndarray | None:
         """(V,) along the view from the camera to world points (V, 3), by which an image with perspective is divided;
         None of one without."""
@@ -105,6 +140,9 @@ class OrthographicCamera(Camera):
     def project(self, points: np.ndarray) -> np.ndarray:
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
+
+    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.ones_like(back), back
 
 
 @dataclass(frozen=True)
@@ -138,6 +176,10 @@ class PerspectiveCamera(Camera):
         before = self.distance - self.near
         depth = 2 * self.far / (self.far - self.near) * ((before - back) / depths) - 1
         return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth], axis=1)
+
+    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        w = 1 - back / self.distance
+        return w, 1 / w
 
     def depths(self, points: np.ndarray) -> np.ndarray:
         """InputError where a point lies behind the camera or as good as there."""

@@ -84,10 +84,41 @@ class Fragments:
         column, row = column * self.samples + across, row * self.samples + down
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
+    def by_sample(self) -> "Fragments":
+        """The same samples, in the same order, as pixels of an image of size · samples pixels per side."""
+        resolution = self.size * self.samples
+        cells = torch.arange(resolution**2, device=self.sample.device).view(self.size, self.samples, self.size, -1)
+        sample = cells.transpose(1, 2).flatten().index_select(0, self.sample)
+        pixel, coverage = torch.arange(len(sample), device=sample.device), self.coverage.new_ones(len(sample))
+        finer: dict[str, Any] = {"pixels": sample, "pixel": pixel, "sample": sample, "coverage": coverage}
+        return self._like(replace(self, size=resolution, samples=1, **finer), slice(None))
+
+    def select(self, samples: Tensor) -> "Fragments":
+        """Some of the samples (N,), in the same pixels."""
+        chosen: dict[str, Any] = {name: getattr(self, name)[samples] for name in ("pixel", "face", "sample")}
+        return self._like(replace(self, **chosen), samples)
+
+    def _like(self, view: "Fragments", samples: Tensor | slice) -> "Fragments":
+        """A view with samples of this one, and with their weights, if these are there already."""
+        if "barycentric" in vars(self):
+            vars(view)["barycentric"] = self.barycentric[samples]
+        return view
+
+    def image_of_samples(self, values: Tensor, empty: float) -> Tensor:
+        """Values (S,) where the samples lie in the image, (size · samples, size · samples), and `empty` elsewhere."""
+        image = values.new_full((self.size**2 * self.samples**2,), empty).index_copy_(0, self.sample, values)
+        by_row = image.view(self.size, self.size, self.samples, self.samples).transpose(1, 2)
+        return by_row.reshape(self.size * self.samples, -1)
+
     def interpolate(self, corners: Tensor) -> Tensor:
         """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
         rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(rows, self.face, self.barycentric.T).T
+
+    def distribute(self, values: Tensor) -> Tensor:
+        """(G, 3, D) sums of values (S, D) over the samples, weighted for each corner: `interpolate` transposed."""
+        rows = _distribute(values.T, self.face, self.barycentric.T, (3 * values.shape[1], len(self.faces)))
+        return rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(pixel (R,), face (R,), albedo (R, C)): neighboring samples of one face in one pixel as one, since they
@@ -133,10 +164,15 @@ class _Interpolation(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         face, weights = ctx.saved_tensors
-        by_corners = upstream.new_zeros(ctx.corners)
-        for above, index, weight in _blocks(upstream, face, weights.to(upstream)):
-            by_corners.index_add_(1, index, (weight[:, None] * above).flatten(0, 1))
-        return by_corners, None, None
+        return _distribute(upstream, face, weights, ctx.corners), None, None
+
+
+def _distribute(values: Tensor, face: Tensor, weights: Tensor, corners: Sequence[int]) -> Tensor:
+    """Values (D, S) of samples, to the corners (3 D, G) of their faces."""
+    by_corners = values.new_zeros(corners)
+    for value, index, weight in _blocks(values, face, weights.to(values)):
+        by_corners.index_add_(1, index, (weight[:, None] * value).flatten(0, 1))
+    return by_corners
 
 
 def build_fragments(

@@ -27,7 +27,7 @@ class ImageSettings:
     """Image size in pixels, samples per side of a pixel, encoding, a normal per face or interpolated vertex normals.
 
     shadows: of the mesh on itself. bounces: how often light goes on from one surface to another, which includes
-    shadows. InputError: a number out of range, an unknown choice.
+    shadows. silhouettes: derivatives see how outlines move. InputError: a number out of range, an unknown choice.
 
     >>> ImageSettings(size=224, samples=2, encoding="srgb", bounces=1).global_illumination
     True
@@ -39,6 +39,7 @@ class ImageSettings:
     normals: str = "flat"
     shadows: bool = False
     bounces: int = 0
+    silhouettes: bool = False
 
     def __post_init__(self) -> None:
         require_range("size", self.size, 1, MOST_SAMPLES)

@@ -21,7 +21,7 @@ from renderer.errors import LARGEST, InputError, require_choice, require_range
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 MOST_VERTICES = 10**7  # some 5 GB
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
-_EDGES = ((0, 1), (1, 2), (2, 0))
+EDGES = ((0, 1), (1, 2), (2, 0))  # corners of a face
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
 
 
@@ -139,7 +139,7 @@ def _closed_parts(faces: bytes) -> np.ndarray | None:
     from trimesh.graph import connected_component_labels  # trimesh takes half a second
 
     corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
-    edges, count = corners[:, _EDGES].reshape(-1, 2), corners.max(initial=0) + 1
+    edges, count = corners[:, EDGES].reshape(-1, 2), corners.max(initial=0) + 1
     forth, back = edges @ [count, 1], edges @ [1, count]
     by_forth, by_back = np.argsort(forth), np.argsort(back)
     if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
@@ -291,7 +291,7 @@ def _select(mesh: Mesh, faces: np.ndarray) -> Mesh:
 
 def _quartered(mesh: Mesh) -> Mesh:
     count = len(mesh.vertices)
-    ends = np.sort(mesh.faces[:, _EDGES].reshape(-1, 2), axis=1)
+    ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends @ [count, 1], return_inverse=True)  # one number is sorted faster than a pair
     middles = mesh.vertices[np.stack(np.divmod(edges, count), axis=1)].mean(axis=1)
     around = np.concatenate([mesh.faces, count + edge.reshape(-1, 3)], axis=1)
@@ -308,5 +308,5 @@ def _quartered(mesh: Mesh) -> Mesh:
 
 def _interpolated(corners: np.ndarray) -> np.ndarray:
     """Values (4F, 3, D) at the corners of the quarters, of values (F, 3, D) at the corners of the faces."""
-    middles = corners[:, _EDGES].mean(axis=2)
+    middles = corners[:, EDGES].mean(axis=2)
     return np.concatenate([corners, middles], axis=1)[:, _QUARTERS].reshape(-1, *corners.shape[1:])

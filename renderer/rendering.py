@@ -9,6 +9,7 @@ from functools import cache, partial, reduce
 from typing import TYPE_CHECKING
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo
@@ -16,13 +17,14 @@ from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.image import ImageSettings, as_background, composite
+from renderer.image import ImageSettings, as_background, composite, decode
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.shapes import sphere
+from renderer.silhouettes import moving_outlines
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
@@ -54,6 +56,7 @@ def render(
     normals: str = "smooth",
     shadows: bool = False,
     bounces: int = 0,
+    silhouettes: bool = False,
     rasterizer: str = "auto",
 ) -> Float[Tensor, "V 3 size size"]:
     """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices, albedo and gloss.
@@ -66,6 +69,8 @@ def render(
     linear or srgb. normals: flat or smooth. shadows: that the mesh casts on itself. bounces: of light between its
     surfaces, shadows included. rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold visibility
     constant; those by vertices, albedo and gloss also hold shadows and bounces of environment light constant.
+    silhouettes: gradients by vertices, and by fields of the cameras that are tensors of one number, also see how
+    outlines and surfaces move in the image.
     InputError: NaN, shapes that do not fit, unknown choices.
 
     >>> light = renderer.load_light("grace").requires_grad_()
@@ -73,7 +78,7 @@ def render(
     >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
     (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
-    settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
+    settings = ImageSettings(size, samples, encoding, normals, shadows, bounces, silhouettes)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         raise InputError(f"vertices of shape {tuple(vertices.shape)} does not fit the mesh: give {mesh.vertices.shape}")
@@ -81,7 +86,9 @@ def render(
     like = next((values for _, values in [(None, light), *local] if values is not None), torch.zeros(0))
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
     positions = vertices.detach().cpu().double().numpy()
-    views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(rasterizer), closed=mesh.closed)
+    cameras = _listed(cameras)
+    fixed = [camera.fixed() for camera in cameras]
+    views = build_fragments(positions, mesh.faces, fixed, settings, _choose(rasterizer), closed=mesh.closed)
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
     smooth, faces = normals == "smooth" and light is not None, torch.from_numpy(mesh.faces).to(like.device)
     moved = replace(mesh, vertices=positions)
@@ -92,7 +99,7 @@ def render(
     transport = build_transport(moved, settings, albedo_scale, basis) if emitters else None
     rays = transport.rays if transport else Rays(moved)
     images = []
-    for view, behind in zip(views, backgrounds, strict=True):
+    for camera, view, behind in zip(cameras, views, backgrounds, strict=True):
         fragments = view.to(like.device)
         colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
         surface = Surface(moved, view, settings, given_gloss=gloss)
@@ -100,8 +107,14 @@ def render(
         in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices, gloss))
         of_vertices = normals_in_sight(fragments, vertices, faces) if smooth else None
         shine = sample_gloss(mesh, fragments, gloss)
-        shade = view_radiance(fragments, vertices, colors, emitters, of_vertices, in_local_light, indirect, gloss=shine)
-        images.append(composite(shade, fragments.coverage.to(like), fragments.pixels, behind, encoding))
+        shading = vertices, colors, emitters, of_vertices, in_local_light, indirect, None, shine
+        if silhouettes:
+            linear = decode(behind.flatten(1), encoding)
+            pixels, coverage, shade = view_with_outlines(camera, fragments, faces, linear, *shading)
+        else:
+            pixels, coverage = fragments.pixels, fragments.coverage.to(like)
+            shade = view_radiance(fragments, *shading)
+        images.append(composite(shade, coverage, pixels, behind, encoding))
     return torch.stack(images)
 
 
@@ -125,13 +138,48 @@ def view_radiance(
     radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not lights else []
     for basis, light in lights:
         if isinstance(basis, LocalBasis):
-            radiances.append(in_local_light().radiance(basis, albedo, light, positions))
+            radiances.append(in_local_light().radiance(basis, albedo, light, positions, fragments))
             continue
         shaded = fragments, vertices, light, albedo, normals
         radiances.append(radiance(*shaded) if gloss is None else glossy_radiance(*shaded, gloss))
         if indirect is not None:
             radiances.append(indirect(albedo, light))
     return reduce(torch.add, radiances)
+
+
+def view_with_outlines(
+    camera: Camera,
+    fragments: Fragments,
+    faces: Tensor,
+    background: Tensor,
+    vertices: Tensor,
+    albedo: Tensor,
+    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]],
+    normals: Tensor | None,
+    in_local_light: Callable[[], LocalLightView],
+    indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
+    positions: Tensor | None = None,
+    gloss: SampleGloss | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(pixels (P + E,), coverage (P + E,), radiance (3, P + E)) of one view, of which E pixels are not covered; the
+    radiance, that of `view_radiance`, is differentiable in outlines, too (`renderer.silhouettes`).
+
+    background: linear, (3, size²). What shadows and bounces of environment light add to a pixel is divided among its
+    samples by albedo, where outlines move.
+    """
+    shading, pixel = (vertices, albedo, lights, normals, in_local_light), fragments.pixel
+    at_samples = view_radiance(fragments.by_sample(), *shading, None, positions, gloss)
+    summed = at_samples.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, at_samples) / fragments.samples**2
+    values = at_samples.detach()
+    if indirect is not None:
+        added = [indirect(albedo, light) for basis, light in lights if not isinstance(basis, LocalBasis)]
+        summed = reduce(torch.add, added, summed)
+        total = values.new_zeros(summed.shape).index_add(1, pixel, albedo.detach().T.to(values))
+        per_albedo = torch.stack(added).sum(0).detach() * fragments.samples**2 / total.masked_fill(total == 0, 1)
+        values = values + per_albedo[:, pixel] * albedo.detach().T
+    pixels, zeros = moving_outlines(fragments, camera, vertices, faces, values, background)
+    coverage = F.pad(fragments.coverage.to(summed), (0, len(pixels)))
+    return torch.cat([fragments.pixels, pixels]), coverage, F.pad(summed, (0, len(pixels))) + zeros
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:

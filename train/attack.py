@@ -90,7 +90,7 @@ class TransferSettings:
 @dataclass
 class AttackExperimentSettings:
     """One attack on one classifier; conf/attack.yaml says what each key does. A projector or lamps that are attacked
-    stand in the scene, where it names none with their defaults."""
+    stand in the scene, where it names none with their defaults; an attacked pose sets `renderer.silhouettes`."""
 
     classifier: str = "efficientnet_lite0"
     weights: str | None = None
@@ -115,6 +115,8 @@ class AttackExperimentSettings:
         require_transferable(self.attack.parameters, self.transfer.azimuths, self.transfer.meshes)
         if self.attack.projector is not None and self.scene.projector is None:
             self.scene.projector = ProjectorSettings()
+        if self.attack.pose is not None:
+            self.renderer.silhouettes = True
         if self.attack.lamps is not None and self.scene.lamps is None:
             self.scene.lamps = LampsSettings()
         if self.attack.positions is not None and self.scene.lamps is None:

@@ -64,7 +64,7 @@ class Adversary:
             mesh = replace(mesh, vertices=vertices)
         return Adversary(
             shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
-            cameras=of_example.cameras,
+            cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
             light=after.light[row].detach().cpu() * of_example.exposure,
             basis=scene.basis_under(after, row),
             background=scene.backgrounds[of_example.background].cpu(),

@@ -15,7 +15,7 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import EOTSettings, Rounded
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings, lighting
+from augment.attacks.parameters import PARAMETERS, AttackProblem, PoseSettings, SkylightSettings, lighting
 from augment.classifiers.adapter import Classifier
 from augment.losses import logit_gap
 from augment.scene import Conditions, Scene
@@ -30,8 +30,8 @@ class AttackSettings:
     """What an attack changes, and how it descends. The defaults are careful: the light stays physically possible, and a
     success survives being stored with 8 bits; the paper has allow_negative=True, margin=0 and rounded=False.
 
-    lighting, skylight, projector, lamps, positions (of lamps), geometry, albedo, pixels: norm-ball and steps of each
-    parameter; None leaves it as it is.
+    lighting, skylight, projector, lamps, positions (of lamps), geometry, pose, albedo, pixels: norm-ball and steps of
+    each parameter; None leaves it as it is.
     max_steps: renders after the first; the paper's appendix C has 30. shorten: undo a step that did not lower the cost,
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
@@ -47,6 +47,7 @@ class AttackSettings:
     lamps: StepSettings | None = None
     positions: StepSettings | None = None
     geometry: StepSettings | None = None
+    pose: PoseSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None
     max_steps: int = 30

@@ -1,4 +1,4 @@
-"""What an attack may change: light, sky, a projector's pattern, lamps, shape, colors, pixels; any at once."""
+"""What an attack may change: light, sky, a projector's pattern, lamps, shape, pose, colors, pixels; any at once."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,12 +13,13 @@ from torch.nn.utils.rnn import pad_sequence
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.scene import Conditions, Scene
 from augment.utils import progress
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 
+POSE = ("rotation", "shift", "scale", "view", "distance")  # its parts, of 3, 2, 1, 2 and 1 values
 TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
 
 
@@ -29,6 +30,26 @@ class SkylightSettings(StepSettings):
     zenith: float = 45.0
     azimuth: float = 0.0
     turbidity: float = 3.0
+
+
+@dataclass
+class PoseSettings(StepSettings):
+    """How far each part of a pose goes for a value of 1; with 0, the part is left as it is. rotation of the object, in
+    degrees. shift: along the table, in world units. scale: of the object, as a fraction. view: the camera's polar and
+    azimuthal angle, in degrees. distance: of the camera, as a fraction."""
+
+    rotation: float = 10.0
+    shift: float = 0.1
+    scale: float = 0.1
+    view: float = 10.0
+    distance: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, most in zip(POSE, (180, 10, 1, 180, 1), strict=True):
+            require_range(name, getattr(self, name), 0, most)
+        if not any(getattr(self, name) for name in POSE):
+            raise InputError(f"{', '.join(POSE)} are all 0: nothing of the pose would change")
 
 
 @dataclass
@@ -153,9 +174,44 @@ def skylight(scene: Scene, settings: SkylightSettings) -> Parameter:
 
 
 def geometry(scene: Scene, settings: StepSettings) -> Parameter:
-    """Displacements of the object's vertices, in world units; it spans [-1, 1]. The gradient sees how normals turn."""
+    """Displacements of the object's vertices, in world units; it spans [-1, 1]. The gradient sees how normals turn
+    and, with `silhouettes`, how outlines move."""
     own = [item.own_vertices for item in scene.objects]
     return _of_mesh(scene, settings, "geometry", own, "vertices", scene.vertices)
+
+
+def pose(scene: Scene, settings: PoseSettings) -> Parameter:
+    """Nine values: the object's rotation vector (about the origin), its shift along x and y and the logarithm of its
+    scale; the polar angle, the azimuth and the logarithm of the distance of the cameras, in the settings' units. Among
+    props or on a table, the object stays on their ground. InputError without `silhouettes`."""
+    if not scene.settings.silhouettes:
+        raise InputError("attack=pose needs gradients of outlines: set renderer.silhouettes=true")
+    angle, view = math.radians(settings.rotation), math.radians(settings.view)
+    units = [angle] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)] + [view] * 2
+    unit = torch.tensor([*units, math.log1p(settings.distance)], dtype=torch.float64).to(scene.lights)
+    own = pad_sequence([torch.from_numpy(item.own_vertices) for item in scene.objects], batch_first=True).to(
+        unit.device
+    )
+    lowest = [math.nan if item.own is None else item.lowest for item in scene.objects]
+
+    def placed(object: int, vertices: Tensor, part: Tensor) -> Tensor:
+        x, y, z = part[:3]
+        zero = torch.zeros_like(x)
+        turn = torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+        moved = part[5].exp() * vertices @ turn.T + torch.cat([part[3:5], zero[None]])
+        if not math.isnan(lowest[object]):
+            height = moved[own[object], 2].amin()
+            moved = moved + (lowest[object] - height) * moved.new_tensor([0, 0, 1])
+        return torch.where(own[object][:, None], moved, vertices)
+
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        parts, objects = values * unit, scene.object_of[examples]
+        before = scene.vertices[objects] if conditions.vertices is None else conditions.vertices
+        after = [placed(*row) for row in zip(objects.tolist(), before, parts, strict=True)]
+        return replace(conditions, vertices=torch.stack(after) if after else before, cameras=parts[:, 6:])
+
+    used = (unit > 0).expand(len(scene), -1)
+    return Parameter("pose", settings, unit.new_zeros(used.shape), apply, used=None if used.all() else used)
 
 
 def albedo(scene: Scene, settings: StepSettings) -> Parameter:
@@ -203,7 +259,7 @@ def pixels(scene: Scene, settings: StepSettings) -> Parameter:
 
 
 PARAMETERS: dict[str, Callable[..., Parameter]] = {
-    make.__name__: make for make in (lighting, skylight, projector, lamps, positions, geometry, albedo, pixels)
+    make.__name__: make for make in (lighting, skylight, projector, lamps, positions, geometry, pose, albedo, pixels)
 }
 
 

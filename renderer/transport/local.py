@@ -71,10 +71,13 @@ def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBas
     return SparseTransfer(index % basis.size, index // basis.size, summed)
 
 
-def local_radiance(surface: Surface, albedo: Tensor, paths: LightPaths, light: Tensor) -> Tensor:
-    """(3, P) float64 radiance of a view in a light (size, 3) along unoccluded paths; differentiable in the light, the
-    albedo (S, 3) at the samples, the irradiance of the paths and the gloss."""
-    fragments, arriving = surface.fragments, paths.irradiance[:, None] * light[paths.function]
+def local_radiance(
+    surface: Surface, albedo: Tensor, paths: LightPaths, light: Tensor, fragments: Fragments | None = None
+) -> Tensor:
+    """(3, P) float64 radiance of a view, or with its samples in the pixels of `fragments`, in a light (size, 3) along
+    unoccluded paths; differentiable in the light, the albedo (S, 3) at the samples, the irradiance of the paths and the
+    gloss."""
+    fragments, arriving = fragments or surface.fragments, paths.irradiance[:, None] * light[paths.function]
     weights = _reflectance(surface, albedo, paths) / fragments.samples**2 * arriving
     return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[paths.point], weights).T
 
@@ -122,13 +125,23 @@ class LocalLightView:
         self._rays, self._surface = rays, Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
         self._fixed: dict[LocalBasis, LightPaths] = {}
 
-    def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None = None) -> Tensor:
+    def radiance(
+        self,
+        basis: LocalBasis,
+        albedo: Tensor,
+        light: Tensor,
+        positions: Tensor | None = None,
+        fragments: Fragments | None = None,
+    ) -> Tensor:
         """(3, P) radiance of a light (size, 3), in its dtype and on its device; albedo: (S, 3), at the samples.
-        positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices."""
+        positions: (L, 3) of lamps, None where the basis has them. fragments: the same samples in other pixels.
+        Differentiable in all and in the vertices."""
+        pixels = None if fragments is None else fragments.to("cpu")
         if isinstance(basis, Lamps) and positions is not None:
             paths = unoccluded(self._rays, self._surface, basis, positions.cpu().double())
         else:
             if basis not in self._fixed:
                 self._fixed[basis] = unoccluded(self._rays, self._surface, basis)
             paths = self._fixed[basis]
-        return local_radiance(self._surface, albedo.cpu().double(), paths, light.cpu().double()).to(light)
+        values = albedo.cpu().double(), paths, light.cpu().double()
+        return local_radiance(self._surface, *values, pixels).to(light)

@@ -92,6 +92,7 @@ STEPS = {
     "lamps": augment.StepSettings(step_size=0.1),
     "positions": augment.StepSettings(step_size=0.1),
     "geometry": augment.StepSettings("linf", 0.05, "sign", 0.01),
+    "pose": augment.PoseSettings("linf", 1.0, "sign", 0.2),
     "albedo": augment.StepSettings("linf", 0.5, "sign", 0.1),
     "pixels": augment.StepSettings("linf", 0.3, "sign", 0.05),
 }
@@ -116,7 +117,14 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
         shown = augment.build_scene(
             [(orange, classifier.classes[0])],
             classifier.size,
-            **{"rasterizer": "numpy", "width": 2.4, "normals": "flat", **local, **(scene or {})},
+            **{
+                "rasterizer": "numpy",
+                "width": 2.4,
+                "normals": "flat",
+                "silhouettes": "pose" in steps,
+                **local,
+                **(scene or {}),
+            },
         )
         defaults = {"allow_negative": True, "margin": 0.0, "rounded": False, "max_steps": 8}
         settings = augment.AttackSettings(**steps, **defaults | settings)

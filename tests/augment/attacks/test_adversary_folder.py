@@ -20,7 +20,7 @@ from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
 from renderer.shapes import solid
 
-OTHER_LIGHTS = {"skylight", "projector", "lamps", "positions"}
+OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # each has a test of its own
 CLASSES = ("orange", "lime", "sky")
 SOFTWARE = choose("numpy")
 
@@ -57,7 +57,7 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
         ({"geometry"}, "srgb"),
         ({"albedo"}, "linear"),
         ({"albedo"}, "srgb"),
-        (set(PARAMETERS) - OTHER_LIGHTS, "srgb"),
+        (set(PARAMETERS) - OTHERS, "srgb"),
     ],
     ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else value,
 )

@@ -1,0 +1,253 @@
+"""How outlines move: the derivative of an image by where surfaces lie in it, which `renderer.shading` holds fixed.
+
+At a fixed place, the radiance L of an image changes as the surface there is shaded otherwise, and by −v · ∇L, as it
+moves with a velocity v in the image. Between neighboring samples i and j, ∇L is a difference, whether surface goes on
+between them or ends (Pidhorskyi et al. 2024, "Rasterized edge gradients"): where it moves by δ samples from i to j, the
+pixel of s² samples gains δ (L_i − L_j) / s². Pixels on both sides of a border gain half each.
+
+Where a silhouette lies between i and j, δ is the silhouette's (Li et al. 2018), not that of the surface beside it: the
+points of a ball move as it turns, its outline does not. Silhouettes are the edges whose faces all lie on one side of
+them in the image. They are cut where they cross rows and columns of samples. A line with unit normal n that moves by v
+moves by n · v / n_x along a row; with rows weighted by n_x² and columns by n_y², the pieces add up to its length.
+
+Light is fixed: edges of shadows and of projected patterns stay on the surface that they are on.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from renderer.camera import Camera
+from renderer.fragments import Fragments
+from renderer.mesh import EDGES
+from renderer.rasterizer.numpy import SUBSAMPLES, to_fixed_point
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+LINES = 64  # rows and as many columns of samples, at least, along which surfaces' slopes are taken; in each pixel one
+NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on it
+
+
+class Crossings(NamedTuple):
+    """K places where a silhouette runs between neighboring samples, the nearest of those between the same two.
+
+    ends: (2, K), its vertices. fraction: (K,), of the way between them. normal: (2, K), of unit length. horizontal:
+    (K,) bool, the neighbors lie in a row; otherwise in a column. cells: (2, K), the neighbors' row-major positions
+    among all samples of the image, the left or the upper one first. samples: (2, K), the same among the covered ones,
+    or -1.
+    """
+
+    ends: Tensor
+    fraction: Tensor
+    normal: Tensor
+    horizontal: Tensor
+    cells: Tensor
+    samples: Tensor
+
+
+def moving_outlines(
+    fragments: Fragments,
+    camera: Camera,
+    vertices: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    radiance: Float[Tensor, "3 S"],
+    background: Float[Tensor, "3 pixels"],
+) -> tuple[Int[Tensor, " E"], Float[Tensor, "3 P_E"]]:
+    """E pixels beside the P covered ones, into which outlines may move, and zeros to add to the linear values of these
+    P + E pixels, whose derivative by vertices, and by fields of the camera that are tensors, is that of the outlines.
+
+    radiance: linear, at the S samples. background: linear, of all pixels of the image.
+    """
+    positions, nearness = camera.homogeneous(vertices.double())
+    numbers = torch.arange(len(fragments.sample), dtype=torch.int32, device=vertices.device)
+    grid = fragments.image_of_samples(numbers, -1)
+    arrays = (tensor.detach().cpu().numpy() for tensor in (positions, nearness, faces, grid))
+    crossings = Crossings(*(part.to(grid.device) for part in _crossings(fragments.to("cpu"), *arrays)))
+    touched = _pixels(crossings.cells, fragments).unique()
+    covered = torch.zeros(fragments.size**2, dtype=torch.bool, device=grid.device).index_fill(0, fragments.pixels, True)
+    beside = touched[~covered[touched]]
+    zeros = _Outlines.apply(positions, fragments, crossings, grid, beside, radiance.detach(), background.detach())
+    return beside, zeros
+
+
+class _Outlines(torch.autograd.Function):
+    """Zeros (3, P + E) of homogeneous positions (V, 3)."""
+
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, fragments: Fragments, *others: Tensor) -> Tensor:
+        ctx.save_for_backward(positions)
+        ctx.view = fragments, *others
+        return others[3].new_zeros(3, len(fragments.pixels) + len(others[2]))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (positions,) = ctx.saved_tensors
+        fragments, crossings, grid, beside, radiance, background = ctx.view
+        upstream = upstream * (fragments.size / 4 / fragments.samples)  # from half the image's width to samples' areas
+        gradient = _by_surface(positions, fragments, crossings, grid, radiance, upstream)
+        ends, by_ends = _by_silhouettes(positions, fragments, crossings, beside, radiance, background, upstream)
+        return gradient.index_add_(0, ends, by_ends), None, None, None, None, None, None
+
+
+def _by_surface(
+    positions: Tensor, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
+) -> Tensor:
+    """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
+    divisors = [step for step in range(1, fragments.samples + 1) if fragments.samples % step == 0]
+    stride = max(step for step in divisors if step == 1 or len(grid) >= LINES * step)
+    forces, levels = radiance.new_zeros(radiance.shape[1], 2), F.pad(radiance.sum(0), (0, 1), value=torch.nan)
+    for axis, force in enumerate(forces.T):
+        lines = (grid if axis == 0 else grid.T)[stride // 2 :: stride].contiguous()
+        level = levels[lines]  # -1 is the last one
+        differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
+        first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
+        before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]
+        goes_on = torch.ones_like(force).index_fill(0, before[(before >= 0) & (after >= 0)], 0)
+        jump = radiance.index_select(1, first) - radiance.index_select(1, second)
+        jump *= sum(upstream.index_select(1, fragments.pixel.index_select(0, pair)) for pair in (first, second))
+        moved = jump.sum(0) * goes_on[first] * (stride / 2 if axis == 0 else -stride / 2)  # rows run down
+        force.index_add_(0, first, moved).index_add_(0, second, moved)
+    moving = torch.nonzero((forces != 0).any(1)).squeeze(1)
+    part, forces = fragments.select(moving), forces[moving]
+    if fragments.depths is not None:
+        depth = part.interpolate(positions[:, 2:][part.corners])
+        forces = _homogeneous(forces, part.positions(), depth)
+    by_corners = part.distribute(forces).flatten(0, 1).double()
+    gradient = torch.zeros_like(positions)
+    gradient[:, : forces.shape[1]].index_add_(0, part.corners.flatten(), by_corners)
+    return gradient
+
+
+def _by_silhouettes(
+    positions: Tensor,
+    fragments: Fragments,
+    crossings: Crossings,
+    beside: Tensor,
+    radiance: Tensor,
+    background: Tensor,
+    upstream: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """(2 K) vertices of silhouettes, and the gradient by them (2 K, 3)."""
+    pixels = _pixels(crossings.cells, fragments)
+    slots = torch.full((fragments.size**2,), -1, device=pixels.device)
+    slots[torch.cat([fragments.pixels, beside])] = torch.arange(upstream.shape[1], device=pixels.device)
+    force = radiance.new_zeros(pixels.shape[1])
+    for pixel in pixels:  # of either neighbor, whose background is seen where nothing covers it
+        first, second = (
+            torch.where(samples >= 0, radiance[:, samples], background[:, pixel]) for samples in crossings.samples
+        )
+        force += (upstream[:, slots[pixel]] * (first - second)).sum(0)
+    along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])  # rows run down
+    forces = (force * along * crossings.normal).T
+    gradients = []
+    for ends, weight in zip(crossings.ends, (1 - crossings.fraction, crossings.fraction), strict=True):
+        x, y, depth = positions[ends].T
+        place = torch.stack([x / depth, y / depth], dim=1)
+        gradients.append(_homogeneous(forces * weight[:, None], place, depth[:, None]))
+    return crossings.ends.flatten(), torch.cat(gradients)
+
+
+def _homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
+    """(N, 3) gradients by (x w, y w, w) of those (N, 2) by places (x, y) in the image; depth: w (N, 1)."""
+    return torch.cat([forces, -(forces * places).sum(1, keepdim=True)], dim=1) / depth
+
+
+def _pixels(cells: Tensor, fragments: Fragments) -> Tensor:
+    """The pixels that samples at row-major positions lie in."""
+    resolution = fragments.size * fragments.samples
+    return cells // resolution // fragments.samples * fragments.size + cells % resolution // fragments.samples
+
+
+def _crossings(
+    fragments: Fragments, positions: np.ndarray, nearness: np.ndarray, faces: np.ndarray, grid: np.ndarray
+) -> Crossings:
+    """Where silhouettes are seen; they hide where both samples beside them are of nearer surfaces."""
+    resolution = len(grid)
+    points = np.column_stack([positions[:, :2] / positions[:, 2:], nearness])
+    places = to_fixed_point(points, resolution)[0] / SUBSAMPLES
+    ends = _silhouettes(places, faces)[:, : None if len(fragments.face) else 0]  # a mesh outside the image has none
+    start, end = places[:, ends[0]], places[:, ends[1]]
+    normal = np.stack([end[1] - start[1], end[0] - start[0]])  # in an image whose y runs up
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
+    tolerance = NEAR * np.ptp(nearness)
+    parts = []
+    for axis, step in enumerate((1, resolution)):
+        edge, line, fraction, after = _cut(start[1 - axis], end[1 - axis], start[axis], end[axis], resolution)
+        after = line * resolution + after if axis == 0 else after * resolution + line
+        cells = np.stack([after - step, after])
+        samples = grid.ravel()[cells].astype(np.int64)
+        first, second = nearness[ends[:, edge]]
+        near = first + fraction * (second - first)
+        place = start[:, edge] + fraction * (end - start)[:, edge]
+        beside = _plane_nearness(fragments, places, nearness, samples, place).min(axis=0)
+        seen = np.flatnonzero((samples >= 0).any(axis=0) & (near >= beside - tolerance))
+        seen = seen[np.lexsort([-near[seen], after[seen]])]
+        seen = seen[np.diff(after[seen], prepend=-1) != 0]  # the nearest between the same samples
+        horizontal = np.full(len(seen), axis == 0)
+        parts.append(
+            (ends[:, edge[seen]], fraction[seen], normal[:, edge[seen]], horizontal, cells[:, seen], samples[:, seen])
+        )
+    return Crossings(*(torch.from_numpy(np.concatenate(both, axis=-1)) for both in zip(*parts, strict=True)))
+
+
+def _cut(
+    start: np.ndarray, end: np.ndarray, across: np.ndarray, end_across: np.ndarray, resolution: int
+) -> tuple[np.ndarray, ...]:
+    """Cut N edges at each line of samples between their starts and ends: (edge (K,), line (K,), the fraction of the way
+    along the edge (K,), the first sample of the line at or after it (K,)), where there are samples before it, too."""
+    first, last = (
+        np.ceil(limit).clip(0, resolution).astype(np.int64)
+        for limit in (np.minimum(start, end), np.maximum(start, end))
+    )
+    counts = last - first
+    edge = np.repeat(np.arange(len(start)), counts)
+    line = np.arange(len(edge)) - (np.cumsum(counts) - counts - first)[edge]
+    fraction = (line - start[edge]) / (end - start)[edge]
+    after = np.ceil(across[edge] + fraction * (end_across - across)[edge]).astype(np.int64)
+    inside = (after > 0) & (after < resolution)
+    return edge[inside], line[inside], fraction[inside], after[inside]
+
+
+def _plane_nearness(
+    fragments: Fragments, places: np.ndarray, nearness: np.ndarray, samples: np.ndarray, at: np.ndarray
+) -> np.ndarray:
+    """(2, K) of the planes of the faces that samples (2, K) see, at (2, K); of background, minus infinity."""
+    corners = fragments.corners.numpy()[fragments.face.numpy()[samples]]
+    near = nearness[corners]
+    (ax, bx, cx), (ay, by, cy) = np.moveaxis(places[:, corners], 3, 1)
+    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    area = np.where(area == 0, np.inf, area)
+    to_b = ((at[0] - ax) * (cy - ay) - (at[1] - ay) * (cx - ax)) / area
+    to_c = ((bx - ax) * (at[1] - ay) - (by - ay) * (at[0] - ax)) / area
+    plane = near[..., 0] + to_b * (near[..., 1] - near[..., 0]) + to_c * (near[..., 2] - near[..., 0])
+    return np.where(samples >= 0, plane, -np.inf)
+
+
+def _silhouettes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(2, N) the vertices of the edges whose faces all lie on one side of them; places: (2, V)."""
+    ends, edge, forth, count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
+    (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
+    turn = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    sides = np.bincount(edge, (turn[:, None] * forth).ravel(), len(count))
+    return ends[:, np.abs(sides) > count - 2]  # of two faces, one may be seen edge-on
+
+
+@lru_cache(maxsize=4)
+def _edges(faces: bytes) -> tuple[np.ndarray, ...]:
+    """Of faces (F, 3) of int64: the ends (2, N) of their edges, the edge of each side (3 F,), ±1 by its direction
+    (F, 3), and how many faces an edge has (N,)."""
+    sides = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)[:, EDGES]
+    low, high = sides.min(axis=2).ravel(), sides.max(axis=2).ravel()
+    vertices = int(high.max()) + 1
+    keys, edge, count = np.unique(low * vertices + high, return_inverse=True, return_counts=True)
+    forth = np.where(sides[..., 0] < sides[..., 1], 1.0, -1.0)
+    return np.stack(np.divmod(keys, vertices)), edge.ravel(), forth, count

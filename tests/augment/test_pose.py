@@ -1,0 +1,94 @@
+"""Attacks on the pose of an object and its cameras."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import augment
+from augment.attacks.parameters import POSE, AttackProblem, pose
+from augment.scene import Scene
+from renderer.errors import InputError
+
+ONLY = dict.fromkeys(POSE, 0.0)
+ONE = torch.zeros(1, dtype=torch.int64)
+
+
+def scene_of(size: int = 24, **options) -> Scene:
+    choices = {"samples": 2, "silhouettes": True, "width": 2.6, "fov": 40.0, "rasterizer": "numpy"} | options
+    scene = augment.build_scene([("solid:pear:0", "pear")], size, **choices)
+    return replace(scene, lights=0.4 * scene.lights.double())
+
+
+def problem_of(scene: Scene, **units) -> AttackProblem:
+    return AttackProblem(scene, [pose(scene, augment.PoseSettings(radius=1.0, **units))])
+
+
+@pytest.mark.parametrize("ground", [None, [0.5, 0.5, 0.5]])
+def test_values_are_a_rotation_vector_a_shift_and_a_scale_and_the_object_stays_on_its_ground(ground):
+    scene = scene_of(ground=ground)
+    values = torch.tensor([[1.0, -0.5, 2.0, 0.3, -0.2, 0.7, 0, 0, 0]], dtype=torch.float64)
+    moved = problem_of(scene).conditions(values, ONE).vertices[0].numpy()
+    own, before = scene.objects[0].own_vertices, scene.objects[0].mesh.vertices
+    turn = Rotation.from_rotvec([10.0, -5.0, 20.0], degrees=True)
+    expected = 1.1**0.7 * turn.apply(before) + [0.03, -0.02, 0]
+    if ground:
+        expected[:, 2] += before[own, 2].min() - expected[own, 2].min()
+    assert abs(moved[own] - expected[own]).max() < 1e-12 and (moved[~own] == before[~own]).all()
+
+
+@pytest.mark.parametrize("fov", [None, 40.0])
+def test_the_camera_moves_as_another_scenes_camera_stands(fov):
+    scene = scene_of(fov=fov, polar=60.0, azimuth=20.0)
+    values = torch.tensor([[0.0] * 6 + [0.5, -1.5, 2.0]], dtype=torch.float64)
+    other = scene_of(fov=fov, polar=65.0, azimuth=5.0, width=2.6 * 1.1**2)
+    expected = other.render(replace(other.conditions(ONE), vertices=other.vertices), ONE)
+    torch.testing.assert_close(problem_of(scene).render(values, ONE), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("ground", [None, pytest.param([0.5, 0.5, 0.5], marks=pytest.mark.slow)])
+def test_gradients_by_the_pose_are_differences_of_images_rendered_anew(ground):
+    fine = {"size": 32, "ground": ground, "rasterizer": "auto"}
+    problem, finer = (problem_of(scene_of(samples=samples, **fine)) for samples in (8, 16))
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 32, dtype=torch.float64)] * 2, indexing="ij")
+    weights = torch.stack([torch.ones_like(x), torch.sin(2 * x + y), torch.cos(3 * y - x)])
+    values = problem.start.clone().requires_grad_()
+    rendered = problem.render(values, ONE)[0, 0].sum(0)
+    found = torch.stack([torch.autograd.grad((w * rendered).sum(), values, retain_graph=True)[0][0] for w in weights])
+    sides = [torch.cat([finer.render(sign * 0.2 * by[None], ONE) for by in torch.eye(9).double()]) for sign in (1, -1)]
+    expected = torch.einsum("kyx,dvcyx->kd", weights, sides[0] - sides[1]) / 0.4
+    assert (found - expected).norm() < 0.03 * expected.norm()
+
+
+def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random_and_it_survives(attacked, by_color, tmp_path):
+    """Of 9 × 9 views in the ball, and of 20 random poses, as many as the descent renders; to 5 % of the gain."""
+    views = augment.PoseSettings("linf", 3.0, "sign", 0.5, **ONLY | {"view": 10.0, "shift": 0.1})
+    lit = {"silhouettes": True, "samples": 4, "normals": "smooth"}
+    result = attacked({"pose": views}, scene=lit, max_steps=20, shorten=True, margin=1000.0)
+    problem, label = result.problem, result.goal.source[0, 0]
+
+    def cost(values: torch.Tensor) -> torch.Tensor:
+        logits = by_color(problem.render(values, torch.zeros(len(values), dtype=torch.int64))[:, 0])
+        return -torch.nn.functional.cross_entropy(logits, label.expand(len(values)), reduction="none")
+
+    steps = torch.linspace(-3, 3, 9)
+    grid = torch.zeros(81, 9)
+    grid[:, 6:8] = torch.cartesian_prod(steps, steps)
+    best, reached = float(cost(grid).min()), float(result.descent.cost[0])
+    before = float(result.descent.cost_before[0])
+    draws = torch.cat([problem.sample(torch.Generator().manual_seed(seed)) for seed in range(20)])
+    assert 0 < 0.95 * (before - min(best, float(cost(draws).min()))) < before - reached
+    [line] = augment.save(result, tmp_path)
+    assert line["versions"]["reload"]["largest_difference"] < 1e-4
+    camera = augment.reload(tmp_path / "example_000").cameras[0]
+    assert camera.polar != problem.scene.cameras[0][0].polar and isinstance(camera.polar, float)
+
+
+def test_a_pose_without_outlines_or_parts_is_refused_in_one_sentence():
+    with pytest.raises(InputError, match="set renderer"):
+        problem_of(scene_of(silhouettes=False))
+    with pytest.raises(InputError, match="are all 0"):
+        augment.PoseSettings(**ONLY)
+    with pytest.raises(InputError, match="rotation=200 must be"):
+        augment.PoseSettings(rotation=200)
