@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.mesh import PER_FACE, Mesh, concatenate, load_mesh, normalize, subdivide
+from renderer.gloss import Gloss
+from renderer.mesh import Mesh, concatenate, load_mesh, normalize, select_faces, subdivide
 from renderer.shapes import solid
 
 TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
@@ -20,13 +22,22 @@ FARTHEST = 10.0  # position and size of props, in world units
 @dataclass
 class MeshSettings:
     """mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. up: the axis
-    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh without colors."""
+    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh without colors. gloss:
+    [roughness, metallic, strength], or the first of them (`renderer.Gloss`); "file" for glTF's own; None for none."""
 
     mesh: str
     up: str = field(default="auto", kw_only=True)
     color: list[float] | None = field(default=None, kw_only=True)
+    gloss: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.gloss not in (None, "file"):
+            try:
+                Gloss(*map(float, self.gloss)).checked(1)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"gloss={self.gloss}: give [roughness, metallic, strength] in [0, 1], or file"
+                ) from error
         if not self.mesh:
             raise InputError("mesh is '': give a file or solid:NAME")
         if self.color is not None:
@@ -153,13 +164,14 @@ def another_instance(item: SceneObject, seed: int) -> SceneObject:
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    return _with_mesh(item, normalize(solid(rest[0], seed)))
+    mesh, gloss = normalize(solid(rest[0], seed)), item.mesh.gloss
+    gloss = None if gloss is None else gloss[:1].repeat(len(mesh.faces), axis=0)  # of a solid, all faces have the same
+    return _with_mesh(item, replace(mesh, gloss=gloss))
 
 
 def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
     """The object after a rotation (3, 3) about the origin, with the same props and table at its new lowest point."""
-    own = slice(item.own)
-    mesh = replace(item.mesh, **{name: getattr(item.mesh, name)[own] for name in PER_FACE})
+    mesh = select_faces(item.mesh, slice(item.own))
     vertices = (mesh.vertices @ rotation.T).astype(np.float32)  # rounded as by `normalize`
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 
@@ -179,6 +191,11 @@ def _prop(item: PropSettings) -> Mesh:
 
 
 def _load(item: MeshSettings) -> Mesh:
+    mesh = _colored(item)
+    return mesh if item.gloss in (None, "file") else Gloss(*map(float, item.gloss)).on(mesh)
+
+
+def _colored(item: MeshSettings) -> Mesh:
     kind, _, name = item.mesh.partition(":")
     if kind == "solid":
         name, _, seed = name.partition(":")
@@ -187,12 +204,12 @@ def _load(item: MeshSettings) -> Mesh:
         except ValueError as error:  # of the name or the seed
             raise InputError(f"{item.mesh}: {error}") from error
     else:
-        mesh = load_mesh(item.mesh, up=item.up)
+        mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     if item.color is None:
         return mesh
     if mesh.textures or (mesh.corner_colors != 1).any():
         raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
-    return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
+    return replace(Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)), gloss=mesh.gloss)
 
 
 def _require_color(name: str, color: Sequence[float]) -> None:

@@ -277,13 +277,13 @@ def refine(mesh: Mesh, area: float) -> Mesh:
         return mesh
     if large.all():
         return refine(_quartered(mesh), area)
-    small, finer = _select(mesh, ~large), refine(_quartered(_select(mesh, large)), area)
+    small, finer = select_faces(mesh, ~large), refine(_quartered(select_faces(mesh, large)), area)
     halves = {name: (getattr(small, name), getattr(finer, name)) for name in PER_FACE}
     joined: dict[str, Any] = {name: np.concatenate(both) for name, both in halves.items() if both[0] is not None}
     return replace(finer, **joined)
 
 
-def _select(mesh: Mesh, faces: np.ndarray) -> Mesh:
+def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
     """Some of the faces, over all vertices."""
     per_face = {name: getattr(mesh, name) for name in PER_FACE}
     return replace(mesh, **{name: values[faces] for name, values in per_face.items() if values is not None})

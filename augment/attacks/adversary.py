@@ -108,6 +108,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "name": Path(shown.name).name,
         "own_faces": shown.own,
         "albedo_scale": shown.albedo_scale,
+        "gloss": shown.mesh.gloss is not None,
         "local_lights": [basis.name for basis, _ in local],
         "background": _write_background(adversary.background, folder),
         "cameras": [asdict(camera) for camera in adversary.cameras],
@@ -164,7 +165,7 @@ def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     settings = ImageSettings(**description["image"])
     kinds = [PerspectiveCamera if "distance" in camera else OrthographicCamera for camera in description["cameras"]]
     cameras = tuple(kind(**camera) for kind, camera in zip(kinds, description["cameras"], strict=True))
-    mesh, own = load_mesh(folder / MESH), description["own_faces"]
+    mesh, own = load_mesh(folder / MESH, gloss=bool(description.get("gloss"))), description["own_faces"]
     for camera in cameras:
         camera.depths(mesh.vertices)  # which refuses a mesh around the camera
     albedo_scale, own = float(description["albedo_scale"]), None if own is None else int(own)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from augment.objects import ObjectSettings, PropSettings, another_instance, load_object, on_ground
+from augment.objects import ObjectSettings, PropSettings, another_instance, load_object, on_ground, rotated
 from renderer.errors import InputError
 from renderer.mesh import normalize
 from renderer.shapes import solid
@@ -62,3 +62,16 @@ def test_another_instance_has_the_same_props():
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.own_faces, expected.own_faces)
     assert not np.array_equal(other.mesh.vertices[other.own_vertices], item.mesh.vertices[item.own_vertices])
+
+
+def test_an_object_has_the_gloss_that_it_is_given_and_its_props_stay_matte():
+    item = load_object(
+        ObjectSettings("solid:pear", label="pear", gloss=[0.3, 0, 0.5], props=[PropSettings("solid:cup", [1, 0])])
+    )
+    for shown in (item, another_instance(item, 5), rotated(item, np.eye(3))):
+        own = shown.own_faces
+        np.testing.assert_allclose(shown.mesh.gloss[own], np.tile([0.3, 0, 0.5], (own.sum(), 1)), rtol=1e-6)
+        assert (shown.mesh.gloss[~own, 2] == 0).all() and len(own) > own.sum()
+    for bad in ([2.0], [0.5, 0, 1, 1], "shiny", 0.3):
+        with pytest.raises(InputError, match="gloss"):
+            ObjectSettings("solid:pear", label="pear", gloss=bad)

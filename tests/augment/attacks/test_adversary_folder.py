@@ -16,6 +16,7 @@ from augment.attacks.parameters import PARAMETERS
 from augment.objects import SceneObject, on_ground, with_props
 from augment.scene import Example, Scene
 from renderer.errors import InputError
+from renderer.gloss import Gloss
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
 from renderer.shapes import solid
@@ -72,6 +73,21 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     assert (done.images - done.images_before).abs().max() > 0.02
     limit = 1 / 255 if "albedo" in kinds else 1e-5
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("kind", ["lighting", "geometry", "albedo"])
+def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(tmp_path, kind):
+    """Beside a matte table. The texture of gloss is painted anew from the nearest texels, so it is even with albedo."""
+    mesh = Gloss(0.4, metallic=0.3).on(normalize(textured()))
+    texels = np.random.default_rng(1).integers(150, 255, (4, 4, 2) if kind != "albedo" else (1, 1, 2), dtype=np.uint8)
+    item = on_ground(SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2))
+    scene = replace(augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0), objects=[item])
+    done = attacked({kind}, scene)
+    write_adversary(adversary_of(done), tmp_path)
+    limit = 1 / 255 if kind == "albedo" else 1e-5
+    torch.testing.assert_close(reload(tmp_path).render(SOFTWARE), done.images[0], rtol=0, atol=limit)
+    matte = adversary_of(attacked({kind}, replace(scene, objects=[replace(item, mesh=replace(item.mesh, gloss=None))])))
+    assert (matte.images - done.images[0]).abs().max() > 0.02
 
 
 def test_props_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
