@@ -16,6 +16,7 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS, Harmonics
 from renderer.light.harmonics import bands, per_degree
+from renderer.mesh import Mesh
 from renderer.transport.rays import Rays, sphere
 
 DIRECTIONS = 48  # of the sky, from a point
@@ -85,6 +86,29 @@ def irradiance(
         blocked.index_add_(0, pixels[row[hit]], sent[number[hit]])
     blocked = F.interpolate(blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear")[0]
     return ((open_sky.T + lit.mean(0)).unflatten(1, (image.size, -1)) - blocked).clamp(min=0)
+
+
+def across_light(
+    rays: Rays, mesh: Mesh, height: float, wall: float, camera: Camera, image: ImageSettings, towards: Tensor
+) -> Tensor:
+    """(2, size, size) where light from a direction (3,) meets what a camera sees in the middle of each pixel, the
+    mesh, the table or the wall: coordinates across the light, in halves of the image's width from the middle."""
+    sine, cosine = math.sin(camera.azimuth), math.cos(camera.azimuth)
+    normals = torch.tensor([[0.0, 0.0, 1.0], [cosine, sine, 0.0]], dtype=torch.float64)
+    (points,), _ = _surfaces(camera, replace(image, samples=1), height, wall, normals)
+    starts = points + FAR * torch.from_numpy(camera.axes()[2])
+    if isinstance(camera, PerspectiveCamera):
+        starts = torch.from_numpy(camera.pose()[:3, 3]).expand_as(points)
+    forward = F.normalize(points - starts, dim=1)
+    face = rays.first_hit(starts, forward)
+    seen = torch.nonzero(face >= 0).squeeze(1)
+    first, second, third = torch.from_numpy(mesh.vertices[mesh.faces[face[seen].numpy()]]).unbind(1)
+    planes = torch.linalg.cross(second - first, third - first)
+    length = ((first - starts[seen]) * planes).sum(1) / (forward[seen] * planes).sum(1)
+    points[seen] = starts[seen] + length[:, None] * forward[seen]
+    right = F.normalize(torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())]), dim=0)
+    axes = torch.stack([right, torch.linalg.cross(towards, right)])
+    return (points @ axes.T / (camera.width / 2)).T.unflatten(1, (image.size, -1))
 
 
 def _near(points: Tensor, directions: Tensor, radius: float) -> Tensor:

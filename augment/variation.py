@@ -66,8 +66,9 @@ class VariationSettings:
     camera's side, up to 70° off, plus [least, most] `fill_light` of their own light. lit_background: a background is a
     wall that faces the camera, in the example's light. tables: fraction of the examples that stand on a table before a
     wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75°
-    above. background_saturation: of random colors that multiply the backgrounds, at most. Backgrounds keep the light
-    that was drawn, also where an attack changes the object's.
+    above; patterns then fall on all three from where the directional light is. background_saturation: of random colors
+    that multiply the backgrounds, at most. Backgrounds keep the light that was drawn, also where an attack changes the
+    object's.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
@@ -175,26 +176,27 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         sky = lights[chosen].to(scene.lights)
     if settings.directional_fraction > 0:
         sky, lamps = _with_lamps(sky, scene, settings, draws, on_table)
+    points = None
+    if settings.lit_background or settings.tables or settings.background_saturation:
+        encoding = scene.settings.encoding
+        albedo = decode(scene.backgrounds, encoding)[[row.background for row in rows]]
+        if settings.background_saturation:
+            drawn = torch.rand(len(rows), 2, generator=draws)
+            albedo = albedo * _colors(drawn * torch.tensor([1, settings.background_saturation])).to(albedo)
+        if settings.tables:
+            sky = sky.clone()
+            sky[on_table] = room.above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
+        lit = replace(scene, examples=rows, lights=_with_directional(sky, lamps))
+        values = albedo * _facing(lit) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
+        if settings.tables:
+            irradiance, points = _in_rooms(lit, sky, lamps, _log_uniform(WALL, len(rows), draws), on_table)
+            values[on_table] = albedo[on_table] * irradiance.to(albedo)
+        rows = [replace(row, background=index) for index, row in enumerate(rows)]
+        changed["backgrounds"] = encode(clamp(values), encoding)
     if settings.camera != CameraEffectSettings():
-        device = scene.lights.device
-        changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws, device)
-    if not (settings.lit_background or settings.tables or settings.background_saturation):
-        return replace(scene, examples=rows, lights=_with_directional(sky, lamps), **changed)
-    albedo = decode(scene.backgrounds, scene.settings.encoding)[[row.background for row in rows]]
-    if settings.background_saturation:
-        colors = _colors(torch.rand(len(rows), 2, generator=draws) * torch.tensor([1, settings.background_saturation]))
-        albedo = albedo * colors.to(albedo)
-    if settings.tables:
-        sky = sky.clone()
-        sky[on_table] = room.above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
-    lights = _with_directional(sky, lamps)
-    varied = replace(scene, examples=rows, lights=lights, **changed)
-    values = albedo * _facing(varied) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
-    if settings.tables:
-        walls = _log_uniform(WALL, len(rows), draws)
-        values[on_table] = albedo[on_table] * _in_rooms(varied, sky, lamps, walls, on_table).to(albedo)
-    rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    return replace(varied, examples=rows, backgrounds=encode(clamp(values), scene.settings.encoding))
+        effects = settings.camera, len(rows), scene.settings, draws, scene.lights.device, points
+        changed["camera_effects"] = draw_camera_effects(*effects)
+    return replace(scene, examples=rows, lights=_with_directional(sky, lamps), **changed)
 
 
 def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
@@ -275,17 +277,23 @@ def _facing(scene: Scene) -> Tensor:
     return irradiance.to(scene.backgrounds)[:, :, None, None]
 
 
-def _in_rooms(scene: Scene, sky: Tensor, lamps: Tensor, walls: Sequence[float], on_table: Tensor) -> Tensor:
-    """(N, 3, size, size) irradiance of table and wall in the N examples on tables."""
+def _in_rooms(
+    scene: Scene, sky: Tensor, lamps: Tensor, walls: Sequence[float], on_table: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(N, 3, size, size) irradiance of table and wall in the N examples on tables; and (2, E, size, size) where
+    patterns fall: there, on table, wall and object along the lamp or, without one, the view."""
     rows, lights, images = torch.nonzero(on_table).squeeze(1).tolist(), sky.cpu().double(), []
-    counted = progress(rows, "tables")
-    for number, group in groupby(counted, lambda row: scene.examples[row].object):
+    points = _middles(scene.settings.size).repeat(1, len(scene), 1, 1)
+    for number, group in groupby(progress(rows, "tables"), lambda row: scene.examples[row].object):
         item, rays = scene.objects[number], Rays(scene.objects[number].mesh)
         for row in group:
             camera, exposure = scene.examples[row].cameras[0], scene.examples[row].exposure
-            seen = item.radius, item.lowest, walls[row], camera, scene.settings, lights[row], lamps[row]
-            images.append(exposure * room.irradiance(rays, *seen))
-    return torch.stack(images) if images else torch.zeros(0, 3, scene.settings.size, scene.settings.size)
+            seen = item.lowest, walls[row], camera, scene.settings
+            images.append(exposure * room.irradiance(rays, item.radius, *seen, lights[row], lamps[row]))
+            towards = lamps[row] if lamps[row].any() else torch.from_numpy(camera.axes()[2])
+            points[:, row] = room.across_light(rays, item.mesh, *seen, towards).float()
+    size = scene.settings.size
+    return torch.stack(images) if images else torch.zeros(0, 3, size, size), points
 
 
 def draw_camera_effects(
@@ -294,10 +302,12 @@ def draw_camera_effects(
     image: ImageSettings,
     draws: torch.Generator,
     device: torch.device | str = "cpu",
+    points: Tensor | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """Random effects of `count` examples: a differentiable function of images (A, V, 3, size, size) and their examples
-    (A,). Projected patterns and white balance scale the linear light of object and background."""
-    patterns = draw_patterns(count, image.size, draws)
+    (A,). Projected patterns and white balance scale the linear light of object and background. points: (2, count, size,
+    size), where in a pattern, which spans [-1, 1], each pixel is; by default, as if projected by the camera."""
+    patterns = draw_patterns(count, image.size, draws, points)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
     plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
@@ -328,11 +338,16 @@ def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
     return torch.einsum("aij,avcjk,alk->avcil", matrix, images, matrix)
 
 
-def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
-    random colors, at a random angle, scale and position."""
+def _middles(size: int) -> Tensor:
+    """(2, 1, size, size) of the pixels, right and down in an image that spans [-1, 1]."""
     middles = (torch.arange(size) + 0.5) / size * 2 - 1
-    points = torch.stack(torch.meshgrid(middles, middles, indexing="xy"))[:, None]  # (2, 1, size, size)
+    return torch.stack(torch.meshgrid(middles, middles, indexing="xy"))[:, None]
+
+
+def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor | None = None) -> Tensor:
+    """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
+    random colors, at a random angle, scale and position. points: as of `draw_camera_effects`."""
+    points = _middles(size) if points is None else points
     rows = []
     for _ in range(count):
         place, family = torch.rand(4, generator=draws), torch.randint(len(FAMILIES), (), generator=draws)

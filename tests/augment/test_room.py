@@ -32,7 +32,6 @@ def square(middle: list[float], first: list[float], second: list[float]) -> Mesh
 @pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
 @pytest.mark.parametrize("surface", ["table", "wall"])
 def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
-    """By a sky, and by a lamp so far away that its light is parallel; pixels with the ball are left out."""
     towards = [math.cos(camera.azimuth), math.sin(camera.azimuth), 0.0]
     aside = [-towards[1], towards[0], 0.0]
     if surface == "table":
@@ -53,6 +52,23 @@ def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
         assert most < 1 and expected.min() < 0.6 * most  # a shadow is in sight
         mean, typical = (0.01, 0.02) if lights else (0.02, 0.07)  # an edge; 48 directions, at every second pixel
         assert errors.mean() < mean * most and errors.quantile(0.98) < typical * most
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
+def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera):
+    """In closed form: with the height of the unit sphere or of the table there, the camera sees the pixel's middle."""
+    ball, image = Mesh.plain(*renderer.shapes.sphere(5)), ImageSettings(SIZE)
+    placed = room.across_light(Rays(ball), ball, -1.0, 50.0, camera, image, torch.tensor([0.0, 0.0, 1.0]).double())
+    y, x = np.array([1, -1])[:, None, None] * placed.numpy() * camera.width / 2
+    bulge = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
+    on_ball = renderer.render(ball, camera, ambient(torch.ones(3)), SIZE, 0.0, samples=1)[0, 0].numpy() > 0
+    middles = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    pixels, off = np.stack(np.meshgrid(middles, -middles), axis=-1), []
+    for height in (bulge, -bulge, np.full_like(x, -1.0)):
+        seen = camera.project(np.stack([x, y, height], axis=-1).reshape(-1, 3))[:, :2].reshape(SIZE, SIZE, 2)
+        off.append(np.abs(seen - pixels).max(axis=-1))
+    assert 0.2 < on_ball.mean() < 0.8 and off[2][~on_ball].max() < 1e-6
+    assert np.minimum(off[0], off[1])[on_ball].max() < 0.5 / SIZE  # a quarter of a pixel: the sphere has faces
 
 
 def test_an_even_sky_stays_even_on_a_white_table_and_loses_its_lower_half_on_a_black_one():

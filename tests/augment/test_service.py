@@ -118,7 +118,6 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
 
 @pytest.mark.parametrize("examples, shown", [(3, 3), (None, 7), (10, 10)])
 def test_a_folders_images_are_all_shown_before_any_is_shown_again_and_the_round_decides_which(examples, shown):
-    """Image n has the value n and the label n % 3, so that the network, which sees values, errs on all but label 0."""
     images, labels = torch.arange(7, dtype=torch.uint8)[:, None, None, None].expand(-1, 3, 8, 8), torch.arange(7) % 3
     model = nn.Sequential(nn.Flatten(), nn.Linear(192, 3))
     nn.init.zeros_(model[1].weight).data[0] = model[1].bias.data[0] = 1.0

@@ -301,7 +301,6 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
 def test_a_folders_images_train_in_place_of_renders_and_a_resumed_run_shows_those_of_the_whole_one(
     tiny, tmp_path, regenerated
 ):
-    """Labels by the names of folders; the pixels are those of the files, which have the data's size."""
     rng, by_image = np.random.default_rng(0), {}
     for name, label in {"orange": 1, "apple": 0, "other_ball": complementary_label(1)}.items():
         (tmp_path / "lab" / name).mkdir(parents=True)
