@@ -56,11 +56,12 @@ def _answer_at_once() -> None:
 _loaded = threading.Event()
 
 
-def _announce_imports() -> None:
+def _await_imports() -> None:
     waited, wait = 0, 5
     while not _loaded.wait(wait):
         waited, wait = waited + wait, 2 * wait
         print(f"loading PyTorch and other libraries: {waited} s ...", file=sys.stderr, flush=True)
+    gc.freeze()  # or Python looks for cycles among all that was imported, for seconds at its end
 
 
 @contextmanager
@@ -71,8 +72,6 @@ def handled_errors() -> Iterator[None]:
     status 141. Characters that the terminal lacks are printed as escapes.
     """
     global _started, _interrupted
-    if not _started:
-        gc.freeze()  # or Python looks for cycles among all that was imported, for seconds at its end
     _started, _interrupted = True, False
     if Path(sys.argv[0]).stem.startswith(PREFIX):  # in further processes, train is no train.py of the current folder
         os.environ["PYTHONSAFEPATH"] = "1"
@@ -132,4 +131,4 @@ def command(as_overrides: Callable[[list[str]], list[str]] = list) -> Callable[.
 if not ({*HELP, "-sc", "--shell-completion"}).isdisjoint(sys.argv):
     _answer_at_once()
 if "torch" not in sys.modules:
-    threading.Thread(target=_announce_imports, daemon=True).start()
+    threading.Thread(target=_await_imports, daemon=True).start()
