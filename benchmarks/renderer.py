@@ -242,14 +242,14 @@ def savings(view: View) -> Iterator[tuple[str, Call, Call]]:
     yield "as many coefficients and channels without gloss", by_light, light_step(view, dense, light)
     yield "building an operator without gloss", shiny.operator, view.operator
 
-    def by_vertices(mesh: Mesh) -> Call:
+    def by_vertices(mesh: Mesh, silhouettes: bool = False) -> Call:
         moved = vertices.clone().requires_grad_()
-        image = partial(
-            rendering.render, mesh, CAMERA, light, view.size, vertices=moved, rasterizer=view.rasterizer.name
-        )
+        options = {"rasterizer": view.rasterizer.name, "silhouettes": silhouettes}
+        image = partial(rendering.render, mesh, CAMERA, light, view.size, vertices=moved, **options)
         return lambda: torch.autograd.grad(image().sum(), moved)
 
     yield "a step by the vertices without gloss", by_vertices(shiny.mesh), by_vertices(view.mesh)
+    yield "a step by the vertices with fixed outlines", by_vertices(view.mesh, True), by_vertices(view.mesh)
 
 
 # ---------------------------------------------------------------------------- results
