@@ -31,7 +31,8 @@ def format_help(name: str, arguments: Sequence[str]) -> str:
     if not file.exists():
         code += (CONF.parent / "train/lab/shots.py").read_text(encoding="utf-8") if name == "lab" else ""
         schema = code.partition("Settings:\n")[2].partition("\n    def ")[0].replace("= MISSING", "= ???")
-        return "\n".join([*parts, "Settings:", *(_aligned(f"{k}={a or b}", c) for k, a, b, c in FIELD.findall(schema))])
+        settings = (_aligned(f"{k}={_value(a or b)}", comment) for k, a, b, comment in FIELD.findall(schema))
+        return "\n".join([*parts, "Settings:", *settings])
     packages, comments = {key.partition("@")[0]: key.rpartition("@")[2] for key in groups}, dict[str, str]()
     parts += [f"The defaults are in {file}", ""]
     for path in sorted(CONF.glob("*/*.yaml")):
@@ -46,6 +47,15 @@ def format_help(name: str, arguments: Sequence[str]) -> str:
         config = hydra.compose(name, [text for text in arguments if text.split("=")[0] in groups and "+" not in text])
     plain: Any = OmegaConf.to_container(config)
     return "\n".join([*parts, "", *_settings(plain, comments)])
+
+
+def _value(code: str) -> str:
+    """A field's default, as it is given on the command line; code where it is computed."""
+    try:
+        value = [] if code == "list" else ast.literal_eval(code)
+    except (ValueError, SyntaxError):
+        return code
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _comments(text: str, prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -39,7 +39,7 @@ class LabSettings:
 
     out: str = MISSING  # a new folder, for photos= of pnb-evaluate
     label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
-    meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
+    meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])  # 6 oranges, 10 others
     setups: int = 180  # draws of light, camera and pose; two renders each
     patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # projected, for as many setups each; two: a+b
     slides: list[str] = field(default_factory=list)  # image files that the pattern `slides` projects

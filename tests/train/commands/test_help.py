@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
 
 from train import settings
@@ -49,6 +50,10 @@ def test_help_of_a_command_without_a_file_shows_its_settings_with_their_comments
     assert re.findall(r"^  (\w+)=", printed, re.M) == [field.name for field in fields(schema)]
     comments = re.findall("  # (.*)", inspect.getsource(schema).partition("  def ")[0])
     assert all(comment in printed for comment in comments)
+    shown = dict(re.findall(r"^  (\w+)=(.*?)(?:  +#.*)?$", printed, re.M))
+    as_given = OmegaConf.to_container(OmegaConf.structured(schema), resolve=False)
+    computed = {"out", "meshes", "patterns"}  # out: with the time; the others are named in code
+    assert all(yaml.safe_load(text) == as_given[key] for key, text in shown.items() if key not in computed)
 
 
 @pytest.mark.parametrize(
