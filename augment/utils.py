@@ -215,3 +215,9 @@ def merged(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tenso
     for rows, indices in parts:
         whole[indices.to(whole.device)] = rows.to(whole.device)
     return whole
+
+
+def rotation_matrices(vectors: Tensor) -> Tensor:
+    """(..., 3, 3) of rotation vectors (..., 3): by their length, in radians, about their direction; differentiable."""
+    axes = torch.eye(3).to(vectors).expand(*vectors.shape, 3)
+    return torch.matrix_exp(torch.linalg.cross(vectors[..., None, :].expand_as(axes), axes).mT)

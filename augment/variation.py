@@ -14,7 +14,7 @@ from torch import Tensor
 from augment import room
 from augment.objects import another_instance, rotated
 from augment.scene import Example, Scene
-from augment.utils import progress
+from augment.utils import progress, rotation_matrices
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
@@ -224,10 +224,9 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
 
 def _rotations(most: float, count: int, draws: torch.Generator) -> np.ndarray:
     """(count, 3, 3) by an angle up to `most` about a random axis."""
-    axes = torch.randn(count, 3, 1, generator=draws, dtype=torch.float64)
-    angles = most * torch.rand(count, 1, 1, generator=draws, dtype=torch.float64)
-    turned = torch.linalg.cross((angles * axes / axes.norm(dim=1, keepdim=True)).mT, torch.eye(3).double()[None])
-    return torch.linalg.matrix_exp(turned.mT).numpy()
+    axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
+    angles = most * torch.rand(count, 1, generator=draws, dtype=torch.float64)
+    return rotation_matrices(angles * axes / axes.norm(dim=1, keepdim=True)).numpy()
 
 
 def _above_table(camera: Camera) -> Camera:

@@ -157,8 +157,14 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh with the faces of all, in order; vertices are not merged."""
     faces, texture_ids, vertices, textures = [], [], 0, 0
-    glossy = any(mesh.gloss is not None for mesh in meshes)
     matte, plain = np.array([[1, 0, 0]], dtype=np.float32), np.full((1, 1, 2), 255, dtype=np.uint8)
+    gloss, factors = None, tuple[np.ndarray, ...]()
+    if any(mesh.gloss is not None for mesh in meshes):
+        rows = [matte.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss for mesh in meshes]
+        gloss = np.concatenate(rows)
+    if any(mesh.gloss_textures for mesh in meshes):
+        parts = (mesh.gloss_textures or (plain,) * len(mesh.textures) for mesh in meshes)
+        factors = tuple(texture for part in parts for texture in part)
     for mesh in meshes:
         faces.append(mesh.faces + vertices)
         texture_ids.append(np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + textures).astype(np.int32))
@@ -170,16 +176,8 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
         texture_ids=np.concatenate(texture_ids),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
-        gloss=np.concatenate(
-            [matte.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss for mesh in meshes]
-        )
-        if glossy
-        else None,
-        gloss_textures=tuple(
-            texture for mesh in meshes for texture in mesh.gloss_textures or (plain,) * len(mesh.textures)
-        )
-        if any(mesh.gloss_textures for mesh in meshes)
-        else (),
+        gloss=gloss,
+        gloss_textures=factors,
     )
 
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.scene import Conditions, Scene
-from augment.utils import progress
+from augment.utils import progress, rotation_matrices
 from renderer.errors import InputError, require_range
 from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
@@ -192,16 +193,13 @@ def pose(scene: Scene, settings: PoseSettings) -> Parameter:
     own = pad_sequence([torch.from_numpy(item.own_vertices) for item in scene.objects], batch_first=True).to(
         unit.device
     )
-    lowest = [math.nan if item.own is None else item.lowest for item in scene.objects]
+    lowest = [None if item.own is None else item.lowest for item in scene.objects]
 
     def placed(object: int, vertices: Tensor, part: Tensor) -> Tensor:
-        x, y, z = part[:3]
-        zero = torch.zeros_like(x)
-        turn = torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
-        moved = part[5].exp() * vertices @ turn.T + torch.cat([part[3:5], zero[None]])
-        if not math.isnan(lowest[object]):
-            height = moved[own[object], 2].amin()
-            moved = moved + (lowest[object] - height) * moved.new_tensor([0, 0, 1])
+        moved = part[5].exp() * vertices @ rotation_matrices(part[:3]).T + F.pad(part[3:5], (0, 1))
+        ground = lowest[object]
+        if ground is not None:
+            moved = moved + (ground - moved[own[object], 2].amin()) * moved.new_tensor([0, 0, 1])
         return torch.where(own[object][:, None], moved, vertices)
 
     def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
