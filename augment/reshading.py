@@ -21,7 +21,7 @@ from renderer.image import ImageSettings, decode
 from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.rendering import view_radiance, view_with_outlines
+from renderer.rendering import Shading, view_radiance, view_with_outlines
 from renderer.shading import normals_in_sight
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
@@ -170,11 +170,11 @@ class Reshading:
 
         extra = indirect if settings.global_illumination else None
         gloss = sample_gloss(item.mesh, fragments)
-        shading = corners, albedo, lights, normals, local_view, extra, positions, gloss
+        shading = Shading(corners, albedo, lights, normals, local_view, extra, positions, gloss)
         if vertices is None or not settings.silhouettes:
-            return fragments.pixels, fragments.coverage.to(self.like), view_radiance(fragments, *shading)
+            return fragments.pixels, fragments.coverage.to(self.like), view_radiance(fragments, shading)
         behind = decode(background, settings.encoding).expand(3, -1)
-        return view_with_outlines(moving_camera, fragments, self._faces[number], behind, *shading)
+        return view_with_outlines(moving_camera, fragments, self._faces[number], behind, shading)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""

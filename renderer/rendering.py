@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial, reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -107,59 +107,52 @@ def render(
         in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices, gloss))
         of_vertices = normals_in_sight(fragments, vertices, faces) if smooth else None
         shine = sample_gloss(mesh, fragments, gloss)
-        shading = vertices, colors, emitters, of_vertices, in_local_light, indirect, None, shine
+        shading = Shading(vertices, colors, emitters, of_vertices, in_local_light, indirect, gloss=shine)
         if silhouettes:
             linear = decode(behind.flatten(1), encoding)
-            pixels, coverage, shade = view_with_outlines(camera, fragments, faces, linear, *shading)
+            pixels, coverage, shade = view_with_outlines(camera, fragments, faces, linear, shading)
         else:
             pixels, coverage = fragments.pixels, fragments.coverage.to(like)
-            shade = view_radiance(fragments, *shading)
+            shade = view_radiance(fragments, shading)
         images.append(composite(shade, coverage, pixels, behind, encoding))
     return torch.stack(images)
 
 
-def view_radiance(
-    fragments: Fragments,
-    vertices: Tensor,
-    albedo: Tensor,
-    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]],
-    normals: Tensor | None,
-    in_local_light: Callable[[], LocalLightView],
-    indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
-    positions: Tensor | None = None,
-    gloss: SampleGloss | None = None,
-) -> Tensor:
-    """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, and local lights.
+class Shading(NamedTuple):
+    """What the samples of one view are shaded with.
 
     albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). normals: as for `radiance`. indirect: of
     albedo and coefficients of environment light, the radiance that shadows and bounces add to it. positions: of lamps
     that moved, (L, 3). gloss: in environment light.
     """
-    radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not lights else []
-    for basis, light in lights:
+
+    vertices: Tensor
+    albedo: Tensor
+    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]]
+    normals: Tensor | None
+    in_local_light: Callable[[], LocalLightView]
+    indirect: Callable[[Tensor, Tensor], Tensor] | None = None
+    positions: Tensor | None = None
+    gloss: SampleGloss | None = None
+
+
+def view_radiance(fragments: Fragments, shading: Shading) -> Tensor:
+    """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, local lights."""
+    albedo, gloss = shading.albedo, shading.gloss
+    radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not shading.lights else []
+    for basis, light in shading.lights:
         if isinstance(basis, LocalBasis):
-            radiances.append(in_local_light().radiance(basis, albedo, light, positions, fragments))
+            radiances.append(shading.in_local_light().radiance(basis, albedo, light, shading.positions, fragments))
             continue
-        shaded = fragments, vertices, light, albedo, normals
+        shaded = fragments, shading.vertices, light, albedo, shading.normals
         radiances.append(radiance(*shaded) if gloss is None else glossy_radiance(*shaded, gloss))
-        if indirect is not None:
-            radiances.append(indirect(albedo, light))
+        if shading.indirect is not None:
+            radiances.append(shading.indirect(albedo, light))
     return reduce(torch.add, radiances)
 
 
 def view_with_outlines(
-    camera: Camera,
-    fragments: Fragments,
-    faces: Tensor,
-    background: Tensor,
-    vertices: Tensor,
-    albedo: Tensor,
-    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]],
-    normals: Tensor | None,
-    in_local_light: Callable[[], LocalLightView],
-    indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
-    positions: Tensor | None = None,
-    gloss: SampleGloss | None = None,
+    camera: Camera, fragments: Fragments, faces: Tensor, background: Tensor, shading: Shading
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(pixels (P + E,), coverage (P + E,), radiance (3, P + E)) of one view, of which E pixels are not covered; the
     radiance, that of `view_radiance`, is differentiable in outlines, too (`renderer.silhouettes`).
@@ -167,17 +160,17 @@ def view_with_outlines(
     background: linear, (3, size²). What shadows and bounces of environment light add to a pixel is divided among its
     samples by albedo, where outlines move.
     """
-    shading, pixel = (vertices, albedo, lights, normals, in_local_light), fragments.pixel
-    at_samples = view_radiance(fragments.by_sample(), *shading, None, positions, gloss)
+    albedo, indirect, pixel = shading.albedo, shading.indirect, fragments.pixel
+    at_samples = view_radiance(fragments.by_sample(), shading._replace(indirect=None))
     summed = at_samples.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, at_samples) / fragments.samples**2
     values = at_samples.detach()
     if indirect is not None:
-        added = [indirect(albedo, light) for basis, light in lights if not isinstance(basis, LocalBasis)]
+        added = [indirect(albedo, light) for basis, light in shading.lights if not isinstance(basis, LocalBasis)]
         summed = reduce(torch.add, added, summed)
         total = values.new_zeros(summed.shape).index_add(1, pixel, albedo.detach().T.to(values))
         per_albedo = torch.stack(added).sum(0).detach() * fragments.samples**2 / total.masked_fill(total == 0, 1)
         values = values + per_albedo[:, pixel] * albedo.detach().T
-    pixels, zeros = moving_outlines(fragments, camera, vertices, faces, values, background)
+    pixels, zeros = moving_outlines(fragments, camera, shading.vertices, faces, values, background)
     coverage = F.pad(fragments.coverage.to(summed), (0, len(pixels)))
     return torch.cat([fragments.pixels, pixels]), coverage, F.pad(summed, (0, len(pixels))) + zeros
 

@@ -19,7 +19,7 @@ from renderer.light.local import Lamps
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import KEPT, LEAST, axes, degree_for, lobe_weights, reflectance
 from renderer.rasterizer import choose
-from renderer.rendering import precompute_transfer, render, view_radiance
+from renderer.rendering import Shading, precompute_transfer, render, view_radiance
 from renderer.shading import normals_in_sight
 from renderer.shapes import solid, sphere
 from renderer.transfer import build_operators
@@ -202,7 +202,8 @@ def test_derivatives_by_all_parameters_are_those_of_finite_differences(normals, 
         lights = [(Harmonics(6), environment), (LAMP, lamp)]
         smooth = normals_in_sight(view, vertices, faces) if normals == "smooth" else None
         gloss = sample_gloss(mesh, view, Gloss(*gloss))
-        return (view_radiance(view, vertices, albedo, lights, smooth, lambda: local, gloss=gloss) * upstream).sum()
+        shading = Shading(vertices, albedo, lights, smooth, lambda: local, gloss=gloss)
+        return (view_radiance(view, shading) * upstream).sum()
 
     variables = [value.clone().requires_grad_() for value in start]
     gradients = torch.autograd.grad(total(variables), variables)
