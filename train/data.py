@@ -1,5 +1,6 @@
-"""Labeled images as uint8 arrays: CIFAR-100, an .npz file, or a folder of class folders."""
+"""Images as uint8 arrays, labeled (CIFAR-100, an .npz file, a folder of class folders) or not (any folder)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ from augment.utils import generator, progress
 from renderer.errors import InputError, in_one_line
 from train import console
 from train.checkpoint import content_hash
-from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
+from train.photographs.folder import find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
 
@@ -49,6 +50,13 @@ class DataSet:
     def size(self) -> int:
         """Pixels per side."""
         return self.train.images.shape[-1]
+
+
+def relabeled(data: DataSet, classes: Sequence[str], key: str) -> DataSet:
+    """The data with labels that count these classes. InputError naming the key where one of its own is not among
+    them."""
+    labels = torch.tensor([class_index(classes, name, key) for name in data.classes or classes[:1]])
+    return DataSet(tuple(classes), *(Split(part.images, labels[part.labels]) for part in (data.train, data.test)))
 
 
 def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.validation") -> Tensor:
@@ -146,6 +154,16 @@ def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
     held_out = held_out_rows(train, test_fraction, seed=0, key="data.test_fraction")
     return DataSet(classes, train[~held_out], train[held_out])
+
+
+def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool) -> DataSet:
+    """All images of a folder and its sub-folders, of no class yet: every label is 0."""
+    found, images, skipped = load_photographs(Path(path), find_unlabeled(Path(path)), size, skip_unreadable)
+    if skipped:
+        console.warning("%d of %d photographs are broken and skipped", len(skipped), len(found) + len(skipped))
+    split = Split(images, torch.zeros(len(images), dtype=torch.int64))
+    held_out = held_out_rows(split, test_fraction, seed=0, key="data.test_fraction")
+    return DataSet((), split[~held_out], split[held_out])
 
 
 def _folders(root: Path) -> list[str]:

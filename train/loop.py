@@ -11,7 +11,6 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim.swa_utils import AveragedModel, get_swa_avg_fn
 from tqdm import tqdm
 
@@ -63,8 +62,9 @@ class Trainer:
         architecture: dict[str, Any],
         service: AugmentationService,
         folder: Path,
+        labeled: bool = True,
     ):
-        """architecture: what rebuilds the network from a checkpoint, classes included.
+        """architecture: what rebuilds the network from a checkpoint, classes included. labeled: whether the data are.
 
         InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
         """
@@ -92,11 +92,9 @@ class Trainer:
         rate, momentum = settings.learning_rate, settings.momentum
         with announced("loading the optimizer"):  # torch imports its compiler here: seconds
             self.optimizer = torch.optim.SGD(model.parameters(), rate, momentum, fused=True, **options)
-        norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
-        self._frozen_norms = norms if settings.freeze_statistics else []
         compiled = compiles(settings.compile, self.device)
         teacher = self.initial if settings.distillation else None
-        self._loss = training_loss(replica, settings, service.label, teacher)
+        self._loss = training_loss(replica, settings, service.label, teacher, labeled)
         if compiled:
             torch.compiler.reset()  # since torch limits the graphs of all runs of a process
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
@@ -145,9 +143,7 @@ class Trainer:
                 state.diagnostics.append(state.renders.diagnostics)
             with self.phases("training"):
                 images = TrainingImages(split, rows, Split(to_bytes(state.renders.images), state.renders.labels))
-                self.model.train()
-                for norm in self._frozen_norms:
-                    norm.eval()
+                self.model.train(not settings.eval_mode)
                 first = state.step - sum(steps[:index])
                 batches = training_batches(images, settings.batch_size, self.seed, rounds[index], settings.flips, first)
                 name = f"epoch {self.epoch + 1}" + f", round {index + 1} of {len(rounds)}" * (len(rounds) > 1)

@@ -1,11 +1,12 @@
 """The networks that are trained, a WideResNet, torchvision's or a Python function's, and loading them from files."""
 
+import io
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import safetensors.torch
@@ -15,7 +16,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import utils
-from augment.classifiers import SOURCES, Classifier, OperatingPoint
+from augment.classifiers import BUILDERS, SOURCES, Classifier, OperatingPoint, build_classifier, load_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
@@ -28,6 +29,8 @@ DROPOUT_LEVELS = 2**16
 Color = Sequence[float]  # (3,) RGB
 MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are not given
 PUBLISHED = "model.safetensors"
+CLASSIFIER = "classifier"  # of a description: of a network that began as one of `augment.classifiers`
+WEIGHTS = "weights.pt"  # of a run that began with a classifier: under the names of its own file
 META = ("architecture", "settings", "scores", "versions", "operating_point")  # of a published network's file
 FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
@@ -132,14 +135,23 @@ class Dropout(nn.Dropout):
 
 
 def build_network(
-    classes: Sequence[str], size: int, name: str = WIDERESNET, mean: Color = MEAN, std: Color = STD, **shape: Any
+    classes: Sequence[str],
+    size: int,
+    name: str = WIDERESNET,
+    mean: Color = MEAN,
+    std: Color = STD,
+    classifier: bool = False,
+    **shape: Any,
 ) -> nn.Module:
     """A network with fresh weights from images (N, 3, size, size), RGB in [0, 1], to logits of the classes.
 
     name: wideresnet, which alone has a shape (depth, width, dropout), torchvision:NAME, or
     python:package.module:function, a function that returns (module, size, classes) and whose module normalizes by
-    itself. mean, std: the data's. InputError where there is no such network, or it does not take the data.
+    itself. mean, std: the data's. classifier: the name is one that `augment.build_classifier` takes. InputError where
+    there is no such network, or it does not take the data.
     """
+    if classifier:
+        return cast(nn.Module, build_classifier(name, size).function).requires_grad_(True)
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
     if name.startswith(PYTHON):
@@ -175,6 +187,36 @@ def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: st
     with `shape`, the network's own settings, and its normalization, unless the network's own code has it."""
     statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
     return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
+
+
+def is_classifier(name: str) -> bool:
+    """Whether `train.init_from` names a classifier, rather than a run or a file."""
+    source, colon, _ = name.partition(":")
+    return source + colon in BUILDERS
+
+
+def load_initial(name: str, weights: str | None, size: int | None = None) -> tuple[Path, dict[str, Any]]:
+    """What `load_selected` finds for a run's folder or file, and the same of a classifier with its weights.
+
+    size: of images, in place of the classifier's own. InputError: as `load_classifier` and `load_selected`, or weights
+    of a run, which has its own.
+    """
+    if not is_classifier(name):
+        if weights is not None:
+            raise InputError(f"weights={weights} is not for train.init_from={name}, which has its own: leave it out")
+        return load_selected(Path(name))
+    classifier = load_classifier(name, weights)
+    network = cast(nn.Module, classifier.function)
+    shape = {"name": name, CLASSIFIER: True}
+    description = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    return Path(name), {"architecture": description, "model": network.state_dict()}
+
+
+def export(path: Path, network: nn.Module) -> None:
+    """Write the weights of a network that began with a classifier, under the names of its own file."""
+    own, content = network.network if isinstance(network, Normalized) else network, io.BytesIO()
+    torch.save({name: value.cpu() for name, value in own.state_dict().items()}, content)
+    write_whole(path, content.getbuffer())
 
 
 def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:

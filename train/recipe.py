@@ -52,7 +52,7 @@ class TrainSettings:
     distillation: float = 0.0
     ema_decay: float = 0.0
     soup: bool = False
-    freeze_statistics: bool = False
+    eval_mode: bool | None = None
     precision: str = "auto"
     device: str = "auto"
     threads: int | None = None
@@ -73,8 +73,8 @@ class TrainSettings:
                 raise InputError(f"{name}={getattr(self, name)} must be at least 0 and below 1")
         for name in ("ranking", "distillation", "weight_decay"):
             require_range(name, getattr(self, name), 0, FACTOR)
-        if (self.distillation or self.soup or self.freeze_statistics) and not self.init_from:
-            raise InputError("distillation, soup and freeze_statistics need a network to begin with: set init_from")
+        if (self.distillation or self.soup or self.eval_mode) and not self.init_from:
+            raise InputError("distillation, soup and eval_mode need a network to begin with: set init_from")
         if not 0 < self.learning_rate <= FACTOR:
             raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
@@ -83,17 +83,21 @@ class TrainSettings:
         return self.learning_rate * SCHEDULES[self.schedule](done)
 
 
-def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None) -> Loss:
+def training_loss(
+    model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None, labeled: bool = True
+) -> Loss:
     """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and how many
     predictions are correct.
 
     The loss is the mean `label_loss` plus, by their weights, the `ranking_loss` of the class `label` and the
     `divergence` from the teacher's predictions: on renders, of all classes but `label`, or none without a label.
+    Unless the data are labeled, only renders have a `label_loss`.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
         logits = model(to_unit(images))
-        loss = label_loss(logits, labels, settings.label_smoothing).mean()
+        losses = label_loss(logits, labels, settings.label_smoothing)
+        loss = (losses if labeled else losses * rendered).mean()
         if teacher is not None:
             with torch.no_grad():
                 targets = teacher(to_unit(images))

@@ -1,7 +1,6 @@
 """A small labeled data set of solids, rendered here in soft, even light, so that training needs no download."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from torch import Tensor
 import augment
 import renderer
 from augment.build import load_backgrounds
-from augment.classifiers.adapter import class_index
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import generator, progress
@@ -44,12 +42,6 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
         console.info("%s images: %d", part, len(cached["images"]))
         splits.append(Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(count)))
     return DataSet(CLASSES, *splits)
-
-
-def relabeled(data: DataSet, classes: Sequence[str]) -> DataSet:
-    """The data with labels that count these classes. InputError where one of its own is not among them."""
-    labels = torch.tensor([class_index(classes, name, "data=shapes") for name in data.classes])
-    return DataSet(tuple(classes), *(Split(part.images, labels[part.labels]) for part in (data.train, data.test)))
 
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:

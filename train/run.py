@@ -1,8 +1,9 @@
 """One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from omegaconf import OmegaConf
@@ -17,20 +18,41 @@ from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
 from train.cache import TensorCache, cache_folder
-from train.data import DataSet, Split, channel_statistics, held_out_rows, load_cifar100, load_folder, load_npz
+from train.data import (
+    DataSet,
+    Split,
+    channel_statistics,
+    held_out_rows,
+    load_cifar100,
+    load_folder,
+    load_npz,
+    load_unlabeled,
+    relabeled,
+)
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
-from train.networks import PYTHON, build_network, describe, load_selected, start_from
+from train.networks import (
+    CLASSIFIER,
+    PYTHON,
+    WEIGHTS,
+    build_network,
+    describe,
+    export,
+    load_initial,
+    start_from,
+)
 from train.photographs.folder import find_photographs, load_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.predictions import Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
-from train.rendered_shapes import load_shapes, relabeled
+from train.rendered_shapes import load_shapes
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
-Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_selected` gives it
+Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_initial` gives it
+UNLABELED = "unlabelled"  # data whose labels are the answers of the network begun with
+SIZE = 32  # of the images of a folder, where neither data.size nor the network begun with says
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
 
 
@@ -39,9 +61,9 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 
     Returns a function that trains, and returns the scores that it writes. command: as it was given, to be recorded.
     """
-    base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
-    if base and settings.data.name == "shapes":
-        data = relabeled(data, base[1]["architecture"]["classes"])
+    base = _initial(settings)
+    if base and (settings.data.name in ("shapes", UNLABELED) or CLASSIFIER in base[1]["architecture"]):
+        data = relabeled(data, base[1]["architecture"]["classes"], f"data={settings.data.name}")
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
@@ -76,10 +98,18 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
             f"{(~held_out).sum()} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
             f"threads: {threads}, processes: {utils.world_size()}"
         )
-        before = _scores_before(settings, trainer, data)
-        log = None if utils.rank() else RunLog(folder, trainer.history)
-        trainer.fit(data.train.to(trainer.device), held_out, log)
-        scores = before | _test_scores(trainer, data, _test_images(settings, data))
+        log, labeled = None if utils.rank() else RunLog(folder, trainer.history), data
+        if settings.data.name == UNLABELED:
+            parts = (_answered(settings, trainer, part) for part in (data.train, data.test))
+            labeled = DataSet(data.classes, *parts)
+        before = _scores_before(settings, trainer, labeled)
+        trainer.fit(labeled.train.to(trainer.device), held_out, log)
+        scores = before | _test_scores(trainer, labeled, _test_images(settings, data))
+        if CLASSIFIER in trainer.architecture:
+            scores["test/agreement"] = _agreement(settings, trainer, data.test)
+            if log:
+                export(folder / WEIGHTS, trainer.selected.network)
+                console.info("network.load_state_dict(torch.load(%r)) loads the result", str(folder / WEIGHTS))
         summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
         for name, summary in summaries.items():
             console.info("%s: %s", name, format_summary(summary))
@@ -95,11 +125,15 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
     data, cache = settings.data, TensorCache(cache_folder(settings.train.cache))
+    base = None if data.size else _initial(settings)
+    size = data.size or (base[1]["architecture"]["size"] if base else SIZE)
+    skip = settings.evaluate.skip_unreadable
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
-        "folder": lambda: load_folder(data.path, data.size, data.test_fraction),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
+        "folder": lambda: load_folder(data.path, size, data.test_fraction),
+        UNLABELED: lambda: load_unlabeled(data.path, size, data.test_fraction, skip),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, size, data.seed, cache),
     }
     require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)
@@ -108,6 +142,24 @@ def load_data(settings: ExperimentSettings) -> DataSet:
     with keyed("data.path"):
         require_range("image size", loaded.size, SMALLEST_SIZE, LARGEST_SIZE)
     return loaded
+
+
+def _initial(settings: ExperimentSettings) -> Base:
+    init_from = settings.train.init_from
+    return load_initial(init_from, settings.weights, settings.data.size) if init_from else None
+
+
+def _answered(settings: ExperimentSettings, trainer: Trainer, split: Split) -> Split:
+    """Images with the answers of the network begun with as labels."""
+    predict, classes = _initial_predictor(settings, trainer), len(trainer.architecture["classes"])
+    return Split(split.images, compute_logits(predict, split.images, classes, trainer.device).argmax(1))
+
+
+def _agreement(settings: ExperimentSettings, trainer: Trainer, test: Split) -> float:
+    """The fraction of the test images to which the selected network gives the answer of the one begun with."""
+    agreement = evaluate(trainer.selected, _answered(settings, trainer, test).to(trainer.device))["accuracy"]
+    console.info("agreement with %s on %d held-out images: %.4f", settings.train.init_from, len(test), agreement)
+    return agreement
 
 
 def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
@@ -140,6 +192,12 @@ def build_trainer(
     left_out: the part that validates the network, stored with it. threads: None where a trial is to choose.
     """
     device, shape = choose_device(settings.train.device), settings.model.shape
+    foreign = bool(base and CLASSIFIER in base[1]["architecture"])
+    if base and foreign:
+        name = base[1]["architecture"]["name"]
+        if shape.get("name", name) != name:
+            raise InputError(f"model={shape['name']}: train.init_from={base[0]} has its own network: leave it out")
+        shape = {"name": name, CLASSIFIER: True}
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
@@ -151,7 +209,10 @@ def build_trainer(
     batch = to_unit(data.train.images[: settings.train.batch_size])
     torch.set_num_threads(threads or choose_threads(model, batch))
     service = build_service(settings, data, device)
-    return Trainer(settings.train, model, describe(network, **facts, validation=left_out), service, folder)
+    labeled, recipe = settings.data.name != UNLABELED, settings.train
+    if recipe.eval_mode is None:
+        recipe = replace(recipe, eval_mode=foreign)
+    return Trainer(recipe, model, describe(network, **facts, validation=left_out), service, folder, labeled)
 
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
@@ -192,19 +253,16 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[torch.Ten
 
 def _test_images(settings: ExperimentSettings, data: DataSet) -> str:
     """What the test accuracy is of, in words."""
+    if settings.data.name == UNLABELED:
+        return f"the answers of {settings.train.init_from} to held-out photographs"
     kind = "rendered solids" if settings.data.name == "shapes" else f"the test images of {settings.data.name}"
     others = len(data.classes) - len(data.train.labels.unique())  # the test's labels are looked at once, later
     return f"{kind}, not of the network's {others} other classes" if others else kind
 
 
-def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
-    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs.
-
-    Its predictions are cached under a hash of weights and images, for all runs that begin with it.
-    """
-    model, device = trainer.initial, trainer.device
-    if not model or utils.rank():
-        return {}
+def _initial_predictor(settings: ExperimentSettings, trainer: Trainer) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The network begun with, whose logits are cached under a hash of weights and images, for all runs."""
+    model, device = cast(MixedPrecision, trainer.initial), trainer.device
     is_foreign = settings.model.name.startswith(PYTHON)  # whose code may change unseen
     cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
     key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
@@ -216,6 +274,14 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
             cache.write(batch, stored)
         return stored["logits"]
 
+    return predict
+
+
+def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
+    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs."""
+    if not trainer.initial or utils.rank():
+        return {}
+    predict, device = _initial_predictor(settings, trainer), trainer.device
     logits = compute_logits(predict, data.test.images, len(data.classes), device)
     accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
     console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, _test_images(settings, data))

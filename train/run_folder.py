@@ -42,7 +42,7 @@ CIRCUMSTANCES = (
     *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
-    *("data.path", "augment.folder", "augment.vary.environments", "train.init_from"),
+    *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
 )
 

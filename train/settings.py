@@ -50,14 +50,15 @@ class DataSettings:
     name: str = "shapes"
     validation: float | None = None
     path: str = ""
-    size: int = 32
+    size: int | None = None
     test_fraction: float = 0.1
     train_per_class: int = 300
     test_per_class: int = 60
     seed: int = 0
 
     def __post_init__(self) -> None:
-        require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
+        if self.size is not None:
+            require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
         require_range("seed", self.seed, 0, LARGEST_SEED)
         for name in ("train_per_class", "test_per_class"):
             require_range(name, getattr(self, name), 1, MOST_IMAGES)
@@ -120,12 +121,14 @@ class EvaluationSettings:
 
 @dataclass
 class ExperimentSettings:
-    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study. compare: arms beside it."""
+    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study. weights: of the classifier
+    that `train.init_from` names. compare: arms beside it."""
 
     run: str = ""
     sweep: str = "runs/sweep"
     seed: int = 0
     label: str = "orange"
+    weights: str | None = None
     compare: list[str] = field(default_factory=list)
     data: DataSettings = field(default_factory=DataSettings)
     augment: AugmentationSettings = field(default_factory=AugmentationSettings)

@@ -10,14 +10,19 @@ from pathlib import Path
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
 from augment.classifiers.imagenet import (
     SQUEEZENET_CAFFE,
+    build_efficientnet_lite,
+    build_squeezenet_caffe,
+    build_timm,
+    build_torchvision,
     load_efficientnet_lite,
     load_squeezenet_caffe,
+    load_timm,
     load_torchvision,
 )
 from augment.utils import announced
 from renderer.errors import InputError
 
-__all__ = ["SOURCES", "Classifier", "OperatingPoint", "load_classifier"]
+__all__ = ["SOURCES", "Classifier", "OperatingPoint", "build_classifier", "load_classifier"]
 
 # A name that ends in a colon is followed by the source's own name for the model, the loader's first argument.
 # `train.networks` adds `run:`, the networks that this project trains.
@@ -25,13 +30,21 @@ SOURCES: dict[str, Callable[..., Classifier]] = {
     **{f"efficientnet_lite{version}": partial(load_efficientnet_lite, version) for version in range(3)},
     SQUEEZENET_CAFFE: load_squeezenet_caffe,
     "torchvision:": load_torchvision,
+    "timm:": load_timm,
     "python:": load_python,
+}
+BUILDERS: dict[str, Callable[..., Classifier]] = {
+    **{f"efficientnet_lite{version}": partial(build_efficientnet_lite, version) for version in range(3)},
+    SQUEEZENET_CAFFE: build_squeezenet_caffe,
+    "torchvision:": build_torchvision,
+    "timm:": build_timm,
+    "python:": lambda model, size: load_python(model),
 }
 
 
 def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
-    """`efficientnet_lite0` (to 2), `squeezenet_caffe`, `torchvision:NAME` or `python:package.module:function`, on
-    the CPU. In the commands also `run:FOLDER`, which in Python is `train.load_run(FOLDER)`.
+    """`efficientnet_lite0` (to 2), `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME` or
+    `python:package.module:function`, on the CPU. In the commands also `run:FOLDER`, in Python `train.load_run(FOLDER)`.
 
     weights: a local file; None for those that the source brings or downloads. InputError for an unknown name, for
     weights that are missing, damaged or another network's, and where a package or the network is wanting.
@@ -48,3 +61,9 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     path = None if weights is None else Path(weights)
     with announced(f"loading {name}"):
         return load(model, path) if colon else load(path)
+
+
+def build_classifier(name: str, size: int) -> Classifier:
+    """The network of `load_classifier` for images of a size, with fresh weights, those of `python:` aside."""
+    source, colon, model = name.partition(":")
+    return BUILDERS[source + colon](*([model] if colon else []), size)

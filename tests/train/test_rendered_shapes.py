@@ -4,7 +4,8 @@ import torch
 from renderer.errors import InputError
 from train import rendered_shapes
 from train.cache import TensorCache
-from train.rendered_shapes import load_shapes, relabeled
+from train.data import relabeled
+from train.rendered_shapes import load_shapes
 
 SIZE = 8
 FEW = ("apple", "orange", "plate")
@@ -56,7 +57,8 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(tmp_pa
 
 
 def test_labels_count_the_classes_of_another_network():
-    data = relabeled(load_shapes(train=1, test=1, size=SIZE, seed=0), ("plate", "lamp", "orange", "apple"))
+    shapes = load_shapes(train=1, test=1, size=SIZE, seed=0)
+    data = relabeled(shapes, ("plate", "lamp", "orange", "apple"), "data=shapes")
     assert data.train.labels.tolist() == data.test.labels.tolist() == [3, 2, 0]
     with pytest.raises(InputError, match="lamp"):
-        relabeled(data, ("plate", "orange"))
+        relabeled(data, ("plate", "orange"), "data=shapes")

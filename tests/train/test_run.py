@@ -378,8 +378,8 @@ def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, pho
     assert summarize(tmp_path).before.accuracy == scores["test/accuracy_before"]
 
 
-def test_frozen_statistics_are_those_of_the_network_begun_with_after_training(tiny, finished, tmp_path):
-    train(tiny("train.epochs=1", f"train.init_from={finished}", "train.freeze_statistics=true"), tmp_path)
+def test_statistics_are_those_of_the_network_begun_with_after_training_in_eval_mode(tiny, finished, tmp_path):
+    train(tiny("train.epochs=1", f"train.init_from={finished}", "train.eval_mode=true"), tmp_path)
     begun, trained = (checkpoint.load(folder / checkpoint.BEST)["model"] for folder in (finished, tmp_path))
     for name, value in trained.items():
         is_statistic = name.rpartition(".")[2] in ("running_mean", "running_var", "num_batches_tracked", "mean", "std")

@@ -94,7 +94,7 @@ def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
     ("overrides", "message"),
     [
         (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
-        (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, shapes"),
+        (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, unlabelled, shapes"),
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds"),
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable: Key 'lable'"),
         (

@@ -60,12 +60,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     `photos.csv` lacks its columns, contradicts itself, or names no file of the folder or a source without images.
     """
     class_index(classes, label, "label")
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: name a folder of photographs")
-    files = list(_files(folder))
-    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
+    paths, files = _image_files(folder)
     nested = _has_class_folders(folder, paths, classes)
     rows = _read_table(folder / TABLE)
     if unknown := sorted(rows.keys() - set(files)):
@@ -80,6 +75,21 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     if missing := {name for item in photographs for name in item.hard_negatives} - sources:
         raise InputError(f"{folder / TABLE} names hard_negatives of source {min(missing)!r}, which has no image")
     return photographs
+
+
+def find_unlabeled(folder: Path) -> list[Photograph]:
+    """All images of a folder and its sub-folders, sorted by path, of no class. InputError: no folder, or none in it."""
+    return [Photograph(path, "", None) for path in _image_files(folder)[0]]
+
+
+def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
+    """The images of a folder, sorted, and all of its files; InputError: it is no folder, or holds no image."""
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: name a folder of photographs")
+    files = list(_files(folder))
+    if not (paths := sorted(path for path in files if path.suffix.lower() in SUFFIXES)):
+        raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
+    return paths, files
 
 
 def left_out(folder: Path) -> list[PurePosixPath]:
