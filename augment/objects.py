@@ -187,7 +187,7 @@ def _prop(item: PropSettings) -> Mesh:
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = item.scale * mesh.vertices @ turn
     lowest = turned[np.unique(mesh.faces), 2].min()
-    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
+    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]), skin=None)
 
 
 def _load(item: MeshSettings) -> Mesh:
@@ -209,7 +209,7 @@ def _colored(item: MeshSettings) -> Mesh:
         return mesh
     if mesh.textures or (mesh.corner_colors != 1).any():
         raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
-    return replace(Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)), gloss=mesh.gloss)
+    return replace(Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)), gloss=mesh.gloss, skin=mesh.skin)
 
 
 def _require_color(name: str, color: Sequence[float]) -> None:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from renderer.errors import LARGEST, InputError, require_choice, require_range
+from renderer.skin import Skin
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 MOST_VERTICES = 10**7  # some 5 GB
@@ -37,6 +38,7 @@ class Mesh:
     textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
     gloss          (F, 3) float32: roughness, metallic and strength in [0, 1] (`renderer.Gloss`); None for a matte mesh
     gloss_textures tuple of (H, W, 2) uint8, for each of `textures`, that multiply roughness and metallic; or empty
+    skin           the joints that carry the vertices, None without joints
 
     InputError: arrays of other shapes, no faces, faces of vertices that are not there.
 
@@ -53,6 +55,7 @@ class Mesh:
     textures: tuple[np.ndarray, ...] = ()
     gloss: np.ndarray | None = None
     gloss_textures: tuple[np.ndarray, ...] = ()
+    skin: Skin | None = None
 
     def __post_init__(self) -> None:
         count, numbers = len(self.faces), "fiu"  # NumPy's letters for types
@@ -113,8 +116,8 @@ class Mesh:
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     def moved(self, vertices: np.ndarray) -> Mesh:
-        """The mesh with vertices (V, 3) in place of its own, and its packed textures."""
-        mesh = replace(self, vertices=vertices)
+        """The mesh with vertices (V, 3) in place of its own, and its packed textures; without a skin."""
+        mesh = replace(self, vertices=vertices, skin=None)
         mesh.__dict__["packed_textures"] = self.packed_textures  # which take long to pack
         return mesh
 
@@ -155,7 +158,7 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh with the faces of all, in order; vertices are not merged."""
+    """One mesh with the faces of all, in order; vertices are not merged. The joints are the first one's."""
     faces, texture_ids, vertices, textures = [], [], 0, 0
     matte, plain = np.array([[1, 0, 0]], dtype=np.float32), np.full((1, 1, 2), 255, dtype=np.uint8)
     gloss, factors = None, tuple[np.ndarray, ...]()
@@ -165,6 +168,11 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     if any(mesh.gloss_textures for mesh in meshes):
         parts = (mesh.gloss_textures or (plain,) * len(mesh.textures) for mesh in meshes)
         factors = tuple(texture for part in parts for texture in part)
+    skin = meshes[0].skin
+    if skin is not None:
+        still = [np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32) for mesh in meshes]
+        rows = [mesh.skin.carried if mesh.skin else zeros for mesh, zeros in zip(meshes, still, strict=True)]
+        skin = replace(skin, carried=np.concatenate(rows))
     for mesh in meshes:
         faces.append(mesh.faces + vertices)
         texture_ids.append(np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + textures).astype(np.int32))
@@ -178,6 +186,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
         gloss=gloss,
         gloss_textures=factors,
+        skin=skin,
     )
 
 
@@ -188,13 +197,14 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     that moving it opens no seam, and unused vertices are dropped. A color is the product of the material's
     color, the texture and the vertex or face colors that the file has, white where it has none; alpha, other
     material properties and the texture's wrap mode are left out. glTF's colors other than textures are linear
-    by its standard and are encoded here.
+    by its standard and are encoded here. Of a glTF with a skin, the mesh has the pose of its nodes, and their joints.
 
     gloss: read glTF's roughness, metallic (factors and texture) and specularFactor; surfaces are matte otherwise, since
     most files have values that nobody chose. Formats other than glTF are matte.
     up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
-    are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
+    are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area;
+    skins without weights, whose weights do not sum to one or that name missing joints.
 
     >>> renderer.export_mesh(renderer.solid("cup"), "cup.glb")
     >>> load_mesh("cup.glb").faces.shape == renderer.solid("cup").faces.shape
@@ -209,8 +219,13 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = concatenate(placed)
-    vertices, corners = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)
-    mesh = replace(mesh, vertices=vertices, faces=corners.reshape(-1, 3))
+    points, skin = mesh.vertices, mesh.skin
+    if skin is not None:  # vertices that joints carry otherwise come apart
+        carried, rows = np.unique(skin.carried, axis=0, return_inverse=True)
+        points = np.column_stack([points, rows.ravel()])
+    vertices, corners = np.unique(points[mesh.faces].reshape(-1, points.shape[1]), axis=0, return_inverse=True)
+    skin = skin and replace(skin, carried=carried[vertices[:, -1].astype(np.int64)])
+    mesh = replace(mesh, vertices=vertices[:, :3], faces=corners.reshape(-1, 3), skin=skin)
     if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
         raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
@@ -232,9 +247,12 @@ def normalize(mesh: Mesh) -> Mesh:
     if not areas.sum() > 0:
         raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
     centroids = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
-    centered = mesh.vertices - np.average(centroids, axis=0, weights=areas)
-    scaled = centered / np.abs(centered).max()
-    return replace(mesh, vertices=scaled.astype(np.float32).astype(np.float64))
+    center = np.average(centroids, axis=0, weights=areas)
+    centered = mesh.vertices - center
+    largest = np.abs(centered).max()
+    scaled, matrix = (centered / largest).astype(np.float32).astype(np.float64), np.eye(4)
+    matrix[:3] = np.column_stack([np.eye(3), -center]) / largest
+    return replace(mesh, vertices=scaled, skin=mesh.skin and mesh.skin.transformed(matrix))
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
@@ -246,6 +264,7 @@ def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         faces=mesh.faces[:, order],
         corner_colors=mesh.corner_colors[:, order],
         corner_uvs=mesh.corner_uvs[:, order],
+        skin=mesh.skin and mesh.skin.transformed(matrix),
     )
 
 
@@ -291,7 +310,10 @@ def _quartered(mesh: Mesh) -> Mesh:
     count = len(mesh.vertices)
     ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends @ [count, 1], return_inverse=True)  # one number is sorted faster than a pair
-    middles = mesh.vertices[np.stack(np.divmod(edges, count), axis=1)].mean(axis=1)
+    ends = np.stack(np.divmod(edges, count), axis=1)
+    middles, skin = mesh.vertices[ends].mean(axis=1), mesh.skin
+    if skin is not None:
+        skin = replace(skin, carried=np.concatenate([skin.carried, skin.carried[ends].mean(axis=1)]))
     around = np.concatenate([mesh.faces, count + edge.reshape(-1, 3)], axis=1)
     return replace(
         mesh,
@@ -301,6 +323,7 @@ def _quartered(mesh: Mesh) -> Mesh:
         corner_uvs=_interpolated(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
+        skin=skin,
     )
 
 

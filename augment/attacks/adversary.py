@@ -61,7 +61,7 @@ class Adversary:
             mesh, albedo_scale = with_added_albedo(mesh, added, scene.settings.encoding, albedo_scale)
         if after.vertices is not None:
             vertices = after.vertices[row, : len(mesh.vertices)].detach().cpu().double().numpy()
-            mesh = replace(mesh, vertices=vertices)
+            mesh = replace(mesh, vertices=vertices, skin=None)
         return Adversary(
             shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
             cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),

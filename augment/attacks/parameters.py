@@ -1,8 +1,9 @@
 """What an attack may change: light, sky, a projector's pattern, lamps, shape, pose, colors, pixels; any at once."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
+from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import progress, rotation_matrices
 from renderer.errors import InputError, require_range
@@ -37,20 +39,39 @@ class SkylightSettings(StepSettings):
 class PoseSettings(StepSettings):
     """How far each part of a pose goes for a value of 1; with 0, the part is left as it is. rotation of the object, in
     degrees. shift: along the table, in world units. scale: of the object, as a fraction. view: the camera's polar and
-    azimuthal angle, in degrees. distance: of the camera, as a fraction."""
+    azimuthal angle, in degrees. distance: of the camera, as a fraction. joints: of a skinned mesh, degrees about each
+    axis, which are also limits; of all joints or {name: degrees} of some."""
 
     rotation: float = 10.0
     shift: float = 0.1
     scale: float = 0.1
     view: float = 10.0
     distance: float = 0.1
+    joints: Any = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, most in zip(POSE, (180, 10, 1, 180, 1), strict=True):
             require_range(name, getattr(self, name), 0, most)
-        if not any(getattr(self, name) for name in POSE):
-            raise InputError(f"{', '.join(POSE)} are all 0: nothing of the pose would change")
+        limits = self.joints if isinstance(self.joints, Mapping) else {"joints": self.joints}
+        for name, degrees in limits.items():
+            if not isinstance(degrees, int | float):
+                raise InputError(f"joints={self.joints}: give degrees, or {{name: degrees}}")
+            require_range("joints" if name == "joints" else f"joints.{name}", degrees, 0, 180)
+        if not any([*limits.values(), *(getattr(self, name) for name in POSE)]):
+            raise InputError(f"{', '.join(POSE)} and joints are all 0: nothing of the pose would change")
+
+    def of_joints(self, item: SceneObject) -> list[float]:
+        """The degrees of each joint of an object. InputError: a joint that it has not, or no skin."""
+        if not self.joints:
+            return []
+        if item.mesh.skin is None:
+            raise InputError(f"joints: {item.name} has no skin: give a glTF file with one, or joints=0")
+        names = item.mesh.skin.names
+        limits = self.joints if isinstance(self.joints, Mapping) else dict.fromkeys(names, self.joints)
+        if unknown := [name for name in limits if name not in names]:
+            raise InputError(f"joints: {item.name} has no joint {unknown[0]}: choose from {', '.join(names)}")
+        return [float(limits.get(name, 0)) for name in names]
 
 
 @dataclass
@@ -183,19 +204,27 @@ def geometry(scene: Scene, settings: StepSettings) -> Parameter:
 
 def pose(scene: Scene, settings: PoseSettings) -> Parameter:
     """Nine values: the object's rotation vector (about the origin), its shift along x and y and the logarithm of its
-    scale; the polar angle, the azimuth and the logarithm of the distance of the cameras, in the settings' units. Among
-    props or on a table, the object stays on their ground. InputError without `silhouettes`."""
+    scale; the polar angle, the azimuth and the logarithm of the distance of the cameras, in the settings' units; and
+    rotation vectors of its joints, if these move, which turn before the object and after its geometry. Among props or
+    on a table, the object stays on their ground. InputError without `silhouettes`, or without the joints."""
     if not scene.settings.silhouettes:
         raise InputError("attack=pose needs gradients of outlines: set renderer.silhouettes=true")
     angle, view = math.radians(settings.rotation), math.radians(settings.view)
     units = [angle] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)] + [view] * 2
-    unit = torch.tensor([*units, math.log1p(settings.distance)], dtype=torch.float64).to(scene.lights)
+    units.append(math.log1p(settings.distance))
+    turns = [[math.radians(limit) for limit in settings.of_joints(item) for _ in range(3)] for item in scene.objects]
+    rows = [torch.tensor(units + of_joints, dtype=torch.float64) for of_joints in turns]
+    unit = pad_sequence(rows, batch_first=True).to(scene.lights)  # (M, D)
     own = pad_sequence([torch.from_numpy(item.own_vertices) for item in scene.objects], batch_first=True).to(
         unit.device
     )
     lowest = [None if item.own is None else item.lowest for item in scene.objects]
 
     def placed(object: int, vertices: Tensor, part: Tensor) -> Tensor:
+        skin, bends = scene.objects[object].mesh.skin, part[9 : len(rows[object])]
+        if skin is not None and len(bends):
+            bent = skin.displacements(rotation_matrices(bends.view(-1, 3)))
+            vertices = vertices + F.pad(bent, (0, 0, 0, len(vertices) - len(bent)))
         moved = part[5].exp() * vertices @ rotation_matrices(part[:3]).T + F.pad(part[3:5], (0, 1))
         ground = lowest[object]
         if ground is not None:
@@ -203,13 +232,16 @@ def pose(scene: Scene, settings: PoseSettings) -> Parameter:
         return torch.where(own[object][:, None], moved, vertices)
 
     def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        parts, objects = values * unit, scene.object_of[examples]
+        objects = scene.object_of[examples]
+        parts = values * unit[objects]
         before = scene.vertices[objects] if conditions.vertices is None else conditions.vertices
         after = [placed(*row) for row in zip(objects.tolist(), before, parts, strict=True)]
-        return replace(conditions, vertices=torch.stack(after) if after else before, cameras=parts[:, 6:])
+        return replace(conditions, vertices=torch.stack(after) if after else before, cameras=parts[:, 6:9])
 
-    used = (unit > 0).expand(len(scene), -1)
-    return Parameter("pose", settings, unit.new_zeros(used.shape), apply, used=None if used.all() else used)
+    limit = unit.new_tensor([math.inf] * 9 + [1.0] * (unit.shape[1] - 9))
+    domain = partial(nearest_in_box, low=-limit, high=limit)
+    used = (unit > 0)[scene.object_of]
+    return Parameter("pose", settings, unit.new_zeros(used.shape), apply, domain, None if used.all() else used)
 
 
 def albedo(scene: Scene, settings: StepSettings) -> Parameter:

@@ -25,6 +25,7 @@ from trimesh.visual.material import Material, PBRMaterial, empty_material
 from renderer.errors import LARGEST, InputError, in_one_line, require_file
 from renderer.image import encode
 from renderer.io.images import eight_bits
+from renderer.io.skins import skinned, with_skins_as_attributes
 from renderer.mesh import Mesh
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: the names in them cannot be checked first
@@ -37,7 +38,8 @@ HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions t
 
 
 def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
-    """Every part of a file in its own coordinates, with the affine matrix (4, 4) that its node places it by.
+    """Every part of a file in its own coordinates, with the affine matrix (4, 4) that its node places it by;
+    where a skin does, it is placed.
     linear: the file's colors, textures aside, are linear. gloss: read that of glTF, too. InputError: as
     `renderer.mesh.load_mesh`."""
     require_file(path, "give the path of a mesh file")
@@ -48,6 +50,9 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
     try:
         content, files = path.read_bytes(), _Files(path)
         tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
+        rigged = any("skin" in node for node in tree.get("nodes", []))
+        if rigged:
+            content = with_skins_as_attributes(content, tree)
         textured_parts, strengths = _textured_parts(tree, gloss), _strengths(tree)
         scene = _load(_utf8(content) if suffix == "obj" else content, suffix, files)
         named = [(name, part) for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)]
@@ -56,10 +61,12 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
             parts = {name: _with_gloss(part, scene.geometry[name].visual, strengths) for name, part in parts.items()}
         if sum(len(part.textures) for part in parts.values()) < textured_parts:
             raise ValueError("the image of a texture is missing, or cannot be decoded")
+        nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
+        if rigged:
+            return [(skinned(parts[name], node, scene, tree), np.eye(4)) for node, _, name in nodes if name in parts]
     except Exception as error:  # readers of meshes and images raise almost anything at a damaged file
         raise InputError(f"{path} cannot be read as a mesh: {in_one_line(error)}") from error
-    nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    return [(parts[name], matrix) for matrix, name in nodes if name in parts]
+    return [(parts[name], matrix) for _, matrix, name in nodes if name in parts]
 
 
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import skinned_arm
 import torch
 from scipy.spatial.transform import Rotation
 
 import augment
+import renderer
 from augment.attacks.parameters import POSE, AttackProblem, pose
 from augment.scene import Scene
 from renderer.errors import InputError
@@ -85,6 +88,47 @@ def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random_and_it_su
     assert camera.polar != problem.scene.cameras[0][0].polar and isinstance(camera.polar, float)
 
 
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return renderer.load_mesh(skinned_arm.write(tmp_path_factory.mktemp("arm") / "arm.glb"))
+
+
+def test_joints_bend_before_the_object_turns_as_far_as_their_limits_and_others_not_at_all(arm):
+    scene = augment.build_scene([(arm, "arm")], 16, silhouettes=True, rasterizer="numpy", ground=[0.5, 0.5, 0.5])
+    settings = augment.PoseSettings(radius=3.0, joints={"elbow": 60.0, "wrist": 30})
+    scene = replace(scene, lights=scene.lights.double())
+    problem = AttackProblem(scene, [pose(scene, settings)])
+    draws = torch.cat([problem.sample(torch.Generator().manual_seed(seed)) for seed in range(100)])
+    assert (draws[:, 9:12] == 0).all() and (draws[:, 12:].abs().amax(0) == 1).all() and draws[:, :9].max() > 2.5
+    values = torch.zeros(1, 18, dtype=torch.float64)
+    values[0, [2, 12, 16, 17]] = torch.tensor([9.0, 0.5, -1.0, 0.2], dtype=torch.float64)
+    moved, mesh = problem.conditions(values, ONE).vertices[0].numpy(), scene.objects[0].mesh
+    bends = [Rotation.from_rotvec(vector, degrees=True).as_matrix() for vector in ([0] * 3, [30, 0, 0], [0, -30, 6])]
+    bent = mesh.vertices + mesh.skin.displacements(torch.tensor(np.stack(bends))).numpy()
+    expected, own = Rotation.from_rotvec([0, 0, 90], degrees=True).apply(bent), scene.objects[0].own_vertices
+    expected[:, 2] += mesh.vertices[own, 2].min() - expected[own, 2].min()
+    assert abs(moved[own] - expected[own]).max() < 1e-9 and (moved[~own] == mesh.vertices[~own]).all()
+
+
+def test_descent_by_the_joints_alone_goes_beyond_as_many_random_poses_and_survives(arm, by_color, tmp_path):
+    red = replace(arm, corner_colors=0 * arm.corner_colors + np.float32([0.9, 0.1, 0.1]))
+    scene = augment.build_scene([(red, "orange")], 8, silhouettes=True, samples=4, rasterizer="numpy", width=2.2)
+    settings = augment.AttackSettings(
+        pose=augment.PoseSettings("linf", 1.0, "sign", 0.2, **ONLY, joints=60.0),
+        max_steps=12,
+        margin=1000.0,
+        shorten=True,
+    )
+    result = augment.attack(by_color, scene, settings=settings, force=True)
+    problem, label = result.problem, result.goal.source[0, 0]
+    draws = torch.cat([problem.sample(torch.Generator().manual_seed(seed)) for seed in range(12)])
+    logits = by_color(torch.cat([problem.images(draw[None])[0] for draw in draws]))
+    random = -torch.nn.functional.cross_entropy(logits, label.expand(12), reduction="none")
+    assert result.descent.cost[0] < random.min() < result.descent.cost_before[0]
+    [line] = augment.save(result, tmp_path)
+    assert line["versions"]["reload"]["largest_difference"] < 1e-4
+
+
 def test_a_pose_without_outlines_or_parts_is_refused_in_one_sentence():
     with pytest.raises(InputError, match="set renderer"):
         problem_of(scene_of(silhouettes=False))
@@ -92,3 +136,19 @@ def test_a_pose_without_outlines_or_parts_is_refused_in_one_sentence():
         augment.PoseSettings(**ONLY)
     with pytest.raises(InputError, match="rotation=200 must be"):
         augment.PoseSettings(rotation=200)
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (200, "joints=200 must be"),
+        ({"elbow": -1}, "joints.elbow=-1 must be"),
+        ({"elbow": "far"}, "give degrees"),
+        ({"elbow": 10, "knee": 10}, "no joint knee: choose from shoulder, elbow, wrist"),
+        (10, "pear:0 has no skin"),
+    ],
+)
+def test_joints_that_cannot_move_are_refused_in_one_sentence(arm, joints, message):
+    scene = scene_of() if joints == 10 else augment.build_scene([(arm, "arm")], 8, silhouettes=True)
+    with pytest.raises(InputError, match=message):
+        problem_of(scene, joints=joints)
