@@ -21,7 +21,7 @@ THREADS = torch.get_num_threads()  # before any run sets its own
 PASS, PASSES = 0.08, 5  # seconds of a pass by one thread, and passes of each, in a trial of threads
 CLEARLY = 1.25  # the ratio of seconds at which more threads are taken
 _CHOSEN: dict[str, int] = {}  # threads, by what they were tried with
-PRECISIONS = ("auto", "bfloat16", "float32")
+PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave on success, and validation
 RECOMPILE_LIMIT = 4 * len(SIZES)  # each with and without gradients, which torch's 8 are too few for
@@ -86,13 +86,14 @@ def set_deterministic(deterministic: bool) -> None:
 
 
 def choose_precision(precision: str, device: torch.device) -> str:
-    """ "bfloat16" or "float32"; "auto" takes bfloat16 where the device computes in it rather than emulate it."""
-    require_choice("train.precision", precision, PRECISIONS)
+    """One of PRECISIONS; "auto" takes bfloat16 where the device computes in it rather than emulate it, otherwise
+    float16 on a GPU and float32 on a CPU."""
+    require_choice("train.precision", precision, ("auto", *PRECISIONS))
     if precision != "auto":
         return precision
     if device.type == "cuda":
-        supported = torch.cuda.is_bf16_supported(including_emulation=False)
-    elif platform.machine() in ("x86_64", "AMD64"):
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float16"
+    if platform.machine() in ("x86_64", "AMD64"):
         supported = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
     else:
         supported = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
@@ -109,7 +110,7 @@ class MixedPrecision(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         images = images.contiguous(memory_format=torch.channels_last)
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+        with torch.autocast(images.device.type, PRECISIONS[self.precision], enabled=self.precision != "float32"):
             return self.network(images).float()
 
 

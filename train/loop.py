@@ -25,7 +25,7 @@ from train.checkpoint import random_state, restore_random_state
 from train.data import Split
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import Interruption, replicated, summed
-from train.recipe import MovingAverage, TrainSettings, augmentation, training_loss
+from train.recipe import MovingAverage, TrainSettings, augmentation, build_optimizer, training_loss
 from train.run_folder import PHASES, RunLog
 
 EVALUATION_BATCH = 512  # images at a time
@@ -68,9 +68,10 @@ class Trainer:
 
         InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
         """
-        processes = utils.world_size()
-        if settings.batch_size % processes:
-            raise InputError(f"train.batch_size={settings.batch_size} is no multiple of the {processes} processes")
+        processes, parts = utils.world_size(), settings.accumulate
+        if settings.batch_size % (processes * parts):
+            divisor = f"{processes} processes × train.accumulate={parts}"
+            raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
         if settings.ranking and service.label is None:
             raise InputError("train.ranking ranks hard negatives: name some in scene.hard_negatives or augment.folder")
         self.settings, self.architecture, self.service, self.folder = settings, architecture, service, folder
@@ -88,10 +89,9 @@ class Trainer:
         average = self.soup or self.ema
         self.selected = cast(MixedPrecision, average.module) if average else model
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
-        options: dict[str, Any] = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0}
-        rate, momentum = settings.learning_rate, settings.momentum
         with announced("loading the optimizer"):  # torch imports its compiler here: seconds
-            self.optimizer = torch.optim.SGD(model.parameters(), rate, momentum, fused=True, **options)
+            self.optimizer = build_optimizer(model, settings)
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=model.precision == "float16")
         compiled = compiles(settings.compile, self.device)
         teacher = self.initial if settings.distillation else None
         self._loss = training_loss(replica, settings, service.label, teacher, labeled)
@@ -175,12 +175,19 @@ class Trainer:
             group["lr"] = settings.rate(progress)
         images = self._augment(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
-        loss, hits = self._loss(images, labels, rendered)
-        loss.backward()
-        self.optimizer.step()
+        sums = torch.zeros(2, device=self.device)
+        for batch in zip(*(part.chunk(settings.accumulate) for part in (images, labels, rendered)), strict=True):
+            loss, hits = self._loss(*batch)
+            self.scaler.scale(loss / settings.accumulate).backward()
+            sums += torch.stack([loss.detach() * len(batch[0]), hits])
+        if settings.clip_gradient:
+            self.scaler.unscale_(self.optimizer)
+            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
         if self.ema:
             self.ema.update_parameters(self.model)
-        return torch.stack([loss.detach() * len(labels), hits])
+        return sums
 
     def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
         """Validate on the split's rows, remember the best network, and log the epoch's metrics."""
@@ -247,11 +254,12 @@ class Trainer:
         return {"architecture": self.architecture, "epoch": self.epoch, "seed": self.seed, "arm": arm}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a run needs to go on as if it had never ended; bfloat16 needs no GradScaler."""
+        """All that a run needs to go on as if it had never ended."""
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "scaler": self.scaler.state_dict(),
             "ema": self.ema.state_dict() if self.ema else None,
             "soup": self.soup.state_dict() if self.soup else None,
             "precision": self.model.precision,
@@ -265,6 +273,7 @@ class Trainer:
         """What `state_dict` gave; many kinds of error for anything else."""
         self.model.network.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.scaler.load_state_dict(state["scaler"])
         if self.ema:
             self.ema.load_state_dict(state["ema"])
         if self.soup:

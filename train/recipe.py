@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from augment import utils
+from augment.classifiers.adapter import nearest
 from augment.losses import divergence, is_right, label_loss, ranking_loss
 from augment.utils import as_found, generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
@@ -20,9 +22,11 @@ Augment = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), 
 Loss = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
+OPTIMIZERS = ("sgd", "adamw")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 PGD_RADIUS, PGD_STEP, PGD_STEPS = 2 / 255, 1 / 255, 3  # L∞ norm; Madry et al. 2018: 8/255 on CIFAR-10
 LARGEST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
+LARGEST["accumulate"] = LARGEST["batch_size"]
 
 # Factors of the learning rate at a fraction of the training: ×0.2 at 30, 60 and 80 % (Zagoruyko and Komodakis 2016: at
 # epochs 60, 120 and 160 of 200); half a cosine; up over the first fifth and down, the most from a few epochs.
@@ -41,9 +45,13 @@ class TrainSettings:
     epochs: int = 150
     images_per_epoch: int | None = None
     batch_size: int = 128
+    accumulate: int = 1
+    optimizer: str = "sgd"
     learning_rate: float = 0.125
     momentum: float = 0.9
     weight_decay: float = 5e-4
+    clip_gradient: float | None = None
+    freeze: str | None = None
     schedule: str = "step"
     flips: str = "random"
     augmentation: str = "none"
@@ -64,7 +72,7 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS, "compile": COMPILE}
-        for name, known in choices.items():
+        for name, known in {**choices, "optimizer": OPTIMIZERS}.items():
             require_choice(name, getattr(self, name), known)
         for name, largest in LARGEST.items():
             require_range(name, getattr(self, name), 1, largest)
@@ -75,12 +83,39 @@ class TrainSettings:
             require_range(name, getattr(self, name), 0, FACTOR)
         if (self.distillation or self.soup or self.eval_mode) and not self.init_from:
             raise InputError("distillation, soup and eval_mode need a network to begin with: set init_from")
-        if not 0 < self.learning_rate <= FACTOR:
-            raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
+        for name in ("learning_rate", "clip_gradient"):
+            if (value := getattr(self, name)) is not None and not 0 < value <= FACTOR:
+                raise InputError(f"{name}={value} must be positive and at most {FACTOR:g}")
 
     def rate(self, done: float) -> float:
         """The learning rate where that fraction of the training is done."""
         return self.learning_rate * SCHEDULES[self.schedule](done)
+
+
+def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
+    """SGD with Nesterov's momentum, as the paper's, which decays all weights; or AdamW (Loshchilov and Hutter 2019),
+    which does not decay biases and the weights of norms, as is usual with it, and has its own two momenta."""
+    rate, decay = settings.learning_rate, settings.weight_decay
+    if settings.optimizer == "sgd":
+        nesterov = settings.momentum > 0
+        options: dict[str, Any] = {"momentum": settings.momentum, "weight_decay": decay, "nesterov": nesterov}
+        return torch.optim.SGD(model.parameters(), rate, **options, fused=True)
+    groups: tuple[list[Tensor], list[Tensor]] = [], []
+    for parameter in model.parameters():
+        groups[parameter.ndim > 1].append(parameter)
+    decays = ({"params": group, "weight_decay": decay * index} for index, group in enumerate(groups))
+    return torch.optim.AdamW(decays, rate, fused=True)
+
+
+def freeze(network: nn.Module, stage: str) -> None:
+    """Let the parameters of a network stay as they are, from its first one to the last of the module of that name.
+    InputError: there is no such module, or it has none."""
+    names = [name for name, _ in network.named_parameters()]
+    if not (frozen := [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]):
+        parts = nearest(stage, sorted({name.rpartition(".")[0] for name in names}))
+        raise InputError(f"train.freeze={stage} is no part of the network: choose one, such as {parts}")
+    for parameter in list(network.parameters())[: frozen[-1] + 1]:
+        parameter.requires_grad_(False)
 
 
 def training_loss(

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from augment import utils
 from augment.build import build_scene
-from augment.classifiers.adapter import class_index
+from augment.classifiers.adapter import Normalized, class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
@@ -46,6 +46,7 @@ from train.photographs.metrics import METRICS, find_metric
 from train.photographs.predictions import Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
+from train.recipe import freeze
 from train.rendered_shapes import load_shapes
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
@@ -205,6 +206,8 @@ def build_trainer(
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if base:
         start_from(network, facts, *base)
+    if settings.train.freeze:
+        freeze(network.network if isinstance(network, Normalized) else network, settings.train.freeze)
     model = MixedPrecision(network.to(device), precision)
     batch = to_unit(data.train.images[: settings.train.batch_size])
     torch.set_num_threads(threads or choose_threads(model, batch))

@@ -6,7 +6,7 @@ import signal
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
 
 from augment.service import AugmentationService, AugmentationSettings
 from augment.utils import Phases
@@ -16,7 +16,7 @@ from train.data import Split
 from train.device import MixedPrecision
 from train.loop import Trainer, evaluate
 from train.networks import WideResNet
-from train.recipe import SCHEDULES, TrainSettings
+from train.recipe import SCHEDULES, TrainSettings, freeze
 from train.run_folder import RunLog, read_metrics
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
@@ -28,9 +28,9 @@ def noise(count: int) -> Split:
     return Split(images, torch.randint(0, 3, (count,), generator=draws))
 
 
-def make_trainer(folder, network: nn.Module | None = None, **settings) -> Trainer:
+def make_trainer(folder, network: nn.Module | None = None, precision: str = "float32", **settings) -> Trainer:
     torch.manual_seed(0)
-    model = MixedPrecision(network or WideResNet(3, 10, 1, dropout=0.0), "float32")
+    model = MixedPrecision(network or WideResNet(3, 10, 1, dropout=0.0), precision)
     settings = TrainSettings(**{"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"} | settings)
     no_renders = AugmentationService(AugmentationSettings(arm="none"), None, torch.zeros(0).long(), 0, Phases())
     return Trainer(settings, model, ARCHITECTURE, no_renders, folder)
@@ -75,6 +75,69 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     (line,) = read_metrics(tmp_path)
     assert line["train/loss"] == pytest.approx(sum(losses) / 2)
     assert line["train/learning_rate"] == pytest.approx(0.5 * SCHEDULES["cosine"](1 / 2))
+
+
+def step_on(monkeypatch, folder, **settings) -> tuple[nn.Linear, dict[str, Tensor], tuple[Tensor, Tensor]]:
+    """A linear layer after one step on a batch of eight, its weight and bias before, and the batch's gradients."""
+    as_bytes, labels = torch.randint(0, 256, (8, 3, 2, 2)).to(torch.uint8), torch.arange(8) % 3
+    batch = [(as_bytes, labels, labels < 0)]
+    monkeypatch.setattr("train.loop.training_batches", lambda *rest: iter(batch))
+    monkeypatch.setattr("train.loop.evaluate", lambda *rest: {"loss": 1.0, "accuracy": 0.0})
+    torch.manual_seed(1)
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
+    before = {name: value.detach().clone().requires_grad_() for name, value in network[1].named_parameters()}
+    loss = F.cross_entropy((as_bytes / 255).flatten(1) @ before["weight"].T + before["bias"], labels)
+    gradients = torch.autograd.grad(loss, list(before.values()))
+    trainer = make_trainer(folder, network, **{"epochs": 1, "batch_size": 8, "schedule": "cosine"} | settings)
+    trainer.fit(Split(as_bytes, labels), torch.zeros(8, dtype=torch.bool), RunLog(folder))
+    return network[1], before, gradients
+
+
+def test_adamw_decays_weights_but_no_biases(tmp_path, monkeypatch):
+    """Its first step is as long as the rate, by the gradient's signs."""
+    settings = {"optimizer": "adamw", "learning_rate": 0.01, "weight_decay": 0.1}
+    layer, before, (weight, bias) = step_on(monkeypatch, tmp_path, **settings)
+    torch.testing.assert_close(layer.weight, before["weight"] * (1 - 0.001) - 0.01 * weight.sign())
+    torch.testing.assert_close(layer.bias, before["bias"] - 0.01 * bias.sign())
+
+
+@pytest.mark.parametrize("precision, tolerance", [("float32", 1e-6), ("float16", 2e-3)])
+def test_a_step_in_parts_follows_the_clipped_gradient_of_the_whole_batch(tmp_path, monkeypatch, precision, tolerance):
+    """In float16 the scale of the loss is taken off before."""
+    settings = {
+        "precision": precision,
+        "accumulate": 4,
+        "clip_gradient": 0.1,
+        "momentum": 0.0,
+        "weight_decay": 0.0,
+        "learning_rate": 1.0,
+    }
+    layer, before, gradients = step_on(monkeypatch, tmp_path, **settings)
+    length = torch.cat([part.flatten() for part in gradients]).norm()
+    assert length > 0.2
+    for name, gradient in zip(("weight", "bias"), gradients, strict=True):
+        step = before[name] - getattr(layer, name)
+        torch.testing.assert_close(step, 0.1 * gradient / length, rtol=0, atol=tolerance)
+
+
+def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
+    trainer = make_trainer(tmp_path, precision="float16", epochs=1)
+    trainer.scaler.load_state_dict(trainer.scaler.state_dict() | {"scale": 256.0})
+    fit_noise(trainer)
+    resumed = make_trainer(tmp_path, precision="float16", epochs=1)
+    resumed.resume()
+    assert resumed.scaler.get_scale() == trainer.scaler.get_scale() == 256
+
+
+def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path):
+    network = WideResNet(3, 10, 1, dropout=0.0)
+    before = {name: value.clone() for name, value in network.named_parameters()}
+    freeze(network, "groups.1")
+    fit_noise(make_trainer(tmp_path, network, epochs=1))
+    changed = [name for name, value in network.named_parameters() if not torch.equal(value, before[name])]
+    assert changed and all(name.startswith(("groups.2", "norm", "head")) for name in changed)
+    with pytest.raises(InputError, match=r"train.freeze=group.1 is no part of the network: choose one, such as groups"):
+        freeze(network, "group.1")
 
 
 @pytest.mark.parametrize("training", [True, False])
