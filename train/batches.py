@@ -1,8 +1,8 @@
 """Batches of training images, data and renders, in the rounds of an epoch: shuffled, cropped and flipped."""
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -10,10 +10,12 @@ from torch import Tensor
 from augment import utils
 from augment.utils import generator
 from train.data import Split
+from train.image_files import ImageFiles
 
 PADDING = 4
 CHUNK_BYTES = 2**24  # of the batches that are cropped at once
 FLIPS = ("random", "alternating")
+Batches = Sequence[Tensor]
 
 
 class TrainingImages(NamedTuple):
@@ -64,9 +66,14 @@ def training_batches(
         drawn = torch.randint(0, 2, (len(data) + len(renders),), generator=generator(seed, "flips"), dtype=torch.bool)
         flipped = drawn[order] ^ bool(now.epoch % 2)
     shard = batch_size // utils.world_size()
-    at_once = shard * max(1, CHUNK_BYTES // (shard * split.images[0].numel()))
     columns = slice(utils.rank() * shard, (utils.rank() + 1) * shard)
+    if isinstance(split.images, ImageFiles):
+        seeds = torch.randint(2**62, order.shape, generator=generator(seed, now.number, "crops"))
+        chosen = (draws[..., first:, columns].unbind(-2) for draws in (order, shifts, flipped, seeds))
+        yield from _batches_from_files(images, split.images, *chosen)
+        return
     order, shifts, flipped = (draws[..., first:, columns].flatten(-2) for draws in (order, shifts, flipped))
+    at_once = shard * max(1, CHUNK_BYTES // (shard * split.images[0].numel()))
     rendered, device = order >= len(data), split.images.device
     places = [part.nonzero().squeeze(1).to(device) for part in rendered.split(at_once)]
     draws = [data[order.clamp(max=len(data) - 1)], order - len(data), shifts, flipped, rendered]
@@ -76,9 +83,31 @@ def training_batches(
         cropped, labels = crop_and_flip(split.images, row, shift, flip), split.labels[row]
         if len(place):
             number = number[place]
-            cropped[place] = crop_and_flip(renders.images, number, shift[:, place], flip[place])
+            cropped[place] = crop_and_flip(cast(Tensor, renders.images), number, shift[:, place], flip[place])
             labels[place] = renders.labels[number]
         yield from zip(*(part.split(shard) for part in (cropped, labels, is_render)), strict=True)
+
+
+def _batches_from_files(
+    images: TrainingImages, files: ImageFiles, orders: Batches, shifts: Batches, flips: Batches, seeds: Batches
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """`training_batches` of files in random crops, with renders that are shifted and flipped."""
+    (split, data, renders), device = images, images.split.labels.device
+    rendered = [order >= len(data) for order in orders]
+    rows = [data[order[~is_render]] for order, is_render in zip(orders, rendered, strict=True)]
+    crops = files.crops(rows, [part[~is_render] for part, is_render in zip(seeds, rendered, strict=True)])
+    for row, crop, order, shift, flip, is_render in zip(rows, crops, orders, shifts, flips, rendered, strict=True):
+        pixels = torch.empty(len(order), *files.shape[1:], dtype=torch.uint8, device=device)
+        labels = torch.empty(len(order), dtype=torch.int64, device=device)
+        pixels[~is_render], labels[~is_render] = crop.to(device), split.labels[row.to(device)]
+        if is_render.any():
+            number = (order[is_render] - len(data)).to(device)
+            shift, flip = shift[:, is_render].to(device), flip[is_render].to(device)
+            pixels[is_render], labels[is_render] = (
+                crop_and_flip(cast(Tensor, renders.images), number, shift, flip),
+                renders.labels[number],
+            )
+        yield pixels, labels, is_render.to(device)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Images as uint8 arrays, labeled (CIFAR-100, an .npz file, a folder of class folders) or not (any folder)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,25 +14,41 @@ from augment.utils import generator, progress
 from renderer.errors import InputError, in_one_line
 from train import console
 from train.checkpoint import content_hash
-from train.photographs.folder import find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
+from train.image_files import RESIDENT, ImageFiles
+from train.photographs.folder import Photograph, find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
 
 
 @dataclass(frozen=True)
 class Split:
-    """images: (N, 3, H, W) uint8 RGB. labels: (N,) int64."""
+    """images: (N, 3, H, W) uint8 RGB, or files that give them. labels: (N,) int64."""
 
-    images: Tensor
+    images: Tensor | ImageFiles
     labels: Tensor
 
     def __len__(self) -> int:
         return len(self.labels)
 
-    content_hash = cached_property(lambda self: content_hash([self.images, self.labels]))
+    @cached_property
+    def content_hash(self) -> str:
+        """Of images and labels; of files, by names and sizes."""
+        return content_hash([self.images.facts() if isinstance(self.images, ImageFiles) else self.images, self.labels])
 
     def to(self, device: torch.device) -> "Split":
-        return Split(self.images.to(device), self.labels.to(device))
+        """Files stay where they are."""
+        return Split(
+            self.images if isinstance(self.images, ImageFiles) else self.images.to(device), self.labels.to(device)
+        )
+
+    def squares(self, rows: Iterable[Tensor]) -> Iterator[Tensor]:
+        """The images (B, 3, H, W) uint8 of batches of rows."""
+        images = self.images
+        return images.squares(rows) if isinstance(images, ImageFiles) else (images[batch] for batch in rows)
+
+    def sample(self, count: int) -> Tensor:
+        """Images from all over the split, so many at most."""
+        return next(iter(self.squares([torch.linspace(0, len(self) - 1, min(count, len(self))).long()])))
 
     def __getitem__(self, rows: Tensor | slice) -> "Split":
         return Split(self.images[rows], self.labels[rows])
@@ -130,10 +146,11 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
 
 
-def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
+def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: bool = False, workers: int = 0) -> DataSet:
     """Class folders of images, or `train` and `test` folders of them; center squares reduced to size × size.
 
-    Without a `test` folder, that fraction of every class is held out as the test split.
+    Without a `test` folder, that fraction of every class is held out as the test split. Images of more than `RESIDENT`
+    pixels per side stay on disk, from where so many processes read them in random crops.
     """
     root = Path(path)
     if not root.is_dir():
@@ -147,20 +164,19 @@ def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     if unread := left_out(root):
         console.warning("%d files in %s are not images: %s", len(unread), root, ", ".join(map(str, unread[:3])))
-    train = _folder_split(train_root, classes, size)
+    options = size, skip_unreadable, workers
+    train = _folder_split(train_root, classes, *options)
     if empty := set(range(len(classes))).difference(train.labels.tolist()):
         raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")
     if parts:
-        return DataSet(classes, train, _folder_split(root / "test", classes, size))
+        return DataSet(classes, train, _folder_split(root / "test", classes, *options))
     held_out = held_out_rows(train, test_fraction, seed=0, key="data.test_fraction")
     return DataSet(classes, train[~held_out], train[held_out])
 
 
-def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool) -> DataSet:
+def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int) -> DataSet:
     """All images of a folder and its sub-folders, of no class yet: every label is 0."""
-    found, images, skipped = load_photographs(Path(path), find_unlabeled(Path(path)), size, skip_unreadable)
-    if skipped:
-        console.warning("%d of %d photographs are broken and skipped", len(skipped), len(found) + len(skipped))
+    _, images = _read(Path(path), find_unlabeled(Path(path)), size, skip_unreadable, workers)
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
     held_out = held_out_rows(split, test_fraction, seed=0, key="data.test_fraction")
     return DataSet((), split[~held_out], split[held_out])
@@ -170,6 +186,18 @@ def _folders(root: Path) -> list[str]:
     return sorted(entry.name for entry in root.iterdir() if entry.is_dir() and not is_hidden(entry.name))
 
 
-def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:
-    photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size, advice="")
-    return Split(images, torch.tensor([class_index(classes, item.label, f"data.path={root}") for item in photographs]))
+def _folder_split(root: Path, classes: tuple[str, ...], size: int, skip_unreadable: bool, workers: int) -> Split:
+    found, images = _read(root, find_photographs(root, classes, classes[0]), size, skip_unreadable, workers)
+    return Split(images, torch.tensor([class_index(classes, item.label, f"data.path={root}") for item in found]))
+
+
+def _read(
+    root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
+) -> tuple[list[Photograph], Tensor | ImageFiles]:
+    """Those that can be read, and their images, in memory or on disk."""
+    if size > RESIDENT:
+        return found, ImageFiles(root, tuple(item.path for item in found), size, workers, skip_unreadable)
+    readable, images, broken = load_photographs(root, found, size, skip_unreadable)
+    if broken:
+        console.warning("%d of %d images cannot be read and are skipped: %s", len(broken), len(found), broken[0])
+    return readable, images

@@ -316,12 +316,13 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
 @torch.no_grad()
 def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
     """Mean cross entropy and top-1 accuracy in eval mode on a split, or its rows; each process scores a shard."""
-    rows = (torch.arange(len(split)) if rows is None else rows).to(split.images.device)
-    loss_sum, hits = totals = torch.zeros(2, device=split.images.device)
+    device = split.labels.device
+    rows = (torch.arange(len(split)) if rows is None else rows).to(device)
+    loss_sum, hits = totals = torch.zeros(2, device=device)
     batches = rows[utils.rank() :: utils.world_size()].split(EVALUATION_BATCH)
     with eval_mode(model):
-        for batch in progress(batches, f"{len(rows)} images"):
-            logits, labels = model(to_unit(split.images[batch])), split.labels[batch]
+        for batch, images in zip(progress(batches, f"{len(rows)} images"), split.squares(batches), strict=True):
+            logits, labels = model(to_unit(images.to(device))), split.labels[batch]
             loss_sum += F.cross_entropy(logits, labels, reduction="sum")
             hits += (logits.argmax(1) == labels).sum()
     loss_sum, hits = summed(totals).tolist()

@@ -13,7 +13,7 @@ from augment.build import build_scene
 from augment.classifiers.adapter import Normalized, class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
-from augment.utils import Phases, stream_seed
+from augment.utils import Phases, progress, stream_seed
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
@@ -43,7 +43,7 @@ from train.networks import (
 )
 from train.photographs.folder import find_photographs, load_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
-from train.photographs.predictions import Model, compute_logits
+from train.photographs.predictions import BATCH, Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.recipe import freeze
@@ -54,6 +54,7 @@ from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rast
 Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_initial` gives it
 UNLABELED = "unlabelled"  # data whose labels are the answers of the network begun with
 SIZE = 32  # of the images of a folder, where neither data.size nor the network begun with says
+SAMPLED = 1000  # images whose channels are measured where they are on disk
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
 
 
@@ -132,8 +133,8 @@ def load_data(settings: ExperimentSettings) -> DataSet:
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
-        "folder": lambda: load_folder(data.path, size, data.test_fraction),
-        UNLABELED: lambda: load_unlabeled(data.path, size, data.test_fraction, skip),
+        "folder": lambda: load_folder(data.path, size, data.test_fraction, skip, data.workers),
+        UNLABELED: lambda: load_unlabeled(data.path, size, data.test_fraction, skip, data.workers),
         "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, size, data.seed, cache),
     }
     require_choice("data.name", data.name, loaders)
@@ -152,8 +153,14 @@ def _initial(settings: ExperimentSettings) -> Base:
 
 def _answered(settings: ExperimentSettings, trainer: Trainer, split: Split) -> Split:
     """Images with the answers of the network begun with as labels."""
+    return Split(split.images, _initial_logits(settings, trainer, split).argmax(1))
+
+
+def _initial_logits(settings: ExperimentSettings, trainer: Trainer, split: Split) -> torch.Tensor:
     predict, classes = _initial_predictor(settings, trainer), len(trainer.architecture["classes"])
-    return Split(split.images, compute_logits(predict, split.images, classes, trainer.device).argmax(1))
+    batches = torch.arange(len(split)).split(BATCH)
+    images = progress(split.squares(batches), "predictions", len(batches))
+    return torch.cat([compute_logits(predict, batch, classes, trainer.device) for batch in images])
 
 
 def _agreement(settings: ExperimentSettings, trainer: Trainer, test: Split) -> float:
@@ -200,7 +207,8 @@ def build_trainer(
             raise InputError(f"model={shape['name']}: train.init_from={base[0]} has its own network: leave it out")
         shape = {"name": name, CLASSIFIER: True}
     precision = choose_precision(settings.train.precision, device)
-    mean, std = channel_statistics(data.train.images)
+    images = data.train.images
+    mean, std = channel_statistics(images if isinstance(images, torch.Tensor) else data.train.sample(SAMPLED))
     torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
@@ -209,7 +217,7 @@ def build_trainer(
     if settings.train.freeze:
         freeze(network.network if isinstance(network, Normalized) else network, settings.train.freeze)
     model = MixedPrecision(network.to(device), precision)
-    batch = to_unit(data.train.images[: settings.train.batch_size])
+    batch = to_unit(data.train.sample(settings.train.batch_size))
     torch.set_num_threads(threads or choose_threads(model, batch))
     service = build_service(settings, data, device)
     labeled, recipe = settings.data.name != UNLABELED, settings.train
@@ -284,11 +292,11 @@ def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet
     """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs."""
     if not trainer.initial or utils.rank():
         return {}
-    predict, device = _initial_predictor(settings, trainer), trainer.device
-    logits = compute_logits(predict, data.test.images, len(data.classes), device)
+    logits = _initial_logits(settings, trainer, data.test)
     accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
     console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, _test_images(settings, data))
-    _score_photographs(settings, predict, data, trainer.folder / BEFORE, device)
+    predict = _initial_predictor(settings, trainer)
+    _score_photographs(settings, predict, data, trainer.folder / BEFORE, trainer.device)
     return {"test/accuracy_before": accuracy}
 
 

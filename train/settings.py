@@ -36,7 +36,7 @@ OTHER = "other"  # in place of the class of a hard negative that the classifier 
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
-MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
+MOST_IMAGES, MOST_WORKERS, LARGEST_SEED = 10**6, 1024, 2**63 - 1
 TEXTS = {  # keys whose values are names or paths, also where they look like numbers
     *("run", "sweep", "init_from", "out", "photos", "path", "folder", "cache"),
     *("weights", "light", "label", "target", "classifier", "name", "reload"),
@@ -52,6 +52,7 @@ class DataSettings:
     path: str = ""
     size: int | None = None
     test_fraction: float = 0.1
+    workers: int = 2
     train_per_class: int = 300
     test_per_class: int = 60
     seed: int = 0
@@ -60,6 +61,7 @@ class DataSettings:
         if self.size is not None:
             require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
         require_range("seed", self.seed, 0, LARGEST_SEED)
+        require_range("workers", self.workers, 0, MOST_WORKERS)
         for name in ("train_per_class", "test_per_class"):
             require_range(name, getattr(self, name), 1, MOST_IMAGES)
 

@@ -119,6 +119,12 @@ def test_what_does_not_fit_is_refused_in_one_sentence(tuned, change, message):
     assert "\n" not in str(caught.value)
 
 
+def test_photographs_that_stay_on_disk_train_and_score_a_network_of_their_size(tuned, weights):
+    folder, scores = tuned("unlabelled", "data.size=96", "data.workers=2", "train.learning_rate=1e-12")
+    assert read_metrics(folder)[0]["train/loss"] < 1e-6 and scores["test/agreement"] == 1
+    assert load_run(folder)(torch.rand(1, 3, 96, 96)).shape == (1, 1000)
+
+
 def test_a_truncated_photograph_among_unlabeled_ones_is_skipped_and_counted(tuned, photos, tmp_path, caplog):
     for file in photos.glob("*/*.png"):
         (tmp_path / f"{file.parent.name}_{file.name}").write_bytes(file.read_bytes())
@@ -126,7 +132,7 @@ def test_a_truncated_photograph_among_unlabeled_ones_is_skipped_and_counted(tune
     with pytest.raises(InputError, match=r"1 of 33 photographs cannot be read, .*broken\.jpg.*skip_unreadable"):
         tuned("unlabelled", f"data.path={tmp_path}")
     tuned("unlabelled", f"data.path={tmp_path}", "evaluate.skip_unreadable=true")
-    assert "1 of 33 photographs are broken and skipped" in caplog.text
+    assert "1 of 33 images cannot be read and are skipped: broken.jpg" in caplog.text
 
 
 def test_timms_networks_take_their_own_normalization_and_weights_from_safetensors(tmp_path):
