@@ -1,11 +1,12 @@
 """A table under an object and a wall behind it, in the object's light and in its shadow, as a background of an image.
 
 The sky's irradiance is exact but where the object blocks it: there, as in `renderer.transport`, the radiance of the
-directions that hit the object is taken away. A distant lamp casts a sharp shadow. What the table reflects lights the
-object from below; the object reflects nothing onto the table.
+directions that hit the object is taken away. A distant lamp casts a sharp shadow, local lights those of their own. What
+the table reflects of sky and distant lamp lights the object from below; the object reflects nothing onto the table.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.image import ImageSettings
-from renderer.light.basis import HARMONICS, Harmonics
+from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.harmonics import bands, per_degree
 from renderer.mesh import Mesh
+from renderer.transport.local import unoccluded
 from renderer.transport.rays import Rays, sphere
 
 DIRECTIONS = 48  # of the sky, from a point
@@ -55,19 +57,21 @@ def irradiance(
     image: ImageSettings,
     sky: Tensor,
     lamp: Tensor,
+    lights: Sequence[tuple[LocalBasis, Tensor]] = (),
 ) -> Tensor:
     """(3, size, size) of the surfaces that a camera sees, averaged over each pixel's samples.
 
     rays: among the faces of the object, which lies within `radius` of the origin. height: of the table. wall: the
     distance of the wall behind the origin; it faces the camera's azimuth. sky: coefficients (49, 3). lamp: the
-    direction (3,) of white light of irradiance 1, or zero for none. InputError: Embree is not installed.
+    direction (3,) of white light of irradiance 1, or zero for none. lights: local ones, and the coefficients
+    (size, 3) of each. InputError: Embree is not installed.
     """
     sine, cosine = math.sin(camera.azimuth), math.cos(camera.azimuth)
     turn = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     directions, radiance, irradiance = _directions(HARMONICS.degree)
     directions, sky = directions @ turn, _turned(sky, camera.azimuth)
     normals = torch.stack([turn[2], turn[0]])
-    fine = image if lamp.any() else replace(image, samples=1)  # a lamp's shadow has edges
+    fine = image if lamp.any() or lights else replace(image, samples=1)  # a lamp's shadow has edges
     points, on_wall = _surfaces(camera, fine, height, wall, normals)
     arriving, fraction = (irradiance @ sky).clamp(min=0), on_wall.double().mean(0)[:, None]
     open_sky = arriving[0] + fraction * (arriving[1] - arriving[0])
@@ -75,6 +79,11 @@ def irradiance(
     shaded = torch.nonzero((lit > 0) & _near(points, lamp, radius), as_tuple=True)
     starts = points[shaded] + rays.offset * normals[on_wall[shaded].long()]
     lit[shaded] *= rays.first_hit(starts, lamp.expand(len(starts), 3)) < 0
+    emitted, facing = torch.zeros(points.numel() // 3, 3, dtype=torch.float64), normals[on_wall.long()].flatten(0, 1)
+    for basis, coefficients in lights:
+        paths = unoccluded(rays, basis, points.flatten(0, 1), facing, facing)
+        emitted.index_add_(0, paths.point, paths.irradiance[:, None] * coefficients[paths.function])
+    lit = lit.mean(0)[:, None] + emitted.unflatten(0, (len(on_wall), -1)).mean(0)
     coarse = replace(image, size=-(-image.size // COARSE), samples=1)
     points, on_wall = (part[0] for part in _surfaces(camera, coarse, height, wall, normals))
     blocked = torch.zeros(len(points), 3, dtype=torch.float64)
@@ -85,7 +94,7 @@ def irradiance(
         hit = rays.first_hit(starts[row], directions[surface, number]) >= 0
         blocked.index_add_(0, pixels[row[hit]], sent[number[hit]])
     blocked = F.interpolate(blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear")[0]
-    return ((open_sky.T + lit.mean(0)).unflatten(1, (image.size, -1)) - blocked).clamp(min=0)
+    return ((open_sky + lit).T.unflatten(1, (image.size, -1)) - blocked).clamp(min=0)
 
 
 def across_light(

@@ -19,7 +19,7 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
-from renderer.light.basis import HARMONICS
+from renderer.light.basis import HARMONICS, LocalBasis, parts_of
 from renderer.light.presets import directional, load_light
 from renderer.transport.rays import Rays
 
@@ -56,19 +56,19 @@ class CameraEffectSettings:
 class VariationSettings:
     """What is drawn for each example in each regeneration; by default nothing, which leaves the paper's grid.
 
-    shift: of the mesh's center, at most, as a fraction of the frame's width, to either side and up and down.
-    scale, exposure: [least, most] factor of the mesh's size in the frame, and of the light; log-uniform. backgrounds:
-    a folder of images, one behind each example. instances: every solid that is named without a seed is another instance
-    in each of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and
-    down. fov: [least, most] degrees between the image's sides, of cameras in perspective. rotation: degrees by which
-    the object itself is turned in each of its views, at most, about a random axis. environments: each example is in one
-    of these lights, as `load_light` takes them. directional_fraction: of the examples, in a directional light from the
-    camera's side, up to 70° off, plus [least, most] `fill_light` of their own light. lit_background: a background is a
-    wall that faces the camera, in the example's light. tables: fraction of the examples that stand on a table before a
-    wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75°
-    above; patterns then fall on all three from where the directional light is. background_saturation: of random colors
-    that multiply the backgrounds, at most. Backgrounds keep the light that was drawn, also where an attack changes the
-    object's.
+    shift: of the mesh's center, at most, as a fraction of the frame's width, to either side and up and down. scale,
+    exposure: [least, most] factor of the mesh's size in the frame, and of the light; log-uniform. backgrounds: a folder
+    of images, one behind each example. instances: every solid that is named without a seed is another instance in each
+    of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and down. fov:
+    [least, most] degrees between the image's sides, of cameras in perspective. rotation: degrees by which the object
+    itself is turned in each of its views, at most, about a random axis. environments: each example is in one of these
+    lights, as `load_light` takes them. directional_fraction: of the examples, in a directional light from the camera's
+    side, up to 70° off, plus [least, most] `fill_light` of their environment. Projector and lamps stay. lit_background:
+    a background is a wall that faces the camera, in the example's light. tables: fraction of the examples that stand on
+    a table before a wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen
+    from 15° to 75° above; patterns then fall on all three from where the directional light is. background_saturation:
+    of random colors that multiply the backgrounds, at most. Backgrounds keep the light that was drawn, also where an
+    attack changes the object's.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
@@ -115,8 +115,8 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once
     """
     on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
-        if scene.views > 1 or scene.basis != HARMONICS or any(item.ground is not None for item in scene.objects):
-            raise InputError("tables are for one view, without ground, projector and lamps: leave these out, or tables")
+        if scene.views > 1 or any(item.ground is not None for item in scene.objects):
+            raise InputError("tables are for one view of objects that stand on none: leave ground out, or tables")
         on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _with_moved_rows(scene, settings, draws, once, on_table)
@@ -169,7 +169,8 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
     exposures = _log_uniform(settings.exposure, len(scene), draws)
     rows = [replace(row, exposure=row.exposure * factor) for row, factor in zip(scene.examples, exposures, strict=True)]
     changed: dict[str, Any] = {}
-    sky, lamps = scene.lights, torch.zeros(len(rows), 3, dtype=torch.float64)
+    sky, local = scene.lights.tensor_split([HARMONICS.size], dim=1)  # projector and lamps stay as they are
+    lamps = torch.zeros(len(rows), 3, dtype=torch.float64)
     if settings.environments:
         chosen = torch.randint(len(settings.environments), (len(rows),), generator=draws)
         lights = torch.stack([load_light(light) for light in settings.environments])
@@ -186,7 +187,7 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         if settings.tables:
             sky = sky.clone()
             sky[on_table] = room.above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
-        lit = replace(scene, examples=rows, lights=_with_directional(sky, lamps))
+        lit = replace(scene, examples=rows, lights=torch.cat([_with_directional(sky, lamps), local], dim=1))
         values = albedo * _facing(lit) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
         if settings.tables:
             irradiance, points = _in_rooms(lit, sky, lamps, _log_uniform(WALL, len(rows), draws), on_table)
@@ -196,7 +197,8 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
     if settings.camera != CameraEffectSettings():
         effects = settings.camera, len(rows), scene.settings, draws, scene.lights.device, points
         changed["camera_effects"] = draw_camera_effects(*effects)
-    return replace(scene, examples=rows, lights=_with_directional(sky, lamps), **changed)
+    lights = torch.cat([_with_directional(sky, lamps), local], dim=1)
+    return replace(scene, examples=rows, lights=lights, **changed)
 
 
 def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
@@ -283,12 +285,14 @@ def _in_rooms(
     patterns fall: there, on table, wall and object along the lamp or, without one, the view."""
     rows, lights, images = torch.nonzero(on_table).squeeze(1).tolist(), sky.cpu().double(), []
     points = _middles(scene.settings.size).repeat(1, len(scene), 1, 1)
+    parts = [(where, part) for where, part in parts_of(scene.basis) if isinstance(part, LocalBasis)]
     for number, group in groupby(progress(rows, "tables"), lambda row: scene.examples[row].object):
         item, rays = scene.objects[number], Rays(scene.objects[number].mesh)
         for row in group:
             camera, exposure = scene.examples[row].cameras[0], scene.examples[row].exposure
             seen = item.lowest, walls[row], camera, scene.settings
-            images.append(exposure * room.irradiance(rays, item.radius, *seen, lights[row], lamps[row]))
+            local = [(part, scene.lights[row, where].cpu().double()) for where, part in parts]
+            images.append(exposure * room.irradiance(rays, item.radius, *seen, lights[row], lamps[row], local))
             towards = lamps[row] if lamps[row].any() else torch.from_numpy(camera.axes()[2])
             points[:, row] = room.across_light(rays, item.mesh, *seen, towards).float()
     size = scene.settings.size

@@ -64,7 +64,7 @@ def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBas
     is not installed.
     """
     fragments = surface.fragments
-    paths = unoccluded(rays, surface, basis)
+    paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
     index, entry = (fragments.pixel[paths.point] * basis.size + paths.function).unique(return_inverse=True)
     weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None] / fragments.samples**2
     summed = weights.new_zeros(len(index), albedo.shape[1]).index_add_(0, entry, weights)
@@ -93,14 +93,17 @@ def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
     return values * (diffuse + colored)[:, None] + white[:, None]
 
 
-def unoccluded(rays: Rays, surface: Surface, basis: LocalBasis, positions: Tensor | None = None) -> LightPaths:
-    """The paths to samples that no surface blocks and that arrive above the tangent plane."""
-    paths = basis.connect(surface.points, surface.normals, positions)
+def unoccluded(
+    rays: Rays, basis: LocalBasis, points: Tensor, normals: Tensor, planes: Tensor, positions: Tensor | None = None
+) -> LightPaths:
+    """The paths to points (S, 3), of unit normals for shading and of their planes, that no surface blocks and that
+    arrive above the plane."""
+    paths = basis.connect(points, normals, positions)
     with torch.no_grad():
-        planes = surface.planes[paths.point]
-        origins = surface.points[paths.point] + rays.offset * planes
+        normal = planes[paths.point]
+        origins = points[paths.point] + rays.offset * normal
         directions, lengths = unit_vectors((paths.source - origins).T)
-        above = (directions.T * planes).sum(1) > 0
+        above = (directions.T * normal).sum(1) > 0
         free = above & (rays.first_hit(origins, directions.T, lengths) < 0)
     return LightPaths(*(field[free] for field in paths))
 
@@ -123,6 +126,7 @@ class LocalLightView:
     ):
         vertices = None if vertices is None else vertices.cpu()
         self._rays, self._surface = rays, Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
+        self._points = self._surface.points, self._surface.normals, self._surface.planes
         self._fixed: dict[LocalBasis, LightPaths] = {}
 
     def radiance(
@@ -138,10 +142,10 @@ class LocalLightView:
         Differentiable in all and in the vertices."""
         pixels = None if fragments is None else fragments.to("cpu")
         if isinstance(basis, Lamps) and positions is not None:
-            paths = unoccluded(self._rays, self._surface, basis, positions.cpu().double())
+            paths = unoccluded(self._rays, basis, *self._points, positions.cpu().double())
         else:
             if basis not in self._fixed:
-                self._fixed[basis] = unoccluded(self._rays, self._surface, basis)
+                self._fixed[basis] = unoccluded(self._rays, basis, *self._points)
             paths = self._fixed[basis]
         values = albedo.cpu().double(), paths, light.cpu().double()
         return local_radiance(self._surface, *values, pixels).to(light)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import augment
-from augment.build import LampsSettings, load_background
+from augment.build import LampsSettings, ProjectorSettings, load_background
 from augment.objects import ObjectSettings, PropSettings
 from augment.scene import Conditions, Scene
 from augment.utils import generator
@@ -120,7 +120,36 @@ def test_backgrounds_take_colors_up_to_the_saturation():
     assert 0.24 < saturation.max() <= 0.3 + 1e-6
 
 
-@pytest.mark.parametrize("options", [{"ground": [0, 0, 0]}, {"lamps": LampsSettings()}, {"views": 2, "shared": True}])
+LOCAL = {
+    "lamps": LampsSettings(positions=[[0.6, 1.5, 2.0], [0.0, -2.0, 1.5]], radius=0.3, start=[[2, 1, 0.5], [0.5, 1, 2]]),
+    "projector": ProjectorSettings(polar=20.0, pattern=0.8),
+}
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_local_lights_and_props_light_and_shadow_a_drawn_table_as_they_do_a_ground_of_triangles(name):
+    prop = PropSettings(mesh="solid:ball", at=[0.7, -0.4], scale=0.3)
+    meshes = [ObjectSettings("solid:pear:1", "pear", props=[prop])]
+    options = {"rasterizer": "numpy", "light": torch.zeros(49, 3), "polar": 30.0, "width": 2.4, name: LOCAL[name]}
+    onto = augment.build_scene(meshes, SIZE, ground=[1.0] * 3, backgrounds=[0.0], **options)
+    rows = drawn(augment.build_scene(meshes, SIZE, backgrounds=[1.0], **options), tables=1.0)
+    expected, seen = images(onto)[0], images(rows)[0]
+    on_ground = images(replace(onto, lights=torch.ones_like(onto.lights))).amin((0, 1)) > 0
+    errors, dark = (seen - expected).abs()[:, on_ground], expected.sum(0)[on_ground] < 0.02
+    assert on_ground.float().mean() > 0.7 and 0.01 < dark.float().mean() < 0.5 and expected.max() > 0.3
+    assert errors.median() < 1e-3 and errors.quantile(0.97) < 0.05  # samples of a pixel differ where a shadow ends
+
+
+@pytest.mark.parametrize("name", LOCAL)
+def test_environments_and_directional_light_are_drawn_as_without_local_lights_which_stay(name):
+    settings = {"environments": ["grace", "eucalyptus"], "directional_fraction": 0.5, "tables": 0.5}
+    without, beside = built("solid:plate", views=6), built("solid:plate", views=6, **{name: LOCAL[name]})
+    lights = drawn(beside, lit_background=True, **settings).lights
+    assert torch.equal(lights[:, :49], drawn(without, lit_background=True, **settings).lights)
+    assert torch.equal(lights[:, 49:], beside.lights[:, 49:]) and beside.lights[:, 49:].any()
+
+
+@pytest.mark.parametrize("options", [{"ground": [0, 0, 0]}, {"views": 2, "shared": True}])
 def test_tables_are_refused_where_they_would_be_wrong(options):
     with pytest.raises(InputError, match=r"^tables are for"):
         drawn(built("solid:plate", **options), tables=0.5)

@@ -122,7 +122,7 @@ def moved_image(
     settings = ImageSettings(size, samples)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
     surface, albedo = Surface(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
-    paths = unoccluded(Rays(mesh), surface, basis, positions)
+    paths = unoccluded(Rays(mesh), basis, surface.points, surface.normals, surface.planes, positions)
     return operator(mesh, basis, size, samples), local_radiance(surface, albedo, paths, powers)
 
 
@@ -155,7 +155,9 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences_at_fixed_visi
 
     def image(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
         surface = Surface(mesh, view, settings, vertices)
-        return local_radiance(surface, albedo, unoccluded(rays, surface, basis), powers)
+        return local_radiance(
+            surface, albedo, unoccluded(rays, basis, surface.points, surface.normals, surface.planes), powers
+        )
 
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()
