@@ -1,12 +1,15 @@
-"""Images of objects whose vertices, colors or lamps change, view by view; a view is rasterized again as vertices move.
+"""Images of objects whose vertices, colors, gloss or lamps change, view by view; moved views are rasterized again.
 
-Shadows and bounces of environment light are frozen at a shape close by (`FrozenTransport`); shadows of local lights are
-those of the moved shape itself (`renderer.transport.local`).
+Shadows and bounces of environment light are frozen at a shape close by, with the mesh's gloss (`FrozenTransport`);
+shadows of local lights are those of the moved shape itself (`renderer.transport.local`).
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,7 +19,7 @@ from augment.objects import SceneObject
 from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import sample_gloss
+from renderer.gloss import Gloss, sample_gloss
 from renderer.image import ImageSettings, decode
 from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
@@ -26,6 +29,9 @@ from renderer.shading import normals_in_sight
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
+
+if TYPE_CHECKING:
+    from augment.scene import Conditions
 
 NEAR = 0.001  # world units: shadows and bounces are computed again once a coordinate has moved farther
 
@@ -125,27 +131,28 @@ class Reshading:
         number: int,
         camera: Camera,
         light: Tensor,
-        vertices: Tensor | None,
-        added: Tensor | None,
-        positions: Tensor | None,
+        changed: Conditions,
         background: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels (P,) of an object, their coverage (P,), and its radiance (3, P) in a light (size, 3); differentiable
         in all tensors, with `settings.silhouettes` also in tensors among the camera's fields.
 
-        example: whose shapes change little from call to call. vertices: (V, 3), and positions of lamps: (L, 3); None
-        where they have not moved. added: offsets of each face's linear albedo, (F, 3). background: image values behind
-        the object, (3 or 1, size²).
+        example: whose shapes change little from call to call. changed: a row of conditions, of which light and cameras
+        are those given. background: image values behind the object, (3 or 1, size²).
         """
         item, settings, moving_camera, camera = self.objects[number], self.settings, camera, camera.fixed()
+        vertices, gloss = changed.vertices, None
         if vertices is None:
             corners, shape = self.vertices[number], item.mesh.vertices
             fragments, albedo = self.view(number, camera)
         else:
             corners, shape = vertices, vertices.detach().cpu().double().numpy()
             fragments, albedo = self._rasterized(number, camera, shape)
-        if added is not None:
-            albedo = painted_albedo(item.mesh, fragments, settings.encoding, item.albedo_scale, added)
+        if changed.albedo is not None:
+            painted = item.mesh, fragments, settings.encoding, item.albedo_scale, changed.albedo
+            albedo = painted_albedo(*painted, changed.hue)
+        if changed.gloss is not None:
+            gloss = Gloss(*changed.gloss.unbind(1), textured=True)
         if settings.normals == "flat":
             normals = None
         elif vertices is None:
@@ -156,10 +163,11 @@ class Reshading:
 
         @cache  # called only where the scene has local lights
         def local_view() -> LocalLightView:
-            if vertices is None:
+            if vertices is None and gloss is None:
                 return self.local_view(number, camera)
-            rays = Rays(replace(item.mesh, vertices=shape))
-            return LocalLightView(rays, item.mesh, fragments, settings, vertices)
+            moved = replace(item.mesh, vertices=shape)
+            rays = self._rays.setdefault(number, Rays(moved)) if vertices is None else Rays(moved)
+            return LocalLightView(rays, item.mesh, fragments, settings, vertices, gloss)
 
         def indirect(albedo: Tensor, light: Tensor) -> Tensor:
             frozen = self._transport_near(example, number, camera, shape)
@@ -169,8 +177,8 @@ class Reshading:
             return added
 
         extra = indirect if settings.global_illumination else None
-        gloss = sample_gloss(item.mesh, fragments)
-        shading = Shading(corners, albedo, lights, normals, local_view, extra, positions, gloss)
+        shine = sample_gloss(item.mesh, fragments, gloss)
+        shading = Shading(corners, albedo, lights, normals, local_view, extra, changed.positions, shine)
         if vertices is None or not settings.silhouettes:
             return fragments.pixels, fragments.coverage.to(self.like), view_radiance(fragments, shading)
         behind = decode(background, settings.encoding).expand(3, -1)

@@ -52,8 +52,9 @@ class Conditions:
 
     light: coefficients of the scene's basis. vertices: None for those of the meshes. albedo: added to each face's
     linear albedo. pixels: added to the values of the V images. positions: of the lamps, None for those of the basis.
-    cameras: what is added to the polar angle, the azimuth and the logarithm of the distance of all V cameras. N and F
-    are the largest mesh's; a smaller mesh has the first of them.
+    cameras: what is added to the polar angle, the azimuth and the logarithm of the distance of all V cameras. gloss:
+    roughness, metallic and strength, which gloss textures multiply. hue: by which a changed albedo is turned, radians.
+    N and F are the largest mesh's; a smaller mesh has the first of them.
     """
 
     light: Float[Tensor, "A coefficients 3"]
@@ -62,6 +63,14 @@ class Conditions:
     pixels: Float[Tensor, "A V 3 size size"] | None = None
     positions: Float[Tensor, "A L 3"] | None = None
     cameras: Float[Tensor, "A 3"] | None = None
+    gloss: Float[Tensor, "A F 3"] | Float[Tensor, "A 1 3"] | None = None
+    hue: Float[Tensor, "A F"] | None = None
+
+    def row(self, index: int, mesh: Mesh) -> Conditions:
+        """One row as it is for its mesh, without the first dimension."""
+        counts = {"vertices": len(mesh.vertices), **dict.fromkeys(("albedo", "gloss", "hue"), len(mesh.faces))}
+        given = {name: values for name, values in vars(self).items() if values is not None}
+        return Conditions(**{name: values[index, : counts.get(name)] for name, values in given.items()})
 
 
 @dataclass(eq=False, repr=False)
@@ -199,7 +208,7 @@ class Scene:
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        if conditions.vertices is not None or conditions.albedo is not None or self.one_light:
+        if self.one_light or not (conditions.vertices is conditions.albedo is conditions.gloss is None):
             return self._reshaded(light, conditions, examples)
         if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)
@@ -233,14 +242,9 @@ class Scene:
         counted = progress(views, "rendering views") if len(views) > 8 else views  # a bar costs a step of few views 4 %
         for image, (row, view) in enumerate(counted):
             index = int(examples[row])
-            example, mesh = self.examples[index], self.mesh(index)
-            vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
-            added = None if conditions.albedo is None else conditions.albedo[row, : len(mesh.faces)]
-            positions = None if conditions.positions is None else conditions.positions[row]
+            example, changed = self.examples[index], conditions.row(row, self.mesh(index))
             cameras = self.cameras_under(conditions, row, index)
             shown, behind = (index, example.object, cameras[view]), self.backgrounds[example.background].flatten(1)
-            pixels, coverage, radiance = self._reshading.radiance(
-                *shown, light[row], vertices, added, positions, background=behind
-            )
+            pixels, coverage, radiance = self._reshading.radiance(*shown, light[row], changed, behind)
             term = background_term(coverage[None], behind.index_select(1, pixels), self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])

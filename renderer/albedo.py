@@ -1,5 +1,6 @@
 """The albedo at a view's samples, linear: of the mesh as it was loaded, or as a parameter per face or per texel."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -69,16 +70,20 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     return _of_faces(albedo.index_select(0, fragments.faces), fragments)
 
 
-def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale: float, added: Tensor) -> Tensor:
-    """(S, 3) at the samples: the scaled albedo plus `added`, (F, 3) per face, clamped to [0, 1], or to the scaled
-    albedo where that is larger; differentiable in `added`. InputError: NaN.
+def painted_albedo(
+    mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale: float, added: Tensor, hue: Tensor | None = None
+) -> Tensor:
+    """(S, 3) at the samples: the scaled albedo, turned in `hue` by an angle per face (F,), plus `added`, (F, 3) per
+    face, clamped to [0, 1], or to the scaled albedo where that is larger; differentiable in both. InputError: NaN.
 
     Corners and texels are clamped before they are interpolated, so that files can hold them: see
     `renderer.io.texture_bake`.
     """
     offset, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
+    angles = None if hue is None else hue.index_select(0, fragments.faces)
+    of_corners, of_samples = (None, None) if angles is None else (angles[:, None], angles[fragments.face])
     corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * albedo_scale
-    albedo = fragments.interpolate(_within(corners + added.index_select(0, fragments.faces)[:, None], corners))
+    albedo = fragments.interpolate(changed_albedo(corners, of_corners, added.index_select(0, fragments.faces)[:, None]))
     if not mesh.textures:
         return albedo
     colors = (_colors(mesh, faces, fragments, encoding) * albedo_scale).to(added)
@@ -87,14 +92,22 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale
     for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
         here = torch.nonzero(texture_ids == index).squeeze(1)
         taps = _taps(texture, uvs[:, here])
+        turn = None if of_samples is None else of_samples[here]
         texels = [(weight.to(added), colors[here] * texture.texels(at).T) for weight, at in taps]
-        value = reduce(torch.add, (weight[:, None] * _within(texel + offset[here], texel) for weight, texel in texels))
-        albedo = albedo.index_copy(0, here, value)
+        changed = (weight[:, None] * changed_albedo(texel, turn, offset[here]) for weight, texel in texels)
+        albedo = albedo.index_copy(0, here, reduce(torch.add, changed))
     return albedo
 
 
-def _within(changed: Tensor, albedo: Tensor) -> Tensor:
-    return clamp(changed, albedo.clamp(min=1))
+def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
+    """(..., 3) linear albedo, turned about the gray axis by angles (...) in radians, which keeps the mean of the
+    channels (Haeberli 1993), plus `added`; clamped to [0, 1], or to the albedo where that is larger."""
+    changed = albedo
+    if hue is not None:
+        gray, hue = albedo.mean(-1, keepdim=True), hue[..., None]
+        across = (albedo.roll(1, -1) - albedo.roll(-1, -1)) / math.sqrt(3)
+        changed = gray + hue.cos() * (albedo - gray) + hue.sin() * across
+    return clamp(changed + added, albedo.clamp(min=1))
 
 
 def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:

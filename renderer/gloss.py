@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -36,7 +36,8 @@ DIELECTRIC = 0.04  # F0 of a refractive index of 1.5, as of varnish
 @dataclass(frozen=True, eq=False)
 class Gloss:
     """Roughness, metallic and strength (`specularFactor` of KHR_materials_specular) of a surface, each in [0, 1]: a
-    number for all of a mesh, or a tensor (), or (F,) for its faces. Roughness below 0.2 is taken for 0.2.
+    number for all of a mesh, or a tensor (), or (F,) for its faces. Roughness below 0.2 is taken for 0.2. textured:
+    multiplied by the mesh's gloss textures, which it replaces otherwise.
 
     >>> varnished = Gloss(roughness=0.3).on(renderer.solid("orange"))
     >>> varnished.gloss.shape == varnished.faces.shape
@@ -46,11 +47,13 @@ class Gloss:
     roughness: float | Float[Tensor, ...] = 0.5
     metallic: float | Float[Tensor, ...] = 0.0
     strength: float | Float[Tensor, ...] = 1.0
+    textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:
         """The mesh with this gloss in place of its own. InputError: another shape, values beyond [0, 1], NaN."""
         columns = [values.detach().cpu().expand(len(mesh.faces)) for values in self.checked(len(mesh.faces))]
-        return replace(mesh, gloss=torch.stack(columns, dim=1).float().numpy(), gloss_textures=())
+        textures = mesh.gloss_textures if self.textured else ()
+        return replace(mesh, gloss=torch.stack(columns, dim=1).float().numpy(), gloss_textures=textures)
 
     def checked(self, faces: int) -> list[Tensor]:
         """Roughness, metallic and strength as tensors (1,) or (F,), of so many faces. InputError: as `on`."""
@@ -113,7 +116,7 @@ class SampleGloss(NamedTuple):
 def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -> SampleGloss | None:
     """That of the mesh, or a gloss in its place, in which it is differentiable; float64. None where there is neither.
     InputError: as `Gloss.on`."""
-    textures = mesh.gloss_textures if gloss is None else ()
+    textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
     if gloss is None:
         if mesh.gloss is None:
             return None

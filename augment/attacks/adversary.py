@@ -17,6 +17,7 @@ from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, in_one_line, require_bounded, require_file, require_range
+from renderer.gloss import Gloss
 from renderer.image import ImageSettings, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_numbers
@@ -55,13 +56,14 @@ class Adversary:
         """An example of a scene and its images (V, 3, size, size) under a row of conditions, by default its own row."""
         of_example, row = scene.examples[example], example if row is None else row
         shown = scene.objects[of_example.object]
-        mesh, albedo_scale = shown.mesh, shown.albedo_scale
-        if after.albedo is not None:
-            added = after.albedo[row, : len(mesh.faces)].detach().cpu().double().numpy()
-            mesh, albedo_scale = with_added_albedo(mesh, added, scene.settings.encoding, albedo_scale)
-        if after.vertices is not None:
-            vertices = after.vertices[row, : len(mesh.vertices)].detach().cpu().double().numpy()
-            mesh = replace(mesh, vertices=vertices, skin=None)
+        mesh, albedo_scale, changed = shown.mesh, shown.albedo_scale, after.row(row, shown.mesh)
+        if changed.albedo is not None:
+            added, hue = _as_numpy(changed.albedo), None if changed.hue is None else _as_numpy(changed.hue)
+            mesh, albedo_scale = with_added_albedo(mesh, added, scene.settings.encoding, albedo_scale, hue)
+        if changed.vertices is not None:
+            mesh = replace(mesh, vertices=_as_numpy(changed.vertices), skin=None)
+        if changed.gloss is not None:
+            mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
         return Adversary(
             shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
             cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
@@ -85,6 +87,10 @@ class Adversary:
         rasterizer = rasterizer or choose("auto")
         pixels = None if self.pixels is None else self.pixels[None]
         return self.scene(rasterizer).render(Conditions(self.light[None], pixels=pixels), torch.arange(1))[0]
+
+
+def _as_numpy(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().double().numpy()
 
 
 DESCRIPTION, MESH, LIGHT = "adversary.json", "mesh.glb", "light.json"

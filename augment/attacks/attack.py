@@ -15,7 +15,14 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import EOTSettings, Rounded
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem, PoseSettings, SkylightSettings, lighting
+from augment.attacks.parameters import (
+    PARAMETERS,
+    AttackProblem,
+    MaterialSettings,
+    PoseSettings,
+    SkylightSettings,
+    lighting,
+)
 from augment.classifiers.adapter import Classifier
 from augment.losses import logit_gap
 from augment.scene import Conditions, Scene
@@ -30,8 +37,8 @@ class AttackSettings:
     """What an attack changes, and how it descends. The defaults are careful: the light stays physically possible, and a
     success survives being stored with 8 bits; the paper has allow_negative=True, margin=0 and rounded=False.
 
-    lighting, skylight, projector, lamps, positions (of lamps), geometry, pose, albedo, pixels: norm-ball and steps of
-    each parameter; None leaves it as it is.
+    lighting, skylight, projector, lamps, positions (of lamps), geometry, pose, material, albedo, pixels: norm-ball and
+    steps of each parameter; None leaves it as it is.
     max_steps: renders after the first; the paper's appendix C has 30. shorten: undo a step that did not lower the cost,
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
@@ -48,6 +55,7 @@ class AttackSettings:
     positions: StepSettings | None = None
     geometry: StepSettings | None = None
     pose: PoseSettings | None = None
+    material: MaterialSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None
     max_steps: int = 30
@@ -227,9 +235,10 @@ def target_labels(
 
 def final_images(problem: AttackProblem, values: Tensor, examples: Tensor, images: Tensor) -> Tensor:
     """Images (A, V, 3, size, size) of examples (A,) under values (A, D), which `problem` rendered; where it holds
-    shadows and bounces fixed while shape or colors change, rendered again with those of the values."""
+    shadows and bounces fixed while shape, colors or gloss change, rendered again with those of the values."""
     scene, after = problem.scene, problem.conditions(values, examples)
-    if not len(examples) or not scene.settings.global_illumination or (after.vertices is None and after.albedo is None):
+    unmoved = after.vertices is after.albedo is after.gloss is None
+    if unmoved or not len(examples) or not scene.settings.global_illumination:
         return images
     rows = zip(examples.tolist(), images, strict=True)
     adversaries = (Adversary.of(scene, example, after, image, image, row) for row, (example, image) in enumerate(rows))

@@ -21,7 +21,7 @@ from augment.utils import generator, progress
 from renderer.errors import FACTOR, InputError, require_range
 
 GROWTH = (1, 3, 10)
-OF_MESH, OF_VIEW = ("geometry", "pose", "albedo", "pixels"), ("pixels",)  # parameters that no other mesh or view has
+OF_MESH, OF_VIEW = ("geometry", "pose", "material", "albedo", "pixels"), ("pixels",)  # that no other mesh or view has
 
 
 def check(result: AttackResult) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What an attack may change: light, sky, a projector's pattern, lamps, shape, pose, colors, pixels; any at once."""
+"""What an attack may change: lights, shape, pose, material, colors, pixels; any at once."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +21,12 @@ from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
+from renderer.microfacets import LEAST
 
 POSE = ("rotation", "shift", "scale", "view", "distance")  # its parts, of 3, 2, 1, 2 and 1 values
+MATERIAL = ("roughness", "metallic", "strength", "hue")
+VARNISH = 0.5, 0.0, 1.0  # roughness, metallic and strength
+ROUNDING = 1e-6  # by which a material stays off 0 and 1, where clamping would end its gradient
 TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
 
 
@@ -72,6 +76,24 @@ class PoseSettings(StepSettings):
         if unknown := [name for name in limits if name not in names]:
             raise InputError(f"joints: {item.name} has no joint {unknown[0]}: choose from {', '.join(names)}")
         return [float(limits.get(name, 0)) for name in names]
+
+
+@dataclass
+class MaterialSettings(StepSettings):
+    """How far each part of a material goes for a value of 1; with 0, the part is left as it is. roughness, metallic,
+    strength: those of `renderer.Gloss`; metallic of what has some. hue: of the albedo, in degrees."""
+
+    roughness: float = 0.3
+    metallic: float = 0.3
+    strength: float = 1.0
+    hue: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, most in zip(MATERIAL, (1, 1, 1, 180), strict=True):
+            require_range(name, getattr(self, name), 0, most)
+        if not any(getattr(self, name) for name in MATERIAL):
+            raise InputError(f"{', '.join(MATERIAL)} are all 0: nothing of the material would change")
 
 
 @dataclass
@@ -244,6 +266,46 @@ def pose(scene: Scene, settings: PoseSettings) -> Parameter:
     return Parameter("pose", settings, unit.new_zeros(used.shape), apply, domain, None if used.all() else used)
 
 
+def material(scene: Scene, settings: MaterialSettings) -> Parameter:
+    """Four values in the settings' units: roughness, metallic and strength of the object, in [0, 1] and at least the
+    least roughness that is shaded; and the angle by which the hue of its albedo is turned. Where its faces differ, the
+    first three are their means, and the differences stay. A matte object begins with VARNISH: without strength, the
+    gradient by roughness is zero, and a descent that lowers strength would never leave."""
+    units = settings.roughness, settings.metallic, settings.strength, math.radians(settings.hue)
+    attacked = torch.tensor(units).to(scene.lights)
+    unit = torch.where(attacked > 0, attacked, 1)
+    pairs = [_initial_gloss(item) for item in scene.objects]
+    mean = torch.stack([rows[mask].mean(0) for rows, mask in pairs]).to(unit)
+    if all(mask.all() and (rows == rows[0]).all() for rows, mask in pairs):
+        pairs = [(rows[:1], mask[:1]) for rows, mask in pairs]
+    gloss, own = (pad_sequence(part, batch_first=True).to(unit) for part in map(list, zip(*pairs, strict=True)))
+    low, high = mean.new_tensor([LEAST + ROUNDING, 0, 0, -math.inf]), 1 - mean.new_tensor([ROUNDING] * 3 + [-math.inf])
+    start = (F.pad(mean, (0, 1)).clamp(low, high) / unit)[scene.object_of]
+    used = (attacked > 0).expand_as(start) & F.pad(mean[:, 1:2] > 0, (1, 2), value=True)[scene.object_of]
+
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        objects, now = scene.object_of[examples], torch.where(used[examples], values, start[examples]) * unit
+        change = (now[:, :3] - mean[objects])[:, None] * own[objects][..., None]
+        if attacked[:3].any():
+            conditions = replace(conditions, gloss=(gloss[objects] + change).clamp(0, 1))
+        if not settings.hue:
+            return conditions
+        faces = max(len(item.mesh.faces) for item in scene.objects)
+        none = now.new_zeros(len(now), faces, 3) if conditions.albedo is None else conditions.albedo
+        return replace(conditions, hue=(now[:, 3:] * own[objects]).expand(-1, faces), albedo=none)
+
+    domain = partial(nearest_in_box, low=low / unit, high=high / unit)
+    return Parameter("material", settings, start, apply, domain, None if used.all() else used)
+
+
+def _initial_gloss(item: SceneObject) -> tuple[Tensor, Tensor]:
+    """What an object's faces begin with, (F, 3), and which are its own, (F,) bool."""
+    own, gloss = torch.from_numpy(item.own_faces), item.mesh.gloss
+    rows = torch.tensor([[1.0, 0, 0]]).expand(len(own), 3) if gloss is None else torch.from_numpy(gloss)
+    matte = not rows[own, 1:].any()
+    return torch.where(own[:, None], rows.new_tensor(VARNISH), rows) if matte else rows, own
+
+
 def albedo(scene: Scene, settings: StepSettings) -> Parameter:
     """What is added to the linear albedo of each face, per channel; the sum is clamped to [0, 1]."""
     return _of_mesh(scene, settings, "albedo", [item.own_faces for item in scene.objects], "albedo")
@@ -289,7 +351,8 @@ def pixels(scene: Scene, settings: StepSettings) -> Parameter:
 
 
 PARAMETERS: dict[str, Callable[..., Parameter]] = {
-    make.__name__: make for make in (lighting, skylight, projector, lamps, positions, geometry, pose, albedo, pixels)
+    make.__name__: make
+    for make in (lighting, skylight, projector, lamps, positions, geometry, pose, material, albedo, pixels)
 }
 
 

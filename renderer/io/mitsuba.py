@@ -6,9 +6,9 @@ is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` g
 
 Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
 and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
-here, a concave mesh has dark places there. Gloss is its `principled`, with the same lobe; the diffuse part below it
-is Disney's there (some 6 % brighter), and Fresnel's term is not Schlick's. Its radiance is premultiplied with alpha, as
-ours with the coverage.
+here, a concave mesh has dark places there. Gloss is its `principled`, with the same lobe; its diffuse part is Disney's,
+which loses nothing to the coat: the color is scaled by what ours keeps on average, and 1 to 3 % are left. Fresnel's
+term is not Schlick's. Its radiance is premultiplied with alpha, as ours with the coverage.
 """
 
 import math
@@ -25,8 +25,8 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.gloss import DIELECTRIC
-from renderer.image import ImageSettings, decode
+from renderer.gloss import DIELECTRIC, SampleGloss
+from renderer.image import ImageSettings, decode, encode, to_bytes
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.environment import light_radiance, write_map
@@ -284,7 +284,9 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
     import trimesh
 
     file, texture = f"part_{number}.ply", f"texture_{number}.png"
-    corners = np.concatenate([part.uvs, part.colors], axis=-1).reshape(-1, 5).astype(np.float32)
+    gloss = part.gloss if part.gloss is not None and part.gloss[1:].any() else None  # of a matte part
+    kept = 1.0 if gloss is None else _kept(gloss)
+    corners = np.concatenate([part.uvs, kept * part.colors], axis=-1).reshape(-1, 5).astype(np.float32)
     trimesh.Trimesh(
         part.positions.reshape(-1, 3),
         np.arange(len(corners)).reshape(-1, 3),
@@ -294,11 +296,12 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
     ).export(folder / file, vertex_normal=True)
     albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.texture is not None:
-        Image.fromarray(part.texture).save(folder / texture)
+        scaled = to_bytes(encode(kept * decode(torch.from_numpy(part.texture) / 255, encoding), encoding))
+        Image.fromarray(scaled.numpy()).save(folder / texture)
         albedo = {"type": "bitmap", "filename": texture, "raw": encoding == "linear"}
     material: Scene = {"type": "diffuse", "reflectance": albedo}
-    if part.gloss is not None:
-        roughness, metallic, strength = part.gloss.tolist()
+    if gloss is not None:
+        roughness, metallic, strength = (gloss / [1, kept, 1]).tolist()
         # The light's scale has the albedo's. F0 is 0.08 × specular.
         specular = min(strength * DIELECTRIC / 0.08 / max(albedo_scale, 1e-6), 1.0)
         material = {"type": "principled", "base_color": albedo, "specular": specular}
@@ -310,3 +313,13 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
                 material[name] = {"type": "bitmap", "filename": f"{name}_{number}.png", "raw": True}
     surface = {"type": "twosided", "material": material}
     return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": surface}
+
+
+def _kept(gloss: np.ndarray) -> float:
+    """The fraction of the albedo that a gloss (3,) reflects of an even sky, as metal or below the coat; the mean over a
+    sphere in view."""
+    cosine = ((torch.arange(64, dtype=torch.float64) + 0.5) / 64).sqrt()
+    toward = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], dim=1)
+    roughness, metallic, strength = torch.from_numpy(gloss).double()[:, None]
+    below = SampleGloss(roughness.clamp(min=LEAST), metallic, strength).diffuse(toward.new_tensor([[0, 0, 1]]), toward)
+    return float(metallic + below.mean())

@@ -1,8 +1,8 @@
 """A mesh whose own colors and textures hold an albedo that an attack changed, so that any renderer shows it.
 
-With the scale s, the albedo ρ of corners and texels and the offset d of the face, files are to hold
+With the scale s, the albedo ρ of corners and texels, the turn of hue h and the offset d of the face, files are to hold
 
-    ρ' = clamp(s ρ + d, 0, max(1, s ρ)) / s',
+    ρ' = clamp(h(s ρ) + d, 0, max(1, s ρ)) / s',
 
 encoded, with one new scale s' that brings the largest value to 1. Corners hold ρ' to float32. In a texture, neighboring
 faces with different offsets may share texels, and interpolation at a face's border reads texels outside of it. So each
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from renderer.albedo import changed_albedo
 from renderer.image import decode, encode, to_bytes
 from renderer.mesh import Mesh
 
@@ -24,8 +25,10 @@ MOST_TEXELS = 2**26  # of a painted texture; where more are needed, charts have 
 BLOCK = 2**20  # texels at a time
 
 
-def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale: float = 1.0) -> tuple[Mesh, float]:
-    """(mesh, s') that show the scaled albedo plus `added`, (F, 3) linear, per face.
+def with_added_albedo(
+    mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale: float = 1.0, hue: np.ndarray | None = None
+) -> tuple[Mesh, float]:
+    """(mesh, s') that show the scaled albedo, turned in `hue` (F,) radians, plus `added`, (F, 3) linear, per face.
 
     Textures hold it to 8 bits, with the colors of corners multiplied in. The new scale is at least 1, the largest value
     in files, and no larger than the colors need, since it multiplies the rounding to 8 bits.
@@ -35,11 +38,12 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale
     lightest = max((float(decoded[texture.max()]) for texture in mesh.textures), default=1.0)
     largest = float(corner_albedo.max()) * (lightest if (mesh.texture_ids >= 0).all() else 1.0)
     ceiling, offset = max(1.0, albedo_scale * largest), torch.from_numpy(added).float()
+    angles = None if hue is None else torch.from_numpy(hue).float()
 
     def painted(albedo: Tensor, faces: np.ndarray) -> Tensor:
         """Linear albedo (N, 3) of faces (N,), changed and encoded."""
-        bright = albedo * albedo_scale
-        return encode((bright + offset[faces]).clamp(min=0).minimum(bright.clamp(min=1)) / ceiling, encoding)
+        turn = None if angles is None else angles[faces]
+        return encode(changed_albedo(albedo * albedo_scale, turn, offset[faces]) / ceiling, encoding)
 
     colors, uvs, textures, gloss_textures = np.ones_like(mesh.corner_colors), mesh.corner_uvs.copy(), [], []
     plain = np.flatnonzero(mesh.texture_ids < 0)

@@ -93,6 +93,7 @@ STEPS = {
     "positions": augment.StepSettings(step_size=0.1),
     "geometry": augment.StepSettings("linf", 0.05, "sign", 0.01),
     "pose": augment.PoseSettings("linf", 1.0, "sign", 0.2),
+    "material": augment.MaterialSettings("linf", 1.0, "sign", 0.2, hue=30.0),
     "albedo": augment.StepSettings("linf", 0.5, "sign", 0.1),
     "pixels": augment.StepSettings("linf", 0.3, "sign", 0.05),
 }

@@ -22,6 +22,7 @@ from renderer.rasterizer import choose
 from renderer.shapes import solid
 
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # each has a test of its own
+PAINTED = {"material", "albedo"}  # change textures
 CLASSES = ("orange", "lime", "sky")
 SOFTWARE = choose("numpy")
 
@@ -29,7 +30,8 @@ SOFTWARE = choose("numpy")
 def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
     radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
-    steps = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
+    steps = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds & set(radii)}
+    steps |= {name: augment.MaterialSettings("linf", 1.0, "sign", 0.5, hue=40.0) for name in kinds & {"material"}}
     settings = augment.AttackSettings(**steps, allow_negative=True, max_steps=3)
     return augment.attack(classifier, scene, settings=settings, force=True)
 
@@ -71,7 +73,7 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     found = reload(tmp_path)
     assert torch.equal(found.images, done.images[0]) and torch.equal(found.images_before, done.images_before[0])
     assert (done.images - done.images_before).abs().max() > 0.02
-    limit = 1 / 255 if "albedo" in kinds else 1e-5
+    limit = 1 / 255 if kinds & PAINTED else 1e-5
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
 
 
@@ -79,12 +81,13 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
 def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(tmp_path, kind):
     """Beside a matte table. The texture of gloss is painted anew from the nearest texels, so it is even with albedo."""
     mesh = Gloss(0.4, metallic=0.3).on(normalize(textured()))
-    texels = np.random.default_rng(1).integers(150, 255, (4, 4, 2) if kind != "albedo" else (1, 1, 2), dtype=np.uint8)
+    size = (1, 1, 2) if kind in PAINTED else (4, 4, 2)
+    texels = np.random.default_rng(1).integers(150, 255, size, dtype=np.uint8)
     item = on_ground(SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2))
     scene = replace(augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0), objects=[item])
     done = attacked({kind}, scene)
     write_adversary(adversary_of(done), tmp_path)
-    limit = 1 / 255 if kind == "albedo" else 1e-5
+    limit = 1 / 255 if kind in PAINTED else 1e-5
     torch.testing.assert_close(reload(tmp_path).render(SOFTWARE), done.images[0], rtol=0, atol=limit)
     matte = adversary_of(attacked({kind}, replace(scene, objects=[replace(item, mesh=replace(item.mesh, gloss=None))])))
     assert (matte.images - done.images[0]).abs().max() > 0.02
