@@ -2,7 +2,8 @@
 
 The sky's irradiance is exact but where the object blocks it: there, as in `renderer.transport`, the radiance of the
 directions that hit the object is taken away. A distant lamp casts a sharp shadow, local lights those of their own. What
-the table reflects of sky and distant lamp lights the object from below; the object reflects nothing onto the table.
+the table reflects of sky and distant lamp lights the object from below. The object reflects nothing onto the table,
+which would change that by 0.1 to 1.4 of 255 on average at 32 pixels.
 """
 
 import math
