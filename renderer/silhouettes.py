@@ -32,7 +32,7 @@ from renderer.rasterizer.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-LINES = 64  # rows and as many columns of samples, at least, along which surfaces' slopes are taken; in each pixel one
+LINES = 128  # rows and as many columns of samples, at least, along which surfaces' slopes are taken; in each pixel one
 NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on it
 
 
@@ -104,10 +104,10 @@ def _by_surface(
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
     divisors = [step for step in range(1, fragments.samples + 1) if fragments.samples % step == 0]
     stride = max(step for step in divisors if step == 1 or len(grid) >= LINES * step)
-    forces, levels = radiance.new_zeros(radiance.shape[1], 2), F.pad(radiance.sum(0), (0, 1), value=torch.nan)
-    for axis, force in enumerate(forces.T):
-        lines = (grid if axis == 0 else grid.T)[stride // 2 :: stride].contiguous()
-        level = levels[lines]  # -1 is the last one
+    forces, levels = radiance.new_zeros(2, radiance.shape[1]), fragments.image_of_samples(radiance.sum(0), torch.nan)
+    for axis, force in enumerate(forces):
+        images = (grid, levels) if axis == 0 else (grid.T, levels.T)
+        lines, level = (image[stride // 2 :: stride].contiguous() for image in images)
         differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
         first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
         before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]
@@ -116,8 +116,8 @@ def _by_surface(
         jump *= sum(upstream.index_select(1, fragments.pixel.index_select(0, pair)) for pair in (first, second))
         moved = jump.sum(0) * goes_on[first] * (stride / 2 if axis == 0 else -stride / 2)  # rows run down
         force.index_add_(0, first, moved).index_add_(0, second, moved)
-    moving = torch.nonzero((forces != 0).any(1)).squeeze(1)
-    part, forces = fragments.select(moving), forces[moving]
+    moving = torch.nonzero(forces.abs().sum(0)).squeeze(1)
+    part, forces = fragments.select(moving), forces.T[moving]
     if fragments.depths is not None:
         depth = part.interpolate(positions[:, 2:][part.corners])
         forces = _homogeneous(forces, part.positions(), depth)
