@@ -176,6 +176,11 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 
 
+def varnished(item: SceneObject, gloss: Gloss) -> SceneObject:
+    """The object with this gloss in place of its own, and with the same props and table."""
+    return _with_mesh(item, gloss.on(select_faces(item.mesh, slice(item.own))))
+
+
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
     """The same props and table with another object's mesh."""
     return on_ground(with_props(replace(item, mesh=mesh, own=None), item.props), item.ground)

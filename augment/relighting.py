@@ -55,7 +55,7 @@ class InPlace(torch.autograd.Function):
 class OperatorStack:
     """O transfer operators over a common set of pixels, and N images that show one of them each, in their own light.
 
-    pixels: (P,) int64, covered by any of the operators. transfer: (O, 3 or 1, K, P), of the K coefficients that are
+    pixels: (P,) int64, covered by any of the operators. transfer: (O, 1 to 3, K, P), of the K coefficients that are
     nonzero in any of them, with a row of zeros if K is odd: with 32 rows instead of 31 the gradient's product is twice
     as fast. albedo: (O, 3, P). coverage: (O, 1, P). Which image shows which operator is known to the host.
     """
@@ -72,11 +72,11 @@ class OperatorStack:
         first, parts = [0], list[SparseTransfer]()
         for index, operator in enumerate(operators):
             rows, columns = torch.searchsorted(nonzero, operator.nonzero), torch.searchsorted(pixels, operator.pixels)
-            if channels == 1:
-                transfer[index][:, rows[:, None], columns] = operator.transfer
+            if channels < 3:
+                transfer[index][: len(operator.transfer), rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:
-                transfer[index][:, rows[:, None], columns] = operator.transfer * operator.albedo[:, None]
+                transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             if operator.sparse is not None:
                 parts.append(operator.sparse._replace(pixel=columns[operator.sparse.pixel]))

@@ -12,15 +12,17 @@ import torch
 from torch import Tensor
 
 from augment import room
-from augment.objects import another_instance, rotated
+from augment.objects import another_instance, rotated, varnished
 from augment.scene import Example, Scene
 from augment.utils import progress, rotation_matrices
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
+from renderer.gloss import Gloss
 from renderer.image import ImageSettings, clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import HARMONICS, LocalBasis, parts_of
 from renderer.light.presets import directional, load_light
+from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
 
 UNCHANGED, NONE = (1.0, 1.0), (0.0, 0.0)
@@ -53,6 +55,19 @@ class CameraEffectSettings:
 
 
 @dataclass
+class VarnishSettings:
+    """[least, most] roughness and strength of a varnish on each object, as of `renderer.Gloss`, each uniform; of
+    strength 0, which is the default, none. Below a roughness of 0.35, light of degree 6 shows rings of its series."""
+
+    roughness: list[float] = field(default_factory=lambda: [0.4, 0.8])
+    strength: list[float] = field(default_factory=lambda: list(NONE))
+
+    def __post_init__(self) -> None:
+        require_limits("roughness", self.roughness, LEAST, 1)
+        require_limits("strength", self.strength, 0, 1)
+
+
+@dataclass
 class VariationSettings:
     """What is drawn for each example in each regeneration; by default nothing, which leaves the paper's grid.
 
@@ -61,14 +76,14 @@ class VariationSettings:
     of images, one behind each example. instances: every solid that is named without a seed is another instance in each
     of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and down. fov:
     [least, most] degrees between the image's sides, of cameras in perspective. rotation: degrees by which the object
-    itself is turned in each of its views, at most, about a random axis. environments: each example is in one of these
-    lights, as `load_light` takes them. directional_fraction: of the examples, in a directional light from the camera's
-    side, up to 70° off, plus [least, most] `fill_light` of their environment. Projector and lamps stay. lit_background:
-    a background is a wall that faces the camera, in the example's light. tables: fraction of the examples that stand on
-    a table before a wall, both of the background's color, in the object's light and shadow (see `augment.room`), seen
-    from 15° to 75° above; patterns then fall on all three from where the directional light is. background_saturation:
-    of random colors that multiply the backgrounds, at most. Backgrounds keep the light that was drawn, also where an
-    attack changes the object's.
+    itself is turned in each of its views, at most, about a random axis. gloss: a varnish on each of its views, in place
+    of its own gloss. environments: each example is in one of these lights, as `load_light` takes them.
+    directional_fraction: of the examples, in a directional light from the camera's side, up to 70° off, plus [least,
+    most] `fill_light` of their environment. Projector and lamps stay. lit_background: a background is a wall that faces
+    the camera, in the example's light. tables: fraction of the examples that stand on a table before a wall, both of
+    the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75° above; patterns
+    then fall on all three from where the directional light is. background_saturation: of random colors that multiply
+    the backgrounds, at most. Backgrounds keep the light that was drawn, also where an attack changes the object's.
 
     >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
@@ -88,6 +103,7 @@ class VariationSettings:
     lit_background: bool = False
     tables: float = 0.0
     background_saturation: float = 0.0
+    gloss: VarnishSettings = field(default_factory=VarnishSettings)
     camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
 
     def __post_init__(self) -> None:
@@ -103,8 +119,9 @@ class VariationSettings:
     @property
     def moves(self) -> bool:
         """Whether views change, which then are rasterized in every regeneration."""
-        angles = self.azimuth, self.rotation, *self.fov
-        return self.shift > 0 or tuple(self.scale) != UNCHANGED or any(angles) or self.instances or self.tables > 0
+        new_objects = self.instances or self.rotation > 0 or any(self.gloss.strength)
+        moved = self.shift > 0 or tuple(self.scale) != UNCHANGED or any((self.azimuth, *self.fov))
+        return moved or new_objects or self.tables > 0
 
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
@@ -147,7 +164,8 @@ def _with_moved_rows(
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    if settings.instances or settings.rotation:
+    shiny = any(settings.gloss.strength)
+    if settings.instances or settings.rotation or shiny:
         views = dict.fromkeys((row.object, row.cameras) for row in scene.examples)
         numbers = {view: index for index, view in enumerate(views)}
         objects = [scene.objects[index] for index, _ in views]
@@ -158,6 +176,12 @@ def _with_moved_rows(
         if settings.rotation:
             rotations = _rotations(math.radians(settings.rotation), len(views), draws)
             objects = [rotated(item, rotation) for item, rotation in zip(objects, rotations, strict=True)]
+        if shiny:
+            ranges = torch.tensor([settings.gloss.roughness, settings.gloss.strength], dtype=torch.float64)
+            fractions = torch.rand(len(views), 2, generator=draws, dtype=torch.float64)
+            values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions)
+            varnish = (Gloss(roughness, strength=strength) for roughness, strength in values.tolist())
+            objects = [varnished(item, gloss) for item, gloss in zip(objects, varnish, strict=True)]
         changed["objects"] = objects
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]

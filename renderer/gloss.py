@@ -1,7 +1,7 @@
 """Gloss of a mesh's surface in the words of glTF 2.0, and what it reflects at a view's samples.
 
-With metallic m, strength s and albedo ρ, the F0 of `renderer.microfacets` is m ρ + (1 - m) 0.04 s, and F90 is
-m + (1 - m) s: the highlight of a dielectric is white, and that of a metal has its color. Radiance per irradiance is
+With metallic m, strength s and albedo ρ, the F of `renderer.microfacets` is (1 - m) s times that of a dielectric, which
+is white, and m times Schlick's with F0 = ρ and F90 = 1, which has the metal's color. Radiance per irradiance is
 
     ρ (diffuse + colored) + white.
 
@@ -23,14 +23,12 @@ from torch import Tensor
 from renderer.albedo import Texture, bilinear
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import bands, basis, unit
+from renderer.light.harmonics import unit
 from renderer.mesh import Mesh
-from renderer.microfacets import LEAST, axes, lobe_weights, reflectance
+from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-DIELECTRIC = 0.04  # F0 of a refractive index of 1.5, as of varnish
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,42 +73,54 @@ class SampleGloss(NamedTuple):
     metallic: Tensor
     strength: Tensor
 
+    @property
+    def metal(self) -> bool:
+        """Whether any of it is metallic, or may become so."""
+        return self.metallic.requires_grad or bool(self.metallic.any())
+
     def at(self, samples: Tensor | slice) -> SampleGloss:
         """Of some samples."""
-        return SampleGloss(*(values if len(values) == 1 else values[samples] for values in self))
+        return SampleGloss(*(at_samples(values, samples) for values in self))
 
     def to(self, like: Tensor) -> SampleGloss:
         return SampleGloss(*(values.to(like) for values in self))
 
-    def split(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """(colored, white) reflection (..., S) of reflection for F0 = 1, F90 = 0 and for F0 = 0, F90 = 1."""
-        dielectric = (1 - self.metallic) * self.strength
-        return self.metallic * first, dielectric * (DIELECTRIC * first + second) + self.metallic * second
+    def lobes(self, cosine: Tensor, degree: int) -> tuple[Tensor | None, Tensor]:
+        """(colored, white) functions (M, S) of `renderer.microfacets.lobe_functions` at n·v (S,); None for no color."""
+        terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)
+        white, *of_metals = lobe_functions(cosine, self.roughness, degree, terms)
+        white = (1 - self.metallic) * self.strength * white
+        if not of_metals:
+            return None, white
+        return self.metallic * of_metals[0], white + self.metallic * of_metals[1]
 
-    def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor, Tensor]:
+    def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor | None, Tensor]:
         """(colored, white) reflection (S,) of an even sky of irradiance 1. normals, toward the camera: (S, 3) unit."""
-        cosine = (normals * toward).sum(1)
-        first, second = lobe_weights(cosine, self.roughness, 0).sum((1, 2)) / math.pi
-        return self.split(first, second)
+        constant = math.sqrt(4 * math.pi) / math.pi  # the band's coefficient of such a sky
+        colored, white = self.lobes((normals * toward).sum(1).clamp(0, 1), 0)
+        return colored if colored is None else colored[0] * constant, white[0] * constant
 
     def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
         """(S,) the fraction of the albedo that is left below the coat: of a dielectric, what that does not reflect."""
         _, coat = self._replace(metallic=torch.zeros_like(self.metallic)).even(normals, toward)
         return (1 - self.metallic) * (1 - coat)
 
-    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-        """(colored, white) radiance (S, (degree + 1)²) per unit coefficient of environment light; differentiable."""
-        band = bands(degree).to(normals.device)
-        weights = self.split(*lobe_weights((normals * toward).sum(1), self.roughness, degree))
-        colored = white = normals.new_zeros(())
-        for axis, of_colored, of_white in zip(axes(normals, toward, self.roughness), *weights, strict=True):
-            values = basis(axis.T, degree)
-            colored, white = colored + of_colored.T[:, band] * values, white + of_white.T[:, band] * values
-        return colored, white
+    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, Tensor]:
+        """(colored, white, world): radiance (K, S) per unit coefficient of environment light of K = (degree + 1)², in
+        the axes of the view, and the matrix (K, K) to those of the world; differentiable. None for no color."""
+        frame = ViewFrame.of(normals, toward)
+        colored, white = self.lobes(frame.cosine, degree)
+        return colored if colored is None else frame.harmonics(colored), frame.harmonics(white), frame.world(degree)
 
     def along(self, normals: Tensor, toward: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """(colored, white) radiance (...) per irradiance from directions (..., 3); all unit vectors. Differentiable."""
-        return self.split(*reflectance(normals, toward, directions, self.roughness))
+        schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
+        return self.metallic * schlick, self.metallic * edge + (1 - self.metallic) * self.strength * dielectric
+
+
+def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
+    """Values (S, ...) of some samples; all of (1, ...), which all samples share."""
+    return values if len(values) == 1 else values[samples]
 
 
 def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -> SampleGloss | None:
@@ -144,8 +154,9 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
 
 
 def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
-    """(S, 3) unit vectors at the samples, in the dtype of the vertices (V, 3); differentiable in them."""
+    """(S, 3) unit vectors at the samples, or (1, 3) where all have the same, in the dtype of the vertices (V, 3);
+    differentiable in them."""
     eye = fragments.eye.to(vertices)
     if not eye[3]:
-        return eye[:3].expand(len(fragments.face), 3)
+        return eye[None, :3]
     return unit((eye[:3] - fragments.interpolate(vertices[fragments.corners])).T).T

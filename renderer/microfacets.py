@@ -1,136 +1,247 @@
-"""Glossy reflection by microfacets: GGX (Walter et al. 2007), Smith's masking and Schlick's Fresnel term.
+"""Glossy reflection by microfacets: GGX (Walter et al. 2007), Smith's masking and Fresnel's term.
 
 With the half vector h between the directions to the light l and to the camera v, and α = roughness²,
 
-    f = F D G / (4 (n·l)(n·v)),    D = α² / (π ((n·h)² (α² - 1) + 1)²),    F = F0 + (F90 - F0) (1 - v·h)⁵,
+    f = F D G / (4 (n·l)(n·v)),    D = α² / (π ((n·h)² (α² - 1) + 1)²),
 
-and G is the product of 2 (n·x) / ((n·x) + √(α² + (1 - α²) (n·x)²)) over x = l and v, as in glTF 2.0 and Mitsuba. F is
-linear in F0 and F90, and so is all reflected light (the split sum of Karis 2013).
+and G is the product of 2 (n·x) / ((n·x) + √(α² + (1 - α²) (n·x)²)) over x = l and v, as in glTF 2.0 and Mitsuba. F of
+a dielectric is Fresnel's of the refractive index 1.5; of a metal, Schlick's F0 + (F90 - F0) (1 - v·h)⁵. Both are linear
+in few numbers of the surface, and so is all reflected light (the split sum of Karis 2013).
 
-Of environment light a surface reflects ∫ L f (n·l) dl, linear in the light's coefficients U. The lobe f (n·l) is
-approximated band by band, by zonal harmonics about four axes in the plane of n and v, near the mirrored direction r:
+Of environment light a surface reflects ∫ L f (n·l) dl, linear in the light's coefficients U. Seen from v, the lobe
+f (n·l) is symmetric about the plane of n and v. In harmonics about the axis v, where n has polar angle θ and azimuth φ,
 
-    ∫ L f (n·l) dl = Σ_j Σ_l z_jl(n·v, α) Σ_m U_lm Y_lm(x_j),    x_j = (r + s_j n) / |r + s_j n|,    r = 2 (n·v) n - v.
+    ∫ L f (n·l) dl = Σ_l Σ_m≥0 c_lm(cos θ, α) sin^m θ (U_lm cos mφ + U_l-m sin mφ).
 
-A single axis (Ramamoorthi and Hanrahan 2002) gives a round lobe; seen obliquely, lobes are long and end at the horizon:
-then it is off by a quarter and more, and four axes by 2 % (degree 6, 4 % at roughness 1). The weights z are least
-squares by quadrature at Chebyshev's nodes, found once, and polynomials between them: so derivatives are exact.
+The functions c are polynomials, found once by quadrature. So the harmonics of the lobe cost one small product of
+matrices and K multiplications for each sample. Under perspective, v is not the same for all samples of a view: the
+lobes are then turned to a common axis (`turned`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.light.harmonics import MAX_DEGREE, per_degree, unit
+from renderer.light.harmonics import MAX_DEGREE, bands, per_degree, rotate, select_rows, unit
 
 LEAST = 0.2  # roughness: of smoother lobes, degree 20 holds less than KEPT
 KEPT = 0.7  # of a lobe's power, the integral of its square
-AXES = (-1.0, 0.5, 2.0, 4.0)  # s_j over α / (1 + 4 α), by which lobes are about as long as wide
-NODES = (16, 12)  # in the cosine and the roughness
-STRETCH = 0.15  # of cosines: below it, where lobes change fastest, are half of the nodes
-RIDGE = 1e-4  # of the least squares: head-on the axes are one
+INDEX = 1.5  # of refraction, as of varnish
+SCHLICK, EDGE, DIELECTRIC = range(3)  # F0 = 1 and F90 = 0; F0 = 0 and F90 = 1; Fresnel's of INDEX
+USUAL = 6  # degree: lower ones take the first functions of its table
+NODES = 12  # Chebyshev's, in the roughness; in the cosine 2 degree + 4, since mirrors turn by twice the angle
 QUADRATURE = (32, 24)  # half vectors: by their distribution, and by azimuth on one side of the plane
 
 
-def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
-    """π f (...) for F0 = 1, F90 = 0 and for F0 = 0, F90 = 1: radiance per irradiance, as diffuse surfaces have albedo.
+def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: Tensor) -> Tensor:
+    """π f (3, ...) with the terms SCHLICK, EDGE and DIELECTRIC: radiance per irradiance, as diffuse surfaces have
+    albedo.
 
     normals, toward, directions: (..., 3) unit, the latter two to the camera and to the light. roughness: (...).
     Differentiable. Where a normal faces away from the camera, n·v counts as 0.
     """
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
     squared, cosine = roughness**4, (half * normals).sum(-1)
-    fresnel = (1 - (half * toward).sum(-1)).clamp(min=0) ** 5
     value = squared / (cosine**2 * (squared - 1) + 1) ** 2
     for direction in (toward, directions):
         along = (direction * normals).sum(-1).clamp(min=0)
         value = value / (along + (squared + (1 - squared) * along**2).sqrt())
-    return value * (1 - fresnel), value * fresnel
+    return torch.stack([value * term for term in fresnel((half * toward).sum(-1).clamp(0, 1))])
 
 
-def axes(normals: Tensor, toward: Tensor, roughness: Tensor) -> list[Tensor]:
-    """x_j (3, S) of unit vectors (S, 3). roughness: (S,) or (1,)."""
-    mirrored = 2 * (toward * normals).sum(1, keepdim=True) * normals - toward
-    alpha = roughness[:, None] ** 2
-    return [unit((mirrored + axis * alpha / (1 + 4 * alpha) * normals).T) for axis in AXES]
+def fresnel(cosine: Tensor) -> Tensor:
+    """F (3, ...): SCHLICK, EDGE and DIELECTRIC, by the cosine v·h (...)."""
+    refracted = (INDEX**2 - 1 + cosine**2).sqrt()
+    perpendicular = (refracted - cosine) / (refracted + cosine)
+    parallel = perpendicular * (cosine * (refracted + cosine) - 1) / (cosine * (refracted - cosine) + 1)
+    edge = (1 - cosine) ** 5
+    return torch.stack([1 - edge, edge, (perpendicular**2 + parallel**2) / 2])
 
 
-def lobe_weights(cosine: Tensor, roughness: Tensor, degree: int) -> Tensor:
-    """π z (2, J, degree + 1, S): for F0 = 1, F90 = 0 and for F0 = 0, F90 = 1; differentiable.
+class ViewFrame(NamedTuple):
+    """Axes of a view and of its S samples; the third of a sample's is the direction to the camera.
 
-    cosine: n·v (S,), taken for 0 below. roughness: (S,) or (1,), at least LEAST.
+    normals: (3, S), along the axes of the sample. tilt: (4, S), sine and cosine of the angle about y and then of that
+    about x that turn the view's axes into the sample's; None where all samples have the view's. axis: sine and cosine
+    of polar angle and azimuth of the view's third axis in the world.
     """
-    table = _table(degree).to(cosine)
-    cosine = cosine.clamp(0, 1)
-    across = _chebyshev(2 * (1 + STRETCH) * cosine / (cosine + STRETCH) - 1, NODES[0])
-    along = _chebyshev((2 * roughness - 1 - LEAST) / (1 - LEAST), NODES[1])
-    if len(along) == 1:
-        weights = across @ (along @ table.flatten(1).unflatten(0, NODES[::-1]).flatten(1)).view(NODES[0], -1)
-    else:
-        weights = (along[:, :, None] * across[:, None]).flatten(1) @ table.flatten(1)
-    return weights.T.unflatten(0, table.shape[1:])
+
+    normals: Tensor
+    tilt: Tensor | None
+    axis: Tensor
+
+    @staticmethod
+    def of(normals: Tensor, toward: Tensor) -> ViewFrame:
+        """Of unit normals (S, 3) and directions to the camera (S, 3), or (1, 3) of all. Differentiable in both."""
+        x, y, z = unit(toward.detach().mean(0))
+        across = torch.hypot(x, y)
+        azimuth = torch.atan2(y, x)
+        axis = torch.stack([across, z, azimuth.sin(), azimuth.cos()])
+        inward = _in_view(normals, axis)
+        if len(toward) == 1 and not toward.requires_grad:
+            return ViewFrame(torch.stack(inward), None, axis)
+        (x, y, z), (ahead_x, ahead_y, ahead_z) = inward, _in_view(toward, axis)
+        cosine = (1 - ahead_x**2).sqrt()
+        tilt = torch.stack([ahead_x, cosine, -ahead_y / cosine, ahead_z / cosine])
+        y, z = _turned(y, z, -tilt[2], tilt[3])
+        z, x = _turned(z, x, -tilt[0], tilt[1])
+        return ViewFrame(torch.stack([x, y, z]), tilt, axis)
+
+    @property
+    def cosine(self) -> Tensor:
+        """n·v (S,), taken for 0 below."""
+        return self.normals[2].clamp(0, 1)
+
+    def harmonics(self, lobes: Tensor) -> Tensor:
+        """(K, S) coefficients of lobes (M, S), as of `lobe_functions`, for light in the view's axes (`world`)."""
+        degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
+        function, m = (index.to(lobes.device) for index in _functions(degree))
+        rows = lobes.index_select(0, function) * _circular(self.normals[0], self.normals[1], degree).index_select(
+            0, degree + m
+        )
+        if self.tilt is None:
+            return rows
+        cycle, (sine_y, cosine_y, sine_x, cosine_x) = _cycle(degree), self.tilt
+        rows = _about_z(_by_band(cycle, rows), sine_y, cosine_y)
+        return _about_z(_by_band(cycle, rows), sine_x, cosine_x)
+
+    def world(self, degree: int) -> Tensor:
+        """(K, K): coefficients of the world's axes, of those of `harmonics`."""
+        cycle, count = _cycle(degree).to(self.axis), (degree + 1) ** 2
+        rows = cycle if self.tilt is not None else torch.eye(count).to(self.axis)
+        sine, cosine, *azimuth = self.axis[:, None]
+        return _about_z(cycle.T @ _about_z(cycle @ rows, sine, cosine), *azimuth)
+
+
+def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:
+    """π c (T, M, S) for each of T terms: of the functions c_lm with 0 ≤ m ≤ l, in ascending order of l and then m.
+
+    cosine: n·v (S,). roughness: (S,) or (1,), at least LEAST. Differentiable.
+    """
+    table = _table(max(degree, USUAL)).to(cosine)[list(terms), : (degree + 1) * (degree + 2) // 2]
+    across = _chebyshev(4 * cosine / (cosine + 1) - 1, table.shape[-1])
+    along = _chebyshev((2 * roughness - 1 - LEAST) / (1 - LEAST), NODES)
+    if len(roughness) == 1:
+        return torch.einsum("tmrc,r->tmc", table, along[:, 0]) @ across
+    return table.flatten(2) @ (along[:, None] * across).flatten(0, 1)
 
 
 def degree_for(roughness: float) -> int:
     """The least degree that holds KEPT of a lobe's power, seen head-on; at most 20, which roughness LEAST needs."""
-    cosine, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(2**9))
-    cosine, weight = (cosine + 1) / 2, weight / 2
     up = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
+    node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(2**9))
+    cosine, weight = (node + 1) / 2, weight / 2
     light = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], 1)
-    lobe = reflectance(up, up, light, torch.tensor(max(roughness, LEAST)))[0] * cosine
-    bands = (_legendre_polynomials(cosine, MAX_DEGREE) @ (weight * lobe)).square()
-    held = ((torch.arange(MAX_DEGREE + 1) + 0.5) * bands).cumsum(0) / (weight * lobe**2).sum()
+    lobe = reflectance(up, up, light, torch.tensor(max(roughness, LEAST)))[SCHLICK] * cosine
+    zonal = torch.stack(select_rows(light.T, [l * (l + 1) for l in range(MAX_DEGREE + 1)])) @ (weight * lobe)
+    held = 2 * math.pi * zonal.square().cumsum(0) / (weight * lobe**2).sum()
     return min(int((held < KEPT).sum()), MAX_DEGREE)
 
 
+def _in_view(vectors: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The components (S,) of vectors (S, 3) along the view's axes."""
+    x, y, z = vectors.T
+    sine, cosine, sine_azimuth, cosine_azimuth = axis.unbind()
+    x, y = _turned(x, y, -sine_azimuth, cosine_azimuth)
+    z, x = _turned(z, x, -sine, cosine)
+    return x, y, z
+
+
+def _turned(x: Tensor, y: Tensor, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+    return x * cosine - y * sine, x * sine + y * cosine
+
+
+@per_degree
+def _functions(degree: int) -> tuple[Tensor, Tensor]:
+    """(K,) of each coefficient: which of the lobe functions is its, and its order m."""
+    l = bands(degree)
+    m = torch.arange(len(l)) - l * (l + 1)
+    return l * (l + 1) // 2 + m.abs(), m
+
+
+def _circular(x: Tensor, y: Tensor, degree: int) -> Tensor:
+    """(2 degree + 1, ...): Im (x + iy)^degree, ..., Im (x + iy), 1, Re (x + iy), ..., Re (x + iy)^degree."""
+    rows = [torch.ones_like(x)]
+    real, imaginary = x, y
+    for _ in range(degree):
+        rows = [imaginary, *rows, real]
+        real, imaginary = _turned(real, imaginary, y, x)
+    return torch.stack(rows)
+
+
+def _about_z(rows: Tensor, sine: Tensor, cosine: Tensor) -> Tensor:
+    """Coefficients (K, S) turned about z by an angle for each (S,), or for all (1,)."""
+    degree = math.isqrt(len(rows)) - 1
+    m, powers = _functions(degree)[1].to(rows.device), _circular(cosine, sine, degree)
+    signed = torch.cat([-powers[:degree], 0 * powers[:1], powers[:degree].flip(0)])
+    partner = torch.arange(len(m), device=rows.device) - 2 * m
+    turned = rows * powers.index_select(0, degree + m.abs())
+    return turned - rows.index_select(0, partner) * signed.index_select(0, degree + m)
+
+
+def _by_band(matrix: Tensor, rows: Tensor) -> Tensor:
+    """The product of a rotation (K, K), which mixes no bands, and coefficients (K, S)."""
+    ends = [l * l for l in range(math.isqrt(len(rows)) + 1)]
+    blocks = (slice(*ends[l : l + 2]) for l in range(len(ends) - 1))
+    return torch.cat([matrix[band, band].to(rows) @ rows[band] for band in blocks])
+
+
+@per_degree
+def _cycle(degree: int) -> Tensor:
+    """(K, K) float64: what turns coefficients as the rotation of x to y, y to z and z to x does."""
+    return rotate(torch.eye((degree + 1) ** 2, dtype=torch.float64), torch.eye(3, dtype=torch.float64).roll(1, 0))
+
+
 def _chebyshev(x: Tensor, count: int) -> Tensor:
-    """(S, count): the polynomials T_0, T_1, ... at x (S,)."""
+    """(count, S): the polynomials T_0, T_1, ... at x (S,)."""
     rows = [torch.ones_like(x), x]
     for _ in range(count - 2):
         rows.append(2 * x * rows[-1] - rows[-2])
-    return torch.stack(rows, dim=1)
+    return torch.stack(rows)
 
 
 @per_degree
 def _table(degree: int) -> Tensor:
-    """(nodes, 2, J, degree + 1) float64: coefficients of π z in products of Chebyshev polynomials of the roughness and,
-    the faster index, the cosine."""
-    count = [torch.arange(number, dtype=torch.float64) + 0.5 for number in NODES]
-    x, y = (torch.cos(math.pi * index / len(index)) for index in count)
-    cosines, roughness = STRETCH * (x + 1) / (1 + 2 * STRETCH - x), (y * (1 - LEAST) + 1 + LEAST) / 2
-    fits = torch.stack([_fit(cosines, value, degree) for value in roughness])
-    inverses = (torch.linalg.inv(_chebyshev(at, len(at))) for at in (y, x))
-    return torch.einsum("kr,im,rm...->ki...", *inverses, fits).flatten(0, 1)
+    """(3 terms, M functions, NODES, 2 degree + 4) float64: coefficients of π c in products of Chebyshev polynomials of
+    the roughness and, the faster index, the cosine."""
+    count = 2 * degree + 4
+    angles = [
+        math.pi * (torch.arange(number, dtype=torch.float64) + 0.5) / number for number in (3 * count // 2, NODES)
+    ]
+    x, y = (angle.cos() for angle in angles)
+    cosines, roughness = (x + 1) / (3 - x), (y * (1 - LEAST) + 1 + LEAST) / 2
+    orders = torch.tensor([m for l in range(degree + 1) for m in range(l + 1)])
+    lobes = torch.stack([_lobes(cosines, value, degree) for value in roughness])  # (NODES, 3, M, N)
+    lobes = torch.einsum("kr,rtmn->mntk", torch.linalg.inv(_chebyshev(y, NODES).T), lobes)
+    # Least squares with the factor sin^m θ, since near 0 the functions are quotients of small numbers.
+    factors = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2) * _chebyshev(x, count).T
+    fits = torch.linalg.lstsq(factors, lobes.flatten(2), rcond=1e-9, driver="gelsd").solution
+    return fits.unflatten(2, (3, NODES)).permute(2, 0, 3, 1).contiguous()
 
 
-def _fit(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
-    """(N, 2, J, degree + 1) the least-squares weights π z of lobes at N cosines: n is z, v in the plane of x and z."""
+def _lobes(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
+    """(3, M, N) π c_lm sin^m θ at N cosines, by quadrature over the half vectors on one side of the plane."""
     node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(QUADRATURE[0]))
     fraction, squared = (node[:, None] + 1) / 2, roughness**4  # of ∫ D (n·h) dh, which is 1
     azimuth = math.pi * (torch.arange(QUADRATURE[1], dtype=torch.float64) + 0.5) / QUADRATURE[1]
     z = ((1 - fraction) / (1 + (squared - 1) * fraction)).sqrt().expand(-1, len(azimuth))
     radius = (1 - z**2).sqrt()
     half = torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], -1).flatten(0, 1)
-    normal = half.new_tensor([[0.0, 0, 1]])
-    toward = torch.stack([-((1 - cosines**2).sqrt()), 0 * cosines, cosines], dim=1)
+    sines = (1 - cosines**2).sqrt()
+    toward = torch.stack([-sines, 0 * sines, cosines], dim=1)
     facing = toward @ half.T
     light = 2 * facing[..., None] * half - toward[:, None]
     density = squared / (half[:, 2] ** 2 * (squared - 1) + 1) ** 2 / math.pi * half[:, 2]
     measure = weight.repeat_interleave(len(azimuth)) / 2 / len(azimuth) / density * 4 * facing.clamp(min=0)  # of light
-    lobe = torch.stack(reflectance(normal, toward[:, None], light, roughness)) * light[..., 2].clamp(min=0) * measure
-    about = torch.stack(axes(normal, toward, roughness[None])).permute(2, 0, 1)
-    received = _legendre_polynomials(about @ light.mT, degree) @ lobe.permute(1, 2, 0)
-    gram = _legendre_polynomials(about @ about.mT, degree) + RIDGE * torch.eye(len(AXES)).to(about)
-    return torch.linalg.solve(gram, received).permute(1, 3, 2, 0)
-
-
-def _legendre_polynomials(x: Tensor, degree: int) -> Tensor:
-    """(degree + 1, ...): P_l at x (...)."""
-    rows = [torch.ones_like(x), x]
-    for l in range(2, degree + 1):
-        rows.append(((2 * l - 1) * x * rows[-1] - (l - 1) * rows[-2]) / l)
-    return torch.stack(rows[: degree + 1])
+    values = reflectance(half.new_tensor([[0.0, 0, 1]]), toward[:, None], light, roughness)
+    values = values * light[..., 2].clamp(min=0) * measure
+    ahead = torch.stack([cosines, 0 * sines, sines], dim=1)  # normal to v, in its plane with n
+    directions = torch.stack([(light * ahead[:, None]).sum(2), light[..., 1], (light * toward[:, None]).sum(2)])
+    harmonics = torch.stack(select_rows(directions, [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]))
+    return torch.einsum("tnq,mnq->tmn", values, harmonics)

@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded
 from renderer.fragments import Fragments
-from renderer.gloss import SampleGloss, toward_camera
+from renderer.gloss import SampleGloss, at_samples, toward_camera
 from renderer.light import harmonics
 from renderer.normals import area_vectors, vertex_normals
 
@@ -76,15 +76,21 @@ def glossy_radiance(
     wide = torch.promote_types(vertices.dtype, torch.float32)
     if normals is None:
         planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        at_samples = harmonics.unit(planes).T[fragments.face].to(wide)
+        shaded = harmonics.unit(planes).T[fragments.face].to(wide)
     else:
-        at_samples = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
-    shaded = at_samples, toward_camera(fragments, vertices.to(wide))
-    albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(at_samples)
-    colored, white = gloss.transfer(*shaded, harmonics.degree_of(light))
-    shine = (albedo * (colored @ light) + white @ light) / fragments.samples**2
-    diffuse = radiance(fragments, vertices, light, albedo * gloss.diffuse(*shaded)[:, None], normals)
-    return diffuse + shine.new_zeros(3, len(fragments.pixels)).index_add(1, fragments.pixel, shine.T).to(diffuse)
+        shaded = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
+    toward = toward_camera(fragments, vertices.to(wide))
+    albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(shaded)
+    blocks = []
+    for first in range(0, len(shaded), BLOCK):
+        some = slice(first, first + BLOCK)
+        seen = shaded[some], at_samples(toward, some)
+        colored, white, world = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
+        in_view = (world.T @ light).T
+        blocks.append(in_view @ white if colored is None else in_view @ white + albedo[some].T * (in_view @ colored))
+    shine = torch.cat([light.new_zeros(3, 0), *blocks], dim=1) / fragments.samples**2
+    diffuse = radiance(fragments, vertices, light, albedo * gloss.diffuse(shaded, toward)[:, None], normals)
+    return diffuse + shine.new_zeros(3, len(fragments.pixels)).index_add(1, fragments.pixel, shine).to(diffuse)
 
 
 def irradiance(

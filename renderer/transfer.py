@@ -21,7 +21,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import Camera
 from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss
+from renderer.gloss import Gloss, at_samples
 from renderer.image import ImageSettings, as_background, composite
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
@@ -37,6 +37,7 @@ DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
 BLOCK = 2**16  # pixels filtered at a time: bounds the memory
+GLOSSY = 2**14  # samples with gloss, of which more numbers are computed
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class TransferOperator:
     """The transfer matrix of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
     transfer: three channels of K nonzero coefficients and P covered pixels; or one, a third of the size and the time,
-    where no pixel mixes albedos (one sample per pixel, or a mesh of one color).
+    where no pixel mixes albedos (one sample per pixel, or a mesh of one color). With gloss, that one is followed by
+    white light, which is added to all channels.
     albedo: multiplies the one channel; ones where there are three.
     coverage: in (0, 1], the fraction of a pixel's samples that the mesh covers.
     pixels: row-major indices of the covered pixels; row 0 is the top of the image.
@@ -101,6 +103,8 @@ class TransferOperator:
         upstream = radiance_gradient.to(self.transfer.dtype)
         if self._shared is not None:
             product = linear(upstream * self.albedo, self._shared)
+            if self._white is not None:
+                product = product + linear(upstream, self._white)
         else:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._scatter @ product.mT
@@ -115,12 +119,25 @@ class TransferOperator:
         sparse = self.sparse and self.sparse.to(device)
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS}, sparse=sparse)
 
+    @property
+    def by_channel(self) -> Tensor:
+        """(3, K, P): the transfer of three channels, with their albedo."""
+        if self._shared is None:
+            return self.transfer
+        colored = self._shared * self.albedo[:, None]
+        return colored if self._white is None else colored + self._white
+
     # Cached, since at 32² even an index or a comparison of dtypes counts.
 
     @cached_property
     def _shared(self) -> Tensor | None:
         """(K, P), where the channels share it."""
-        return self.transfer[0] if len(self.transfer) == 1 else None
+        return self.transfer[0] if len(self.transfer) < 3 else None
+
+    @cached_property
+    def _white(self) -> Tensor | None:
+        """(K, P), added to the product of albedo and what the channels share."""
+        return self.transfer[1] if len(self.transfer) == 2 else None
 
     @cached_property
     def _scatter(self) -> Tensor:
@@ -135,6 +152,8 @@ class _Radiance(torch.autograd.Function):
         nonzero = lights.index_select(-2, operator.nonzero).to(operator.transfer.dtype)
         if operator._shared is not None:
             product = (nonzero.mT @ operator._shared).mul_(operator.albedo)
+            if operator._white is not None:
+                product.add_(nonzero.mT @ operator._white)
         else:
             product = torch.einsum("...kc,ckp->...cp", nonzero, operator.transfer)
         if operator.sparse is not None:
@@ -149,12 +168,15 @@ class _Radiance(torch.autograd.Function):
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
-    """Radiance (..., B, 3, P) of B lights (..., B, K, 3) under transfer (..., C, K, P), C = 3 or 1, and albedo
-    (..., 3, P). The light comes first in the product: on a CPU that is several times faster."""
+    """Radiance (..., B, 3, P) of B lights (..., B, K, 3) under transfer (..., C, K, P), C = 1 to 3, and albedo
+    (..., 3, P), as of a `TransferOperator`. The light comes first in the product: on a CPU that is several times
+    faster."""
     if transfer.shape[-3] == 3:
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
-    product = lights.mT.flatten(-3, -2) @ transfer.squeeze(-3)
-    return product.unflatten(-2, (-1, 3)) * albedo.unsqueeze(-3)
+    shared, *white = transfer.unbind(-3)
+    by_light = lights.mT.flatten(-3, -2)
+    product = (by_light @ shared).unflatten(-2, (-1, 3)) * albedo.unsqueeze(-3)
+    return product + (by_light @ white[0]).unflatten(-2, (-1, 3)) if white else product
 
 
 def build_operators(
@@ -176,18 +198,20 @@ def build_operators(
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
     transport = build_transport(mesh, settings, albedo_scale, basis)
+    local = any(isinstance(part, LocalBasis) for _, part in parts_of(basis))
     rays = transport.rays if transport else Rays(mesh)
 
     def build(fragments: Fragments) -> TransferOperator:
         surface, pixels = Surface(mesh, fragments, settings, given_gloss=gloss), len(fragments.pixels)
         albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
-        by_channel = surface.gloss is not None or (transport and transport.colors)
+        by_channel = (transport and transport.colors) or (surface.gloss is not None and (transport or local))
         factor = None if by_channel else _pixel_albedo(fragments, albedo, dtype)
         if factor is None:
             factor = torch.ones(pixels, 3)
         else:
             albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-        transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=dtype)], [torch.arange(0)]
+        channels = 2 if albedo.shape[1] == 1 and surface.gloss is not None else albedo.shape[1]
+        transfers, nonzero = [torch.empty(channels, 0, pixels, dtype=dtype)], [torch.arange(0)]
         sparse = []
         for rows, part in parts_of(basis):
             if isinstance(part, LocalBasis):
@@ -228,7 +252,7 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
     """(C, K, P): albedo (S, C) × A_l Y_lm(n), and what gloss makes of it, summed over each pixel's samples, by blocks
-    of pixels in float64. K: the nonzero coefficients, with gloss all."""
+    of pixels in float64. K: the nonzero coefficients, with gloss all. With gloss, one channel is followed by white."""
     fragments, pixels, gloss = surface.fragments, len(surface.fragments.pixels), surface.gloss
     by_face = surface.settings.normals == "flat" and gloss is None
     if by_face:
@@ -236,23 +260,32 @@ def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch
         shading = basis.irradiance(surface.face_planes)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-    starts = torch.arange(0, pixels, BLOCK)
-    ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
-    size = len(basis.nonzero) if gloss is None else basis.size
-    filtered = torch.empty(albedo.shape[1], size, pixels, dtype=dtype)
+    size = BLOCK if gloss is None else max(1, GLOSSY // fragments.samples**2)
+    starts = torch.arange(0, pixels, size)
+    ends = torch.searchsorted(pixel, starts + size).tolist()
+    colors = albedo.shape[1]
+    if gloss is None:
+        filtered = torch.empty(colors, len(basis.nonzero), pixels, dtype=dtype)
+    else:
+        filtered = torch.zeros(colors + (colors == 1), basis.size, pixels, dtype=dtype)
     for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
-        some = slice(begin, end)
+        some, block = slice(begin, end), filtered[..., first : first + size]
+
+        def over_pixels(rows: Tensor, at: Tensor = pixel[some] - first, count: int = block.shape[2]) -> Tensor:
+            return rows.new_zeros(count, rows.shape[1]).index_add_(0, at, rows).T
+
         rows = shading.index_select(0, face[some]) if by_face else basis.irradiance(surface.normals[some])
-        white = None
         if gloss is not None:
-            at, seen = gloss.at(some), (surface.normals[some], surface.toward[some])
-            colored, white = at.transfer(*seen, basis.degree)
-            rows = colored.index_add(1, basis.nonzero, rows * at.diffuse(*seen)[:, None])
-        block = filtered[..., first : first + BLOCK]
-        for channel, weight in zip(block, weights[some].T, strict=True):
-            summed = rows.new_zeros(channel.shape[::-1])
-            summed.index_add_(0, pixel[some] - first, rows * weight[:, None])
-            if white is not None:
-                summed.index_add_(0, pixel[some] - first, white, alpha=1 / fragments.samples**2)
-            channel.copy_(summed.T)
+            seen = surface.normals[some], at_samples(surface.toward, some)
+            colored, white, world = gloss.at(some).transfer(*seen, basis.degree)
+            rows = rows * gloss.at(some).diffuse(*seen)[:, None]
+        for channel, weight in zip(block, weights[some].T, strict=False):
+            if gloss is None:
+                channel.copy_(over_pixels(rows * weight[:, None]))
+                continue
+            channel[basis.nonzero] = over_pixels(rows * weight[:, None]).to(dtype)
+            if colored is not None:
+                channel += world @ over_pixels((colored * weight).T)
+        if gloss is not None:
+            block[1 if colors == 1 else slice(None)] += world @ over_pixels(white.T) / fragments.samples**2
     return filtered

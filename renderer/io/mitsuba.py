@@ -25,7 +25,7 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.gloss import DIELECTRIC, SampleGloss
+from renderer.gloss import SampleGloss
 from renderer.image import ImageSettings, decode, encode, to_bytes
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Harmonics, LocalBasis
@@ -302,8 +302,8 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
     material: Scene = {"type": "diffuse", "reflectance": albedo}
     if gloss is not None:
         roughness, metallic, strength = (gloss / [1, kept, 1]).tolist()
-        # The light's scale has the albedo's. F0 is 0.08 × specular.
-        specular = min(strength * DIELECTRIC / 0.08 / max(albedo_scale, 1e-6), 1.0)
+        # The light's scale has the albedo's. F0 is 0.08 × specular, and 0.04 for a refractive index of 1.5.
+        specular = min(strength / 2 / max(albedo_scale, 1e-6), 1.0)
         material = {"type": "principled", "base_color": albedo, "specular": specular}
         for index, (name, factor, least) in enumerate((("roughness", roughness, LEAST), ("metallic", metallic, 0.0))):
             material[name] = max(factor, least)

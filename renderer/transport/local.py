@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from renderer.fragments import Fragments
-from renderer.gloss import Gloss
+from renderer.gloss import Gloss, at_samples
 from renderer.image import ImageSettings
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.harmonics import unit, unit_vectors
@@ -88,7 +88,7 @@ def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
     if gloss is None:
         return values
     directions = unit((paths.source - surface.points[point]).T).T
-    colored, white = gloss.at(point).along(surface.normals[point], surface.toward[point], directions)
+    colored, white = gloss.at(point).along(surface.normals[point], at_samples(surface.toward, point), directions)
     diffuse = gloss.diffuse(surface.normals, surface.toward)[point]
     return values * (diffuse + colored)[:, None] + white[:, None]
 

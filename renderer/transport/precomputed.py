@@ -26,7 +26,7 @@ from torch import Tensor
 from renderer.albedo import surface_albedo
 from renderer.errors import InputError
 from renderer.fragments import Fragments
-from renderer.gloss import SampleGloss
+from renderer.gloss import SampleGloss, at_samples
 from renderer.image import ImageSettings
 from renderer.light.basis import Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh, refine
@@ -142,11 +142,12 @@ class Transport:
     def _lobes(self, gloss: SampleGloss, surface: Surface, sample: Tensor) -> tuple[Tensor, Tensor]:
         """(colored, white) radiance (B, D) per irradiance from the directions at samples (B, D). Lobes may be narrower
         than the directions are apart: they are scaled to reflect as much of an even sky as they do in closed form."""
-        normals, toward = surface.normals[sample], surface.toward[sample]
+        normals, toward = surface.normals[sample], at_samples(surface.toward, sample)
         colored, white = gloss.at(sample).along(normals, toward, self._directions)
         cosine = torch.einsum("bdi,di->bd", normals, self._directions).clamp(min=0)
         sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
-        exact = torch.stack(gloss.even(surface.normals, surface.toward)).sum(0)
+        colored_exact, exact = gloss.even(surface.normals, surface.toward)
+        exact = exact if colored_exact is None else exact + colored_exact
         scale = exact[sample].mean(1, keepdim=True) / sampled.clamp(min=torch.finfo(sampled.dtype).tiny)
         return colored * scale, white * scale
 

@@ -80,7 +80,7 @@ class Surface:
 
     @cached_property
     def toward(self) -> Tensor:
-        """(S, 3) unit vectors to the camera."""
+        """(S, 3) unit vectors to the camera, or (1, 3) where all samples have the same."""
         return toward_camera(self.fragments, self.vertices)
 
 

@@ -141,7 +141,7 @@ def test_a_material_is_written_to_files_that_show_it_again(tmp_path, textured):
 
 def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color):
     """Of 5² of roughness and strength in the ball, under lamps whose highlights are narrow; to 2 % of the gain."""
-    lit = {"normals": "smooth", "lamps": augment.LampsSettings([[1.5, 0.5, 2.0], [-1.0, 2.0, 1.5]], start=3.0)}
+    lit = {"normals": "smooth", "lamps": augment.LampsSettings([[1.5, 0.5, 2.0], [-1.0, 2.0, 1.5]], start=6.0)}
     steps = augment.MaterialSettings("linf", 1.0, "sign", 0.2, roughness=0.3, strength=1.0)
     result = attacked({"material": steps}, scene=lit, max_steps=10, shorten=True, margin=1000.0)
     problem, label = result.problem, result.goal.source[0, 0]

@@ -17,7 +17,7 @@ from augment.build import LampsSettings, ProjectorSettings, load_background
 from augment.objects import ObjectSettings, PropSettings
 from augment.scene import Conditions, Scene
 from augment.utils import generator
-from augment.variation import VariationSettings, draw_camera_effects, draw_patterns, vary
+from augment.variation import VariationSettings, VarnishSettings, draw_camera_effects, draw_patterns, vary
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode
 from renderer.light.basis import HARMONICS
@@ -98,6 +98,34 @@ def test_each_view_of_an_object_is_turned_about_an_axis_of_its_own_and_its_props
         rest = item.mesh.vertices[item.mesh.faces[item.own :]]
         assert rest.min((0, 1))[2] == pytest.approx(item.lowest) == pytest.approx(pairs[0][:, 2].min())
     assert len(rows.objects) == 6 and len(set(angles)) == 6 and 20 < max(angles) <= 40
+
+
+def test_each_view_of_an_object_has_a_gloss_of_its_own_and_its_props_keep_theirs():
+    prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
+    scene = augment.build_scene([ObjectSettings("solid:pear", "pear", props=[prop])], 8, 6, rasterizer="numpy")
+    ranges = {"roughness": [0.3, 0.6], "strength": [0.5, 1.0]}
+    settings = {"gloss": VarnishSettings(**ranges), "rotation": 90.0, "instances": True}
+    first, again = drawn(scene, **settings), drawn(scene, **settings)
+    values = np.stack([item.mesh.gloss[0] for item in first.objects])
+    assert len(np.unique(values[:, 0])) == 6 and not values[:, 1].any()
+    for column, (low, high) in zip((0, 2), ranges.values(), strict=True):
+        assert (
+            (values[:, column] >= low).all() and (values[:, column] <= high).all() and np.ptp(values[:, column]) > 0.1
+        )
+    for item in first.objects:
+        assert (item.mesh.gloss[: item.own] == item.mesh.gloss[0]).all()
+        assert item.mesh.gloss[item.own :] == pytest.approx(np.tile([0.9, 0, 1], (len(item.mesh.faces) - item.own, 1)))
+    assert torch.equal(images(first), images(again))
+    one_light = vary(scene, VariationSettings(**settings), generator(0), once=True)
+    torch.testing.assert_close(images(one_light), images(first), rtol=0, atol=1e-5)
+    matte = drawn(scene, rotation=90.0, instances=True)
+    assert (images(matte) - images(first)).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("limits", [{"roughness": [0.1, 0.5]}, {"strength": [0.5, 1.5]}, {"strength": [1.0]}])
+def test_gloss_out_of_range_is_refused(limits):
+    with pytest.raises(InputError, match=f"^{next(iter(limits))}"):
+        VarnishSettings(**limits)
 
 
 def test_on_a_table_views_come_from_above_and_darken_the_table_under_the_object_alone():
