@@ -64,6 +64,9 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     Returns a function that trains, and returns the scores that it writes. command: as it was given, to be recorded.
     """
     base = _initial(settings)
+    if settings.data.name == UNLABELED and not (base and settings.train.distillation):
+        missing = "set train.init_from and train.distillation"
+        raise InputError(f"data={UNLABELED}: a network keeps its answers on it: {missing}")
     if base and (settings.data.name in ("shapes", UNLABELED) or CLASSIFIER in base[1]["architecture"]):
         data = relabeled(data, base[1]["architecture"]["classes"], f"data={settings.data.name}")
     for name, photographs in settings.evaluate.folders.items():

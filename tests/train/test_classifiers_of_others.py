@@ -111,6 +111,7 @@ def test_labeled_folders_are_scored_in_the_networks_classes_before_and_after(tun
             f"model=torchvision:resnet18: train.init_from=torchvision:{NAME} has its own",
         ),
         ("data.path=absent", "absent is not a folder"),
+        ("train.distillation=0", "a network keeps its answers on it: set train.init_from and train.distillation"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_sentence(tuned, change, message):
