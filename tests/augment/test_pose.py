@@ -1,12 +1,14 @@
 """Attacks on the pose of an object and its cameras."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import skinned_arm
 import torch
 from scipy.spatial.transform import Rotation
+from torch.nn.functional import pad
 
 import augment
 import renderer
@@ -15,6 +17,7 @@ from augment.scene import Scene
 from renderer.errors import InputError
 
 ONLY = dict.fromkeys(POSE, 0.0)
+MESHES = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 ONE = torch.zeros(1, dtype=torch.int64)
 
 
@@ -152,3 +155,35 @@ def test_joints_that_cannot_move_are_refused_in_one_sentence(arm, joints, messag
     scene = scene_of() if joints == 10 else augment.build_scene([(arm, "arm")], 8, silhouettes=True)
     with pytest.raises(InputError, match=message):
         problem_of(scene, joints=joints)
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.skipif(not MESHES.is_dir(), reason="needs ../shared/data")
+@pytest.mark.parametrize(
+    ("mesh", "label", "fooled"),
+    [("orange_studio", "orange", 1), ("banana", "banana", 0), ("golf_ball", "golf ball", 0)],
+)
+def test_near_the_start_descent_fools_an_imagenet_network_as_often_as_random_and_grid_poses(
+    tmp_path, mesh, label, fooled
+):
+    """Of two views, within 10° and a tenth, by 26 poses each: descent, uniform draws, and all rotations of -10, 0 and
+    10° about three axes. What fools does so in Mitsuba, too."""
+    pytest.importorskip("mitsuba")
+    network = augment.load_classifier("efficientnet_lite0")
+    shown = {"width": 2.4, "fov": 40.0, "encoding": "srgb", "backgrounds": [0.9], "exposure": 1.5, "silhouettes": True}
+    scene = augment.build_scene([(str(MESHES / f"{mesh}.glb"), label)], network.size, views=2, **shown)
+    settings = augment.AttackSettings(pose=augment.PoseSettings("linf", 1.0, "sign", 0.25), max_steps=26)
+    result = augment.attack(network, scene, settings=settings)
+
+    def fools(values: torch.Tensor) -> torch.Tensor:
+        logits = result.preprocessed_model(result.problem.images(values)[:, 0])
+        return logits.argmax(1) != result.goal.source[:, 0]
+
+    draws = torch.Generator().manual_seed(0)
+    rotations = [pad(turn, (0, 6)) for turn in torch.cartesian_prod(*[torch.tensor([-1.0, 0, 1])] * 3) if turn.any()]
+    at_random = torch.stack([fools(result.problem.sample(draws)) for _ in rotations]).any(0)
+    on_grid = torch.stack([fools(turn.expand(2, -1)) for turn in rotations]).any(0)
+    assert result.success.sum() == fooled >= max(at_random.sum(), on_grid.sum())
+    lines = augment.save(result, tmp_path, verify=["mitsuba"])
+    assert [line["versions"]["mitsuba"]["success"] for line in lines] == result.success.tolist()
