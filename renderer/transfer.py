@@ -7,7 +7,7 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import Camera
 from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss, at_samples
+from renderer.gloss import Gloss, SampleGloss, at_samples
 from renderer.image import ImageSettings, as_background, composite
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
@@ -222,8 +222,11 @@ def build_operators(
                     continue
                 transfer, indices = entries.dense(pixels)
             else:
-                transfer = _box_filter(surface, albedo, part, dtype)
-                indices = part.nonzero if surface.gloss is None else torch.arange(part.size)
+                if surface.gloss is None:
+                    transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
+                else:
+                    transfer = _glossy_box_filter(surface, surface.gloss, albedo, part, dtype)
+                    indices = torch.arange(part.size)
                 change = transport.change(surface, albedo) if transport else None
                 if change is not None:
                     transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
@@ -251,41 +254,50 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
 
 
 def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
-    """(C, K, P): albedo (S, C) × A_l Y_lm(n), and what gloss makes of it, summed over each pixel's samples, by blocks
-    of pixels in float64. K: the nonzero coefficients, with gloss all. With gloss, one channel is followed by white."""
-    fragments, pixels, gloss = surface.fragments, len(surface.fragments.pixels), surface.gloss
-    by_face = surface.settings.normals == "flat" and gloss is None
+    """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64.
+    K: the nonzero coefficients."""
+    fragments, by_face = surface.fragments, surface.settings.normals == "flat"
     if by_face:
         pixel, face, weights = fragments.merge(albedo)
         shading = basis.irradiance(surface.face_planes)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-    size = BLOCK if gloss is None else max(1, GLOSSY // fragments.samples**2)
-    starts = torch.arange(0, pixels, size)
-    ends = torch.searchsorted(pixel, starts + size).tolist()
-    colors = albedo.shape[1]
-    if gloss is None:
-        filtered = torch.empty(colors, len(basis.nonzero), pixels, dtype=dtype)
-    else:
-        filtered = torch.zeros(colors + (colors == 1), basis.size, pixels, dtype=dtype)
-    for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
-        some, block = slice(begin, end), filtered[..., first : first + size]
-
-        def over_pixels(rows: Tensor, at: Tensor = pixel[some] - first, count: int = block.shape[2]) -> Tensor:
-            return rows.new_zeros(count, rows.shape[1]).index_add_(0, at, rows).T
-
+    filtered = torch.empty(albedo.shape[1], len(basis.nonzero), len(fragments.pixels), dtype=dtype)
+    for some, at, block in _blocks(pixel, filtered, BLOCK):
         rows = shading.index_select(0, face[some]) if by_face else basis.irradiance(surface.normals[some])
-        if gloss is not None:
-            seen = surface.normals[some], at_samples(surface.toward, some)
-            colored, white, world = gloss.at(some).transfer(*seen, basis.degree)
-            rows = rows * gloss.at(some).diffuse(*seen)[:, None]
         for channel, weight in zip(block, weights[some].T, strict=False):
-            if gloss is None:
-                channel.copy_(over_pixels(rows * weight[:, None]))
-                continue
-            channel[basis.nonzero] = over_pixels(rows * weight[:, None]).to(dtype)
-            if colored is not None:
-                channel += world @ over_pixels((colored * weight).T)
-        if gloss is not None:
-            block[1 if colors == 1 else slice(None)] += world @ over_pixels(white.T) / fragments.samples**2
+            channel.copy_(_over_pixels(rows * weight[:, None], at, block.shape[2]))
     return filtered
+
+
+def _glossy_box_filter(
+    surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
+) -> Tensor:
+    """`_box_filter` (C, K, P) with what gloss adds, for all K coefficients. One channel is followed by white."""
+    fragments, colors = surface.fragments, albedo.shape[1]
+    filtered = torch.zeros(colors + (colors == 1), basis.size, len(fragments.pixels), dtype=dtype)
+    weights = albedo / fragments.samples**2
+    for some, at, block in _blocks(fragments.pixel, filtered, max(1, GLOSSY // fragments.samples**2)):
+        seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
+        colored, white, world = gloss.at(some).transfer(*seen, basis.degree)
+        rows = basis.irradiance(surface.normals[some]) * gloss.at(some).diffuse(*seen)[:, None]
+        for channel, weight in zip(block, weights[some].T, strict=False):
+            channel[basis.nonzero] = _over_pixels(rows * weight[:, None], at, pixels).to(dtype)
+            if colored is not None:
+                channel += world @ _over_pixels((colored * weight).T, at, pixels)
+        block[1 if colors == 1 else slice(None)] += world @ _over_pixels(white.T, at, pixels) / fragments.samples**2
+    return filtered
+
+
+def _blocks(pixel: Tensor, filtered: Tensor, size: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """The samples of so many pixels at a time, their pixels counted from the first, and the part of (..., P) to
+    fill."""
+    starts = torch.arange(0, filtered.shape[-1], size)
+    ends = torch.searchsorted(pixel, starts + size).tolist()
+    for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
+        yield slice(begin, end), pixel[begin:end] - first, filtered[..., first : first + size]
+
+
+def _over_pixels(rows: Tensor, at: Tensor, pixels: int) -> Tensor:
+    """(K, pixels): rows (S, K) summed by pixel."""
+    return rows.new_zeros(pixels, rows.shape[1]).index_add_(0, at, rows).T

@@ -71,7 +71,7 @@ class DataSet:
 def relabeled(data: DataSet, classes: Sequence[str], key: str) -> DataSet:
     """The data with labels that count these classes. InputError naming the key where one of its own is not among
     them."""
-    labels = torch.tensor([class_index(classes, name, key) for name in data.classes or classes[:1]])
+    labels = torch.tensor([class_index(classes, name, key) for name in data.classes])
     return DataSet(tuple(classes), *(Split(part.images, labels[part.labels]) for part in (data.train, data.test)))
 
 

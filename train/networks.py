@@ -214,9 +214,14 @@ def load_initial(name: str, weights: str | None, size: int | None = None) -> tup
 
 def export(path: Path, network: nn.Module) -> None:
     """Write the weights of a network that began with a classifier, under the names of its own file."""
-    own, content = network.network if isinstance(network, Normalized) else network, io.BytesIO()
-    torch.save({name: value.cpu() for name, value in own.state_dict().items()}, content)
+    content = io.BytesIO()
+    torch.save({name: value.cpu() for name, value in without_normalization(network).state_dict().items()}, content)
     write_whole(path, content.getbuffer())
+
+
+def without_normalization(network: nn.Module) -> nn.Module:
+    """The network whose parameters have its own file's names."""
+    return network.network if isinstance(network, Normalized) else network
 
 
 def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:

@@ -25,8 +25,9 @@ TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 OPTIMIZERS = ("sgd", "adamw")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 PGD_RADIUS, PGD_STEP, PGD_STEPS = 2 / 255, 1 / 255, 3  # L∞ norm; Madry et al. 2018: 8/255 on CIFAR-10
-LARGEST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
-LARGEST["accumulate"] = LARGEST["batch_size"]
+LARGEST = dict(
+    epochs=10**6, images_per_epoch=10**9, batch_size=10**6, accumulate=10**6, checkpoint_every=10**6, threads=1024
+)
 
 # Factors of the learning rate at a fraction of the training: ×0.2 at 30, 60 and 80 % (Zagoruyko and Komodakis 2016: at
 # epochs 60, 120 and 160 of 200); half a cosine; up over the first fifth and down, the most from a few epochs.
@@ -71,8 +72,8 @@ class TrainSettings:
     cache: str | None = "auto"
 
     def __post_init__(self) -> None:
-        choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS, "compile": COMPILE}
-        for name, known in {**choices, "optimizer": OPTIMIZERS}.items():
+        choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS}
+        for name, known in {**choices, "compile": COMPILE, "optimizer": OPTIMIZERS}.items():
             require_choice(name, getattr(self, name), known)
         for name, largest in LARGEST.items():
             require_range(name, getattr(self, name), 1, largest)

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from augment import utils
 from augment.build import build_scene
-from augment.classifiers.adapter import Normalized, class_index
+from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, progress, stream_seed
@@ -40,6 +40,7 @@ from train.networks import (
     export,
     load_initial,
     start_from,
+    without_normalization,
 )
 from train.photographs.folder import find_photographs, load_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
@@ -52,6 +53,7 @@ from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
 Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_initial` gives it
+Predict = Callable[[torch.Tensor], torch.Tensor]
 UNLABELED = "unlabelled"  # data whose labels are the answers of the network begun with
 SIZE = 32  # of the images of a folder, where neither data.size nor the network begun with says
 SAMPLED = 1000  # images whose channels are measured where they are on disk
@@ -68,7 +70,11 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         missing = "set train.init_from and train.distillation"
         raise InputError(f"data={UNLABELED}: a network keeps its answers on it: {missing}")
     if base and (settings.data.name in ("shapes", UNLABELED) or CLASSIFIER in base[1]["architecture"]):
-        data = relabeled(data, base[1]["architecture"]["classes"], f"data={settings.data.name}")
+        classes = base[1]["architecture"]["classes"]
+        if settings.data.name == UNLABELED:
+            data = replace(data, classes=tuple(classes))
+        else:
+            data = relabeled(data, classes, f"data={settings.data.name}")
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
@@ -104,14 +110,23 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
             f"threads: {threads}, processes: {utils.world_size()}"
         )
         log, labeled = None if utils.rank() else RunLog(folder, trainer.history), data
-        if settings.data.name == UNLABELED:
-            parts = (_answered(settings, trainer, part) for part in (data.train, data.test))
-            labeled = DataSet(data.classes, *parts)
-        before = _scores_before(settings, trainer, labeled)
+        before: dict[str, float] = {}
+        if trainer.initial:
+            predict = _initial_predictor(settings, trainer)
+            answered = _answered(predict, trainer, data.test)
+            if settings.data.name == UNLABELED:
+                labeled = DataSet(data.classes, _answered(predict, trainer, data.train), answered)
+            if utils.rank() == 0:
+                before = _scores_before(settings, trainer, labeled, predict, answered.labels)
         trainer.fit(labeled.train.to(trainer.device), held_out, log)
         scores = before | _test_scores(trainer, labeled, _test_images(settings, data))
         if CLASSIFIER in trainer.architecture:
-            scores["test/agreement"] = _agreement(settings, trainer, data.test)
+            kept = scores["test/accuracy"]
+            if labeled is data:
+                kept = evaluate(trainer.selected, answered.to(trainer.device))["accuracy"]
+            scores["test/agreement"] = kept
+            name, count = settings.train.init_from, len(data.test)
+            console.info("agreement with %s on %d held-out images: %.4f", name, count, kept)
             if log:
                 export(folder / WEIGHTS, trainer.selected.network)
                 console.info("network.load_state_dict(torch.load(%r)) loads the result", str(folder / WEIGHTS))
@@ -130,15 +145,18 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
     data, cache = settings.data, TensorCache(cache_folder(settings.train.cache))
-    base = None if data.size else _initial(settings)
-    size = data.size or (base[1]["architecture"]["size"] if base else SIZE)
     skip = settings.evaluate.skip_unreadable
+
+    def size() -> int:
+        base = None if data.size else _initial(settings)
+        return data.size or (base[1]["architecture"]["size"] if base else SIZE)
+
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
-        "folder": lambda: load_folder(data.path, size, data.test_fraction, skip, data.workers),
-        UNLABELED: lambda: load_unlabeled(data.path, size, data.test_fraction, skip, data.workers),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, size, data.seed, cache),
+        "folder": lambda: load_folder(data.path, size(), data.test_fraction, skip, data.workers),
+        UNLABELED: lambda: load_unlabeled(data.path, size(), data.test_fraction, skip, data.workers),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, size(), data.seed, cache),
     }
     require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)
@@ -154,23 +172,12 @@ def _initial(settings: ExperimentSettings) -> Base:
     return load_initial(init_from, settings.weights, settings.data.size) if init_from else None
 
 
-def _answered(settings: ExperimentSettings, trainer: Trainer, split: Split) -> Split:
+def _answered(predict: Predict, trainer: Trainer, split: Split) -> Split:
     """Images with the answers of the network begun with as labels."""
-    return Split(split.images, _initial_logits(settings, trainer, split).argmax(1))
-
-
-def _initial_logits(settings: ExperimentSettings, trainer: Trainer, split: Split) -> torch.Tensor:
-    predict, classes = _initial_predictor(settings, trainer), len(trainer.architecture["classes"])
-    batches = torch.arange(len(split)).split(BATCH)
+    batches, classes = torch.arange(len(split)).split(BATCH), len(trainer.architecture["classes"])
     images = progress(split.squares(batches), "predictions", len(batches))
-    return torch.cat([compute_logits(predict, batch, classes, trainer.device) for batch in images])
-
-
-def _agreement(settings: ExperimentSettings, trainer: Trainer, test: Split) -> float:
-    """The fraction of the test images to which the selected network gives the answer of the one begun with."""
-    agreement = evaluate(trainer.selected, _answered(settings, trainer, test).to(trainer.device))["accuracy"]
-    console.info("agreement with %s on %d held-out images: %.4f", settings.train.init_from, len(test), agreement)
-    return agreement
+    logits = [compute_logits(predict, batch, classes, trainer.device) for batch in images]
+    return Split(split.images, torch.cat(logits).argmax(1))
 
 
 def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
@@ -218,7 +225,7 @@ def build_trainer(
     if base:
         start_from(network, facts, *base)
     if settings.train.freeze:
-        freeze(network.network if isinstance(network, Normalized) else network, settings.train.freeze)
+        freeze(without_normalization(network), settings.train.freeze)
     model = MixedPrecision(network.to(device), precision)
     batch = to_unit(data.train.sample(settings.train.batch_size))
     torch.set_num_threads(threads or choose_threads(model, batch))
@@ -274,7 +281,7 @@ def _test_images(settings: ExperimentSettings, data: DataSet) -> str:
     return f"{kind}, not of the network's {others} other classes" if others else kind
 
 
-def _initial_predictor(settings: ExperimentSettings, trainer: Trainer) -> Callable[[torch.Tensor], torch.Tensor]:
+def _initial_predictor(settings: ExperimentSettings, trainer: Trainer) -> Predict:
     """The network begun with, whose logits are cached under a hash of weights and images, for all runs."""
     model, device = cast(MixedPrecision, trainer.initial), trainer.device
     is_foreign = settings.model.name.startswith(PYTHON)  # whose code may change unseen
@@ -291,14 +298,13 @@ def _initial_predictor(settings: ExperimentSettings, trainer: Trainer) -> Callab
     return predict
 
 
-def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
-    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs."""
-    if not trainer.initial or utils.rank():
-        return {}
-    logits = _initial_logits(settings, trainer, data.test)
-    accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
+def _scores_before(
+    settings: ExperimentSettings, trainer: Trainer, data: DataSet, predict: Predict, answers: torch.Tensor
+) -> dict[str, float]:
+    """Score the network of train.init_from by its answers (N,) to the test set and, in the folder BEFORE, on the
+    photographs."""
+    accuracy = (answers == data.test.labels).float().mean().item()
     console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, _test_images(settings, data))
-    predict = _initial_predictor(settings, trainer)
     _score_photographs(settings, predict, data, trainer.folder / BEFORE, trainer.device)
     return {"test/accuracy_before": accuracy}
 

@@ -146,25 +146,25 @@ def load_timm(model: str, weights: Path | None) -> Classifier:
 
     InputError without the package, for an unknown name, other classes, weights that do not fit and a failed download.
     """
-    classifier = build_timm(model)
     if weights:
-        return fill(classifier, read_weights(weights), weights)
+        return fill(build_timm(model), read_weights(weights), weights)
     try:
-        state = _required("timm", classifier.name).create_model(model, pretrained=True).state_dict()
+        return build_timm(model, pretrained=True)
+    except InputError:
+        raise
     except Exception as error:  # no network, no room, no such set of weights
         reason = in_one_line(error)
-        raise InputError(f"classifier={classifier.name} cannot be downloaded ({reason}): give weights=FILE") from error
-    return fill(classifier, state, "timm")
+        raise InputError(f"classifier=timm:{model} cannot be downloaded ({reason}): give weights=FILE") from error
 
 
-def build_timm(model: str, size: int | None = None) -> Classifier:
-    """With fresh weights."""
+def build_timm(model: str, size: int | None = None, pretrained: bool = False) -> Classifier:
+    """With fresh weights, or those that timm downloads."""
     name, classes = f"timm:{model}", imagenet_classes()
     timm = _required("timm", f"timm:{model}")
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
         raise InputError(f"classifier={name} is not a network of timm: choose one, such as {choices}")
-    network = timm.create_model(model)
+    network = timm.create_model(model, pretrained=pretrained)
     facts = network.pretrained_cfg
     if network.num_classes != len(classes):
         raise InputError(f"classifier={name} has {network.num_classes} classes: choose one of ImageNet's 1,000")

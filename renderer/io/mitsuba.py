@@ -7,8 +7,8 @@ is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` g
 Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
 and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
 here, a concave mesh has dark places there. Gloss is its `principled`, with the same lobe; its diffuse part is Disney's,
-which loses nothing to the coat: the color is scaled by what ours keeps on average, and 1 to 3 % are left. Fresnel's
-term is not Schlick's. Its radiance is premultiplied with alpha, as ours with the coverage.
+which loses nothing to the coat: the color is scaled by what ours keeps on average, and 1 to 3 % are left. Its
+radiance is premultiplied with alpha, as ours with the coverage.
 """
 
 import math
