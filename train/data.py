@@ -18,6 +18,7 @@ from train.image_files import RESIDENT, ImageFiles
 from train.photographs.folder import Photograph, find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
+HELD_OUT = 1000  # unlabeled images at most: agreement to a percent, from folders of any length
 
 
 @dataclass(frozen=True)
@@ -175,10 +176,11 @@ def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: boo
 
 
 def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int) -> DataSet:
-    """All images of a folder and its sub-folders, of no class yet: every label is 0."""
+    """All images of a folder and its sub-folders, of no class yet: every label is 0. At most HELD_OUT are for tests."""
     _, images = _read(Path(path), find_unlabeled(Path(path)), size, skip_unreadable, workers)
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
-    held_out = held_out_rows(split, test_fraction, seed=0, key="data.test_fraction")
+    fraction = min(test_fraction, HELD_OUT / len(split))
+    held_out = held_out_rows(split, fraction, seed=0, key="data.test_fraction")
     return DataSet((), split[~held_out], split[held_out])
 
 

@@ -127,16 +127,19 @@ def training_loss(
 
     The loss is the mean `label_loss` plus, by their weights, the `ranking_loss` of the class `label` and the
     `divergence` from the teacher's predictions: on renders, of all classes but `label`, or none without a label.
-    Unless the data are labeled, only renders have a `label_loss`.
+    Unless the data are labeled, only renders have a `label_loss`, and the teacher's answers are the others' labels.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
         logits = model(to_unit(images))
-        losses = label_loss(logits, labels, settings.label_smoothing)
-        loss = (losses if labeled else losses * rendered).mean()
         if teacher is not None:
             with torch.no_grad():
                 targets = teacher(to_unit(images))
+            if not labeled:
+                labels = torch.where(rendered, labels, targets.argmax(1))
+        losses = label_loss(logits, labels, settings.label_smoothing)
+        loss = (losses if labeled else losses * rendered).mean()
+        if teacher is not None:
             changed = divergence(logits, targets) * ~rendered
             if label is not None:
                 kept = torch.arange(logits.shape[1], device=logits.device) != label

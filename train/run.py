@@ -19,6 +19,7 @@ from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
 from train.cache import TensorCache, cache_folder
 from train.data import (
+    HELD_OUT,
     DataSet,
     Split,
     channel_statistics,
@@ -113,11 +114,14 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         before: dict[str, float] = {}
         if trainer.initial:
             predict = _initial_predictor(settings, trainer)
-            answered = _answered(predict, trainer, data.test)
+            answers = _answers(predict, trainer, data.test)
+            answered = Split(data.test.images, answers)
             if settings.data.name == UNLABELED:
-                labeled = DataSet(data.classes, _answered(predict, trainer, data.train), answered)
+                labels = data.train.labels.clone()  # of the others, the loss asks the teacher
+                labels[held_out] = _answers(predict, trainer, data.train[held_out])
+                labeled = DataSet(data.classes, Split(data.train.images, labels), answered)
             if utils.rank() == 0:
-                before = _scores_before(settings, trainer, labeled, predict, answered.labels)
+                before = _scores_before(settings, trainer, labeled, predict, answers)
         trainer.fit(labeled.train.to(trainer.device), held_out, log)
         scores = before | _test_scores(trainer, labeled, _test_images(settings, data))
         if CLASSIFIER in trainer.architecture:
@@ -172,19 +176,20 @@ def _initial(settings: ExperimentSettings) -> Base:
     return load_initial(init_from, settings.weights, settings.data.size) if init_from else None
 
 
-def _answered(predict: Predict, trainer: Trainer, split: Split) -> Split:
-    """Images with the answers of the network begun with as labels."""
+def _answers(predict: Predict, trainer: Trainer, split: Split) -> torch.Tensor:
+    """(N,) the classes that the network begun with gives."""
     batches, classes = torch.arange(len(split)).split(BATCH), len(trainer.architecture["classes"])
     images = progress(split.squares(batches), "predictions", len(batches))
     logits = [compute_logits(predict, batch, classes, trainer.device) for batch in images]
-    return Split(split.images, torch.cat(logits).argmax(1))
+    return torch.cat(logits).argmax(1)
 
 
 def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
     """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
     the smallest along its ancestors, since parts of one seed are nested, or None where `base` does not know its own."""
     asked, init_from = settings.data.validation, settings.train.init_from
-    fraction = VALIDATION if asked is None else asked
+    most = HELD_OUT / len(split) if settings.data.name == UNLABELED else 1.0
+    fraction = min(VALIDATION, most) if asked is None else asked
     rendered = {"data": "shapes"} if settings.data.name == "shapes" else {}
     own = {"fraction": fraction, "seed": 0, "images": split.content_hash, **rendered}
     if base is None:

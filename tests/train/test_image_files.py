@@ -92,9 +92,12 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
     assert all(torch.equal(*pair) for batch in zip(batches[1:], rest, strict=True) for pair in zip(*batch, strict=True))
 
 
-def test_nothing_of_a_large_folder_is_read_before_it_is_shown(tmp_path):
+def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(b"no image")
     for number in range(9):
         (tmp_path / f"{number}.png").symlink_to("a.png")
     data = load_unlabeled(str(tmp_path), 224, 0.2, False, 0)
     assert (len(data.train), len(data.test), data.size) == (8, 2, 224)
+    monkeypatch.setattr("train.data.HELD_OUT", 1)
+    data = load_unlabeled(str(tmp_path), 224, 0.2, False, 0)
+    assert (len(data.train), len(data.test)) == (9, 1)

@@ -75,6 +75,17 @@ def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_di
     torch.testing.assert_close(ranked, loss + 4 * (q * (q / p).log()).sum() / 6)
 
 
+def test_unlabeled_images_have_the_teachers_answers_as_labels_but_no_cross_entropy(model, images):
+    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    settings = TrainSettings(init_from="base", distillation=4.0, ranking=2.0)
+    answers = torch.where(rendered, LABELS, teacher(images / 255).argmax(1))
+    label = int(answers[-1])
+    labeled, hits = training_loss(model.eval(), settings, label, teacher)(images, answers, rendered)
+    cross_entropy = F.cross_entropy(model(images / 255)[2:], answers[2:], reduction="sum") / 6
+    unlabeled = training_loss(model, settings, label, teacher, labeled=False)(images, LABELS * rendered, rendered)
+    torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
+
+
 def test_the_ranking_is_added_by_its_weight(model, images):
     labels = LABELS - 1  # two of "anything but class 0"
     alone, both = (
