@@ -12,7 +12,7 @@ from augment.utils import generator
 from train.data import Split
 from train.image_files import ImageFiles
 
-PADDING = 4
+PADDING = 4  # pixels by which an image is shifted at most; above 64 pixels per side, a sixteenth of them
 CHUNK_BYTES = 2**24  # of the batches that are cropped at once
 FLIPS = ("random", "alternating")
 Batches = Sequence[Tensor]
@@ -52,14 +52,15 @@ def training_batches(
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """This process's shard of a round's batches: images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
 
-    Shuffles, reflect-pads by 4 and crops, then flips half: "random" ones, or "alternating", each image in every
-    other epoch. All batches have one shape; the last one is filled up with the round's first images. All draws are made
-    on the CPU, the same for every device and number of processes. first: the batch to begin with.
+    Shuffles, shifts by up to `PADDING`, mirrored at the border, then flips half: "random" ones, or "alternating", each
+    image in every other epoch. All batches have one shape; the last one is filled up with the round's first images. All
+    draws are made on the CPU, the same for every device and number of processes. first: the batch to begin with.
     """
     (split, data, renders), rows = images, now.rows
     order = rows[torch.randperm(len(rows), generator=generator(seed, now.number, "batches"))]
     order = order[torch.arange(math.ceil(len(rows) / batch_size) * batch_size) % len(rows)].view(-1, batch_size)
-    shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
+    most = max(PADDING, split.images.shape[-1] // 16)
+    shifts = torch.randint(-most, most + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
     if flips == "random":
         flipped = torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
     else:

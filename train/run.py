@@ -221,7 +221,6 @@ def build_trainer(
         if shape.get("name", name) != name:
             raise InputError(f"model={shape['name']}: train.init_from={base[0]} has its own network: leave it out")
         shape = {"name": name, CLASSIFIER: True}
-    precision = choose_precision(settings.train.precision, device)
     images = data.train.images
     mean, std = channel_statistics(images if isinstance(images, torch.Tensor) else data.train.sample(SAMPLED))
     torch.manual_seed(stream_seed(settings.seed, "weights"))
@@ -231,7 +230,7 @@ def build_trainer(
         start_from(network, facts, *base)
     if settings.train.freeze:
         freeze(without_normalization(network), settings.train.freeze)
-    model = MixedPrecision(network.to(device), precision)
+    model = MixedPrecision(network.to(device), choose_precision(settings.train.precision, device, network))
     batch = to_unit(data.train.sample(settings.train.batch_size))
     torch.set_num_threads(threads or choose_threads(model, batch))
     service = build_service(settings, data, device)
@@ -309,7 +308,9 @@ def _scores_before(
     """Score the network of train.init_from by its answers (N,) to the test set and, in the folder BEFORE, on the
     photographs."""
     accuracy = (answers == data.test.labels).float().mean().item()
-    console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, _test_images(settings, data))
+    if settings.data.name != UNLABELED:  # whose labels are these answers
+        images = _test_images(settings, data)
+        console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, images)
     _score_photographs(settings, predict, data, trainer.folder / BEFORE, trainer.device)
     return {"test/accuracy_before": accuracy}
 

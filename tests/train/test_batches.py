@@ -38,15 +38,17 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flippe
         assert torch.equal(image, expected.flip(2) if flipped else expected)
 
 
-def test_shifts_and_flips_are_all_drawn_about_equally_often():
-    count, size, middle = 6000, 11, 5
-    pixel = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
-    (images, *_), *_ = training_batches(numbered(pixel), count, 0, epoch_round(count, 0))
-    rows = images[:, 0, middle].long()
-    flipped = rows[:, middle - 1] > rows[:, middle + 1]
+@pytest.mark.parametrize("size, most, count", [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)])
+def test_shifts_and_flips_are_all_drawn_about_equally_often(size, most, count):
+    middle, places = size // 2, torch.arange(size, dtype=torch.uint8)
+    pixels = torch.stack([*torch.meshgrid(places, places, indexing="ij"), torch.zeros(size, size, dtype=torch.uint8)])
+    shown = training_batches(numbered(pixels.expand(count, -1, -1, -1)), 300, 0, epoch_round(count, 0))
+    around = torch.cat([images[:, :2, middle, middle - 1 : middle + 2] for images, *_ in shown]).long()
+    flipped = around[:, 1, 0] > around[:, 1, 2]
     assert binomtest(int(flipped.sum()), count).pvalue > 1e-4
-    counts = rows[:, middle].bincount(minlength=size * size).view(size, size)[1:-1, 1:-1]
-    assert counts.sum() == count and chisquare(counts.flatten()).pvalue > 1e-4
+    rows, columns = around[..., 1].T - middle + most
+    counts = (rows * (2 * most + 1) + columns).bincount()
+    assert len(counts) == (2 * most + 1) ** 2 and chisquare(counts).pvalue > 1e-4
 
 
 def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():

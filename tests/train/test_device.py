@@ -83,6 +83,9 @@ def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, where, 
     expected = "bfloat16" if supported else "float32" if where.type == "cpu" else "float16"
     assert choose_precision("auto", where) == expected
     assert choose_precision("float32", where) == "float32"
+    grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
+    assert choose_precision("auto", where, grouped) == expected
+    assert choose_precision("auto", where, depthwise) == ("float32" if where.type == "cpu" else expected)
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
