@@ -8,7 +8,8 @@ python -m benchmarks.sides make --data DATA --sides SIDES --packages packages
 python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides SIDES
 python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
 
-DATA has meshes/, hdri/, photos/ and cifar100.npz.
+DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is an arm: of several seeds, the table has the mean,
+the lowest and the highest.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import zipfile
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -37,9 +39,11 @@ from train.lab.shots import LabSettings
 from train.loop import evaluate
 from train.networks import load_run
 from train.photographs.folder import TABLE
-from train.photographs.metrics import METRICS, OVERALL, RANKED, find_metric, interval, metric_title, pool_by
+from train.photographs.metrics import METRICS, OVERALL, metric_title, pool_by
 from train.photographs.predictions import PREDICTIONS, read_predictions
 from train.photographs.scoring import evaluate_photographs
+from train.report.compare import Evaluation, difference, mean_metric
+from train.report.summary import summarize
 from train.tables import Table, format_interval
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
@@ -134,14 +138,14 @@ def make(args: argparse.Namespace) -> None:
             print(name, write_laboratory(LabSettings(out=str(args.sides / name), **settings)), "renders")
 
 
-def log_looks(args: argparse.Namespace, folders: list[Path]) -> None:
+def log_looks(args: argparse.Namespace, networks: list[str], folders: list[Path]) -> None:
     """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
     looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
         images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for name in args.networks:
+    for name in networks:
         weights = content_hash(load_run(name).state_dict())[:12]
         if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights)]:
             print(f"{name} was looked at for {args.table!r} before, on {', '.join(days)}")
@@ -156,41 +160,47 @@ def score(args: argparse.Namespace) -> None:
     side = {"choose": "choosing", "report": "reporting"}[args.command]
     folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
     folders = [folder for folder in folders if not args.part or folder.name in args.part]
+    arms = {name: sorted(str(path.parent) for path in Path(name).glob("*/best.pt")) or [name] for name in args.networks}
     if side == "reporting":
-        log_looks(args, folders)
-    lines = []
-    outs = {path: Path("runs/sides", side, path.strip("/").replace("/", "_")) for path in args.networks}
-    for path, out in outs.items():
-        network = load_run(path)
-        model = MixedPrecision(network, choose_precision("auto", torch.device("cpu")))
+        log_looks(args, [run for runs in arms.values() for run in runs], folders)
+    lines, scored = [], {}
+    for arm, runs in arms.items():
+        models = [MixedPrecision(load_run(run), choose_precision("auto", torch.device("cpu"))) for run in runs]
         for folder in folders:
-            options = {"by": BY.get(folder.name, "mesh"), "point": network.operating_point}
-            given = model, network.classes, folder, LABEL, out / folder.name, network.size
-            summary = evaluate_photographs(*given, **options)
-            for name, group in {"all": summary, **summary["by_source"], **summary.get("by_mesh", {})}.items():
-                cells = (format_interval(find_metric(group, metric)) for metric in METRICS)
-                lines.append([path, folder.name, Path(name).stem, *cells])
+            group = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
+            scored[arm, folder] = group
+            for name in group[0].pools:
+                cells = (format_interval(mean_metric(group, name, metric)) for metric in METRICS)
+                lines.append([arm, folder.name, Path(name).stem or "all", *cells])
         if args.data:
             data = load_npz(str(args.data / "cifar100.npz"))
             split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
-            lines.append(
-                [path, "CIFAR-100", "accuracy", evaluate(model, split)["accuracy"], *[""] * (len(METRICS) - 1)]
-            )
-    for name in (folder.name for folder in folders):
-        files = (out / name / PREDICTIONS for out in outs.values())
-        first, *others = (pool_by(read_predictions(file, LABEL), LABEL, "source")[OVERALL] for file in files)
-        for path, pool in zip(args.networks[1:], others, strict=True):  # intervals of the same draws
-            ends = {metric: interval(pool.replicates[metric] - first.replicates[metric]) for metric in RANKED}
-            values = {m: find_metric(pool.metrics, m)["value"] - find_metric(first.metrics, m)["value"] for m in ends}
-            cells = (format_interval({"value": values.get(m), **ends.get(m, {})}, "+") for m in METRICS)
-            lines.append([f"{path} - {args.networks[0]}", name, "all", *cells])
+            values = [evaluate(model, split)["accuracy"] for model in models]
+            spread = {"low": min(values), "high": max(values)} if len(values) > 1 else {}
+            accuracy = format_interval({"value": fmean(values), **spread})
+            lines.append([arm, "CIFAR-100", "accuracy", accuracy, *[""] * (len(METRICS) - 1)])
+    first, *others = arms
+    for folder in folders:
+        for arm in others:
+            pair = scored[arm, folder], scored[first, folder]
+            cells = (format_interval(difference(*pair, OVERALL, metric), "+") for metric in METRICS)
+            lines.append([f"{arm} - {first}", folder.name, "all", *cells])
     print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
+
+
+def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> Evaluation:
+    """A run's predictions on a folder, pooled by object or source."""
+    network, by = model.network, BY.get(folder.name, "mesh")
+    out, point = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name), network.operating_point
+    evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by, point=point)
+    predictions, threshold = read_predictions(out / PREDICTIONS, LABEL), point.threshold if point else None
+    return Evaluation(summarize(Path(run)), pool_by(predictions, LABEL, by, threshold=threshold))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=["make", "choose", "report"])
-    parser.add_argument("networks", nargs="*", help="run folders, or names under pretrained/")
+    parser.add_argument("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
     for option in ("--data", "--sides", "--packages"):
         parser.add_argument(option, type=Path, required=option == "--sides")
     parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
