@@ -37,7 +37,8 @@ NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on 
 
 
 class Crossings(NamedTuple):
-    """K places where a silhouette runs between neighboring samples, the nearest of those between the same two.
+    """K places where a silhouette runs between neighboring samples; of several between the same two, the one next to
+    the sample that sees farther, which no other hides.
 
     ends: (2, K), its vertices. fraction: (K,), of the way between them. normal: (2, K), of unit length. horizontal:
     (K,) bool, the neighbors lie in a row; otherwise in a column. cells: (2, K), the neighbors' row-major positions
@@ -188,10 +189,11 @@ def _crossings(
         first, second = nearness[ends[:, edge]]
         near = first + fraction * (second - first)
         place = start[:, edge] + fraction * (end - start)[:, edge]
-        beside = _plane_nearness(fragments, places, nearness, samples, place).min(axis=0)
-        seen = np.flatnonzero((samples >= 0).any(axis=0) & (near >= beside - tolerance))
-        seen = seen[np.lexsort([-near[seen], after[seen]])]
-        seen = seen[np.diff(after[seen], prepend=-1) != 0]  # the nearest between the same samples
+        beside = _plane_nearness(fragments, places, nearness, samples, place)
+        seen = np.flatnonzero((samples >= 0).any(axis=0) & (near >= beside.min(axis=0) - tolerance))
+        onward = np.where(beside[0] < beside[1], 1, -1) * place[axis]  # away from the farther sample
+        seen = seen[np.lexsort([onward[seen], after[seen]])]
+        seen = seen[np.diff(after[seen], prepend=-1) != 0]  # one between the same two samples
         horizontal = np.full(len(seen), axis == 0)
         parts.append(
             (ends[:, edge[seen]], fraction[seen], normal[:, edge[seen]], horizontal, cells[:, seen], samples[:, seen])
