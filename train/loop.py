@@ -86,6 +86,7 @@ class Trainer:
         self.ema = MovingAverage(model, settings.ema_decay) if settings.ema_decay else None
         mean = {"avg_fn": get_swa_avg_fn(), "use_buffers": True}  # Wortsman et al. 2022, "Model soups"
         self.soup = AveragedModel(model, **mean) if settings.soup else None
+        self._latest = settings.soup or not labeled  # a soup has all epochs in it; agreement is best with no training
         average = self.soup or self.ema
         self.selected = cast(MixedPrecision, average.module) if average else model
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
@@ -103,7 +104,8 @@ class Trainer:
         self._validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
 
     def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
-        """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
+        """Train to the last epoch; best.pt holds the network of the best validation, or the last of a soup or without
+        labels.
 
         split: on the trainer's device. held_out: (N,) bool on the CPU, which of its images validate. log: of the
         process that writes. InputError where training diverges; `Interrupted`, after a checkpoint, by a signal.
@@ -201,7 +203,7 @@ class Trainer:
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         before = [line["validation/accuracy"] for line in self.history]
-        if validated["accuracy"] > max(before, default=-1) or self.soup:  # a soup has all epochs in it
+        if validated["accuracy"] > max(before, default=-1) or self._latest:
             weights = {name: value.to("cpu", copy=True) for name, value in self.selected.network.state_dict().items()}
             self._best = {"model": weights, **self._description(), "validation_accuracy": validated["accuracy"]}
         if log and len(state.renders.labels):

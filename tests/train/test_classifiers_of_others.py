@@ -88,6 +88,11 @@ def test_a_network_that_hardly_moves_keeps_its_answers_at_no_loss(tuned):
     assert read_metrics(folder)[0]["train/loss"] > 0.01
 
 
+def test_unlabeled_data_keep_the_last_network_whose_agreement_is_no_better(tuned):
+    folder, scores = tuned("unlabelled", "train.learning_rate=1e-12", "train.epochs=2")
+    assert [line["validation/accuracy"] for line in read_metrics(folder)[:2]] == [1, 1] and scores["test/epoch"] == 2
+
+
 def test_labeled_folders_are_scored_in_the_networks_classes_before_and_after(tuned, weights, photos):
     _, scores = tuned("folder", "train.learning_rate=1e-12")
     assert scores["test/agreement"] == 1 and scores["test/accuracy"] == scores["test/accuracy_before"]
