@@ -1,7 +1,10 @@
 """Losses: the cost that an attack decreases, and those of training.
 
-A label is a class, or any class but one (a complementary label), written −1 − class.
+A label is a class, or any class but one (a complementary label), written −1 − class. Where several classes are under
+study, `absent` holds the others that images of a complementary label do not show, either.
 """
+
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -44,13 +47,16 @@ def require_known(labels: Tensor, logits: Tensor) -> None:
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
 
-def label_loss(logits: Tensor, labels: Tensor, label_smoothing: float = 0.0) -> Tensor:
-    """(N,) cross entropy where a label is a class c, and −log(1 − p_c) where it is complementary to c.
+def label_loss(logits: Tensor, labels: Tensor, label_smoothing: float = 0.0, absent: Sequence[int] = ()) -> Tensor:
+    """(N,) cross entropy where a label is a class c, and −log(1 − p_c) where it is complementary to c; with p_c and the
+    probabilities of `absent` added.
 
     logits: (N, classes). labels: (N,) int64. label_smoothing: of the cross entropy alone.
     """
     classes = _class_of(labels)[:, None]
     others = logits.scatter(1, classes, -torch.inf)
+    for index in absent:
+        others[:, index] = -torch.inf
     complementary = logits.logsumexp(1) - others.logsumexp(1)
     entropy = F.cross_entropy(logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing)
     return torch.where(labels < 0, complementary, entropy)
@@ -79,9 +85,12 @@ def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     return F.kl_div(logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True).sum(1)
 
 
-def is_right(predicted: Tensor, labels: Tensor) -> Tensor:
+def is_right(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
     """Whether classes agree with labels, both (N,) int64; boolean."""
-    return (predicted == _class_of(labels)) != (labels < 0)
+    right = (predicted == _class_of(labels)) != (labels < 0)
+    for index in absent:
+        right = right & ((labels >= 0) | (predicted != index))
+    return right
 
 
 def _class_of(labels: Tensor) -> Tensor:

@@ -160,11 +160,10 @@ class Renders(Dataset[tuple[Tensor, Tensor]]):
 class AugmentationService:
     """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
 
-    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`. label:
-    the class that hard negatives are attacked towards, where there are any: these are the examples of all other
-    labels. None: every attack leads away from the example's own class. rank, world_size: of this process among those
-    that train together; each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W) uint8, of
-    arm="folder".
+    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`. studied:
+    the classes that hard negatives, the examples of all other labels, are attacked towards, in turn. Without any, every
+    attack leads away from the example's own class. rank, world_size: of this process among those that train together;
+    each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W) uint8, of arm="folder".
     """
 
     settings: AugmentationSettings
@@ -172,7 +171,7 @@ class AugmentationService:
     labels: Tensor
     seed: int
     phases: Phases
-    label: int | None = None
+    studied: Sequence[int] = ()
     rank: int = 0
     world_size: int = 1
     images: Tensor | None = None
@@ -277,14 +276,17 @@ class AugmentationService:
             logits = logits_of(preprocessed_model, images, self.settings.attack.batch_size)
         logits = utils.merged(logits, shard, len(labels), self.world_size)[:, 0]
         require_known(labels, logits)
-        success = ~is_right(logits.argmax(1), labels)
-        return success, {"attack_success": _mean(success), "loss": _mean(label_loss(logits, labels))}
+        success = ~is_right(logits.argmax(1), labels, self.studied[1:])
+        loss = label_loss(logits, labels, absent=self.studied[1:])
+        return success, {"attack_success": _mean(success), "loss": _mean(loss)}
 
     def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         attack, goal = self.settings.attack, Goal(self.labels[:, None])
-        if self.label is not None:
+        if self.studied:
+            studied = torch.tensor(self.studied, device=self.labels.device)
             source = torch.where(self.labels < 0, NO_CLASS, self.labels)
-            target = torch.where(self.labels == self.label, NO_CLASS, self.label)
+            in_turn = studied[torch.arange(len(self.labels), device=self.labels.device) % len(studied)]
+            target = torch.where(torch.isin(self.labels, studied), NO_CLASS, in_turn)
             goal = Goal(source[:, None], target[:, None])
         start = self._last_values
         if start is None:

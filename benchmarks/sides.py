@@ -192,9 +192,12 @@ def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> Evalu
     """A run's predictions on a folder, pooled by object or source."""
     network, by = model.network, BY.get(folder.name, "mesh")
     out, point = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name), network.operating_point
-    evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by, point=point)
-    predictions, threshold = read_predictions(out / PREDICTIONS, LABEL), point.threshold if point else None
-    return Evaluation(summarize(Path(run)), pool_by(predictions, LABEL, by, threshold=threshold))
+    points = [point] if point else []
+    evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by, points=points)
+    thresholds = {point.label: point.threshold for point in points}
+    return Evaluation(
+        summarize(Path(run)), pool_by(read_predictions(out / PREDICTIONS, LABEL), by, thresholds=thresholds)
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> None:

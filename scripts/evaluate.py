@@ -6,6 +6,7 @@ classifier= takes any other network, by a name that pnb-attack knows.
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
@@ -13,6 +14,7 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from augment.classifiers import load_classifier
+from augment.classifiers.adapter import label_names
 from renderer.errors import InputError, require_choice
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
@@ -29,7 +31,7 @@ class Settings:
     classifier: str | None = None  # instead of run, any other network, by a name that conf/attack.yaml explains
     weights: str | None = None  # the classifier's local weights file, if it brings none
     photos: str = MISSING  # a folder of class folders, or of images of `label`; pretrained/laboratory is installed
-    label: str = "orange"  # the class whose recall and false positives count, and that of a flat folder's images
+    label: Any = "orange"  # the class whose recall and false positives count, or several; that of a flat folder
     out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
     false_positive_rate: float | None = None  # for a threshold on the log-odds of `label`, chosen on calibrate
     calibrate: str | None = None  # a folder like photos; null: the threshold that a published network carries, if any
@@ -54,17 +56,20 @@ def main(settings: Settings) -> None:
         network = load_classifier(str(settings.classifier), settings.weights)
     else:
         network = load_run(settings.run, settings.weights, settings.model)
-    network.label(settings.label)  # or InputError that names the network
+    labels = label_names(settings.label)
+    for name in labels:
+        network.label(name)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
-    label, point, options = settings.label, network.operating_point, (network.size, settings.skip_unreadable, device)
+    points = [network.operating_point] if network.operating_point else []
+    options = network.size, settings.skip_unreadable, device
     with sole_writer("out", out):
         if settings.calibrate and settings.false_positive_rate:
             folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
-            point = scoring.choose_operating_point(model, network.classes, folder, label, rate, *options)
-        point = point if point and point.label == label else None
+            points = scoring.choose_operating_points(model, network.classes, folder, labels, rate, *options)
+        points = points if [point.label for point in points] == labels else []
         photos, by = published(Path(settings.photos)), settings.by
-        summary = scoring.evaluate_photographs(model, network.classes, photos, label, out, *options, by, point)
+        summary = scoring.evaluate_photographs(model, network.classes, photos, labels, out, *options, by, points)
     print(f"{scoring.format_summary(summary)}\n\ntable, scores and image: {out}")
 
 

@@ -59,7 +59,7 @@ def main(settings: Settings) -> None:
         network.half().float()  # as it is published
         folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
         options = network.classes, folder, settings.label, rate, network.size, False, "cpu"
-        point = scoring.choose_operating_point(network, *options)
+        (point,) = scoring.choose_operating_points(network, *options)
         state["operating_point"] = asdict(point)
         print(f"threshold {point.threshold:.3f} for {scoring.describe_point(state['operating_point'])}")
     out.mkdir(parents=True, exist_ok=True)

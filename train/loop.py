@@ -72,7 +72,7 @@ class Trainer:
         if settings.batch_size % (processes * parts):
             divisor = f"{processes} processes × train.accumulate={parts}"
             raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
-        if settings.ranking and service.label is None:
+        if settings.ranking and not service.studied:
             raise InputError("train.ranking ranks hard negatives: name some in scene.hard_negatives or augment.folder")
         self.settings, self.architecture, self.service, self.folder = settings, architecture, service, folder
         self.phases, self.seed, self.epoch = service.phases, service.seed, 0
@@ -95,7 +95,7 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=model.precision == "float16")
         compiled = compiles(settings.compile, self.device)
         teacher = self.initial if settings.distillation else None
-        self._loss = training_loss(replica, settings, service.label, teacher, labeled)
+        self._loss = training_loss(replica, settings, service.studied, teacher, labeled)
         if compiled:
             torch.compiler.reset()  # since torch limits the graphs of all runs of a process
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)

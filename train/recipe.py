@@ -1,7 +1,7 @@
 """How a network is trained: settings, learning-rate schedules, the loss, averaged weights, baseline augmentations."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,14 +120,14 @@ def freeze(network: nn.Module, stage: str) -> None:
 
 
 def training_loss(
-    model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None, labeled: bool = True
+    model: nn.Module, settings: TrainSettings, studied: Sequence[int], teacher: nn.Module | None, labeled: bool = True
 ) -> Loss:
     """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and how many
     predictions are correct.
 
-    The loss is the mean `label_loss` plus, by their weights, the `ranking_loss` of the class `label` and the
-    `divergence` from the teacher's predictions: on renders, of all classes but `label`, or none without a label.
-    Unless the data are labeled, only renders have a `label_loss`, and the teacher's answers are the others' labels.
+    The loss is the mean `label_loss` plus, by their weights, the mean `ranking_loss` of the classes `studied` and the
+    `divergence` from the teacher's predictions: on renders, of all classes but these, or none without any. Unless the
+    data are labeled, only renders have a `label_loss`, and the teacher's answers are the others' labels.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,17 +137,19 @@ def training_loss(
                 targets = teacher(to_unit(images))
             if not labeled:
                 labels = torch.where(rendered, labels, targets.argmax(1))
-        losses = label_loss(logits, labels, settings.label_smoothing)
+        losses = label_loss(logits, labels, settings.label_smoothing, studied[1:])
         loss = (losses if labeled else losses * rendered).mean()
         if teacher is not None:
             changed = divergence(logits, targets) * ~rendered
-            if label is not None:
-                kept = torch.arange(logits.shape[1], device=logits.device) != label
+            if studied:
+                classes = torch.arange(logits.shape[1], device=logits.device)
+                kept = torch.stack([classes != label for label in studied]).all(0)
                 changed = changed + divergence(logits[:, kept], targets[:, kept]) * rendered
             loss = loss + settings.distillation * changed.mean()
-        if label is not None and settings.ranking:
-            loss = loss + settings.ranking * ranking_loss(logits, labels, label)
-        return loss, is_right(logits.detach().argmax(1), labels).sum()
+        if studied and settings.ranking:
+            ranked = sum(ranking_loss(logits, labels, label) for label in studied)
+            loss = loss + settings.ranking * ranked / len(studied)
+        return loss, is_right(logits.detach().argmax(1), labels, studied[1:]).sum()
 
     return loss_and_hits
 

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from augment import utils
 from augment.build import build_scene
-from augment.classifiers.adapter import class_index
+from augment.classifiers.adapter import class_index, label_names
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, progress, stream_seed
@@ -137,8 +137,10 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
         for name, summary in summaries.items():
             console.info("%s: %s", name, format_summary(summary))
-            metrics = {metric: find_metric(summary, metric).get("value") for metric in ("top5", *METRICS)}
-            scores |= {f"{name}/{metric}": value for metric, value in metrics.items() if value is not None}
+            parts = {name: summary} | {f"{name}/{label}": part for label, part in summary.get("by_label", {}).items()}
+            for key, part in parts.items():
+                metrics = {metric: find_metric(part, metric).get("value") for metric in ("top5", *METRICS)}
+                scores |= {f"{key}/{metric}": value for metric, value in metrics.items() if value is not None}
         if log:
             log.scalars(scores)
         return scores
@@ -244,35 +246,41 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
     """The scene, its labels and the service that regenerates its renders; logs the rasterizer."""
     scene, images, labels = None, None, torch.zeros(0, dtype=torch.int64, device=device)
     phases, process = Phases(device), (utils.rank(), utils.world_size())
-    ranked = class_index(data.classes, settings.label, "label") if settings.scene.hard_negatives else None
+    names = label_names(settings.label)
+    ranks = bool(settings.scene.hard_negatives) or len(names) > 1
+    studied = [class_index(data.classes, name, "label") for name in names if ranks or settings.augment.renders]
     if settings.augment.renders and settings.augment.arm == "folder":
         images, labels = (part.to(device) for part in load_renders(settings, data))
-        ranked = class_index(data.classes, settings.label, "label") if len(labels.unique()) > 1 else None
+        ranks = len(labels.unique()) > 1
     elif settings.augment.renders:
-        label, objects = class_index(data.classes, settings.label, "label"), settings.objects
+        objects = settings.objects
         named = {item.label: key for key, item in objects.items() if item.label != OTHER}
         numbers = {name: class_index(data.classes, name, f"label of {key}") for name, key in named.items()}
-        numbers[OTHER] = complementary_label(label)
+        numbers[OTHER] = complementary_label(studied[0])  # the service and the loss know the others
         rasterizer = chosen_rasterizer(settings.renderer)
         console.info("rasterizer: %s", rasterizer.description)
         options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
             scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
-    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process, images)
+    if len(studied) == len(data.classes) and (labels < 0).any():
+        raise InputError(f"label={settings.label} leaves no class of the network for other things: leave these out")
+    towards = studied if ranks else ()
+    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, towards, *process, images)
 
 
 def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[torch.Tensor, torch.Tensor]:
     """The images (N, 3, size, size) uint8 of the folder `augment.folder`, and their labels (N,) by the names of its
-    folders. InputError: as `find_photographs` and `load_photographs`, or no image of the class under study."""
-    folder, label = Path(str(settings.augment.folder)), class_index(data.classes, settings.label, "label")
+    folders. InputError: as `find_photographs` and `load_photographs`, or no image of a class under study."""
+    folder, studied = Path(str(settings.augment.folder)), label_names(settings.label)
     with keyed("augment.folder"):
-        found = find_photographs(folder, data.classes, settings.label)
+        found = find_photographs(folder, data.classes, studied)
         found, images, _ = load_photographs(folder, found, data.size, advice="")
-        foreign, numbers = complementary_label(label), {name: index for index, name in enumerate(data.classes)}
+        numbers = {name: index for index, name in enumerate(data.classes)}
+        foreign = complementary_label(numbers[studied[0]])
         labels = torch.tensor([numbers.get(item.label, foreign) for item in found])
-        if not (labels == label).any():
-            raise InputError(f"{folder} holds no image of label={settings.label}: add a folder of them")
+        if missing := set(studied) - {item.label for item in found}:
+            raise InputError(f"{folder} holds no image of label={min(missing)}: add a folder of them")
     return images, labels
 
 

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from augment.build import RendererSettings, SceneSettings, count_views
+from augment.classifiers.adapter import label_names
 from augment.objects import ObjectSettings
 from augment.service import AugmentationSettings
 from augment.utils import announced, world_size
@@ -68,7 +69,8 @@ class DataSettings:
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """hard_negatives: like meshes, of other classes than `label`; of no class, unless a mapping names one."""
+    """hard_negatives: like meshes, of other classes than `label`, or of one of several; of no class, unless a mapping
+    names one."""
 
     meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0", "solid:orange:1"])
     backgrounds: list[Any] = field(default_factory=lambda: [0.0, 0.25, 0.5, 0.75, 1.0])
@@ -123,13 +125,13 @@ class EvaluationSettings:
 
 @dataclass
 class ExperimentSettings:
-    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study. weights: of the classifier
-    that `train.init_from` names. compare: arms beside it."""
+    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study, or several. weights: of the
+    classifier that `train.init_from` names. compare: arms beside it."""
 
     run: str = ""
     sweep: str = "runs/sweep"
     seed: int = 0
-    label: str = "orange"
+    label: Any = "orange"  # str | list[str], a union that OmegaConf has no type for
     weights: str | None = None
     compare: list[str] = field(default_factory=list)
     data: DataSettings = field(default_factory=DataSettings)
@@ -142,6 +144,7 @@ class ExperimentSettings:
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
+        label_names(self.label)
         if self.augment.renders and self.augment.arm != "folder":
             self.augment.examples = self.views * self.scene.objects * len(self.scene.backgrounds)
             require_range("meshes × views × backgrounds", self.augment.examples, 1, MOST_IMAGES)
@@ -155,14 +158,21 @@ class ExperimentSettings:
     @property
     def objects(self) -> dict[str, ObjectSettings]:
         """By their keys, the meshes of the scene, and its hard negatives, of the class OTHER where they name none."""
+        labels = label_names(self.label)
         objects = {
             f"scene.{key}[{index}]": read_object(item, label, index, f"scene.{key}")
-            for key, label in (("meshes", self.label), ("hard_negatives", OTHER))
+            for key, label in (("meshes", labels[0] if len(labels) == 1 else ""), ("hard_negatives", OTHER))
             for index, item in enumerate(getattr(self.scene, key))
         }
         for key, item in objects.items():
-            if key.startswith("scene.hard_negatives") and item.label == self.label:
-                raise InputError(f"{key} is of the class {self.label}: name it in scene.meshes, or leave it out")
+            item.label = item.label or solid_name(item.mesh)
+            if not item.label:
+                raise InputError(f"{key} must name its class: give {{mesh: {item.mesh}, label: CLASS}}")
+            if key.startswith("scene.hard_negatives") and [item.label] == labels:
+                raise InputError(f"{key} is of the class {item.label}: name it in scene.meshes, or leave it out")
+        missing = set(labels) - {item.label for item in objects.values()}
+        if missing and len(labels) > 1:
+            raise InputError(f"label={self.label} has no mesh of {min(missing)}: name one in scene.meshes")
         return objects
 
 
@@ -170,6 +180,12 @@ def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "
     """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own class."""
     keys = item if isinstance(item, dict) else {"mesh": item}
     return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
+
+
+def solid_name(mesh: str) -> str:
+    """The NAME of solid:NAME or solid:NAME:SEED; "" of a file."""
+    kind, name, *_ = [*mesh.split(":"), ""]
+    return name if kind == "solid" else ""
 
 
 def quoted(text: str) -> str:

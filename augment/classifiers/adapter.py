@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
+Label = str | Sequence[str]  # the class under study, or several
+
+
 @dataclass(frozen=True)
 class OperatingPoint:
     """A threshold on the log-odds of the class `label`: images above it are taken for the class.
@@ -126,6 +129,14 @@ class Normalized(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         ordered = images.flip(1) if self.bgr else images
         return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
+
+
+def label_names(label: Label) -> list[str]:
+    """The classes under study. InputError: none, or one twice."""
+    names = [str(name) for name in (label if isinstance(label, list | tuple) else [label])]
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"label=[{', '.join(names)}] must name a class, or several, each once")
+    return names
 
 
 def class_index(classes: Sequence[str], name: str, key: str) -> int:

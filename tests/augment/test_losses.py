@@ -33,6 +33,15 @@ def test_a_class_costs_the_cross_entropy_in_a_batch_with_complementary_labels():
     torch.testing.assert_close(label_loss(LOGITS, mixed)[::2], expected[::2], rtol=16 * EPS, atol=16 * EPS)
 
 
+def test_a_complementary_label_leaves_out_the_other_classes_under_study_too_and_changes_no_other_loss():
+    expected = -np.log1p(-softmax(LOGITS.numpy(), axis=1)[:, [1, 4]].sum(1))
+    labels = torch.full((6,), complementary_label(1))
+    torch.testing.assert_close(label_loss(LOGITS, labels, absent=[4]), torch.from_numpy(expected))
+    assert torch.equal(label_loss(LOGITS, CLASSES, absent=[4]), label_loss(LOGITS, CLASSES))
+    assert is_right(torch.arange(5), torch.full((5,), complementary_label(1)), [4]).tolist() == [1, 0, 1, 1, 0]
+    assert is_right(torch.arange(5), torch.full((5,), 4), [4]).tolist() == [0, 0, 0, 0, 1]
+
+
 def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
     assert torch.autograd.gradcheck(lambda logits: label_loss(logits, EXCLUDED), LOGITS.clone().requires_grad_(True))
     certain = torch.tensor([[100.0, 0.0, 0.0]], requires_grad=True)

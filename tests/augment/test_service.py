@@ -69,9 +69,11 @@ def model(scene, labels) -> nn.Module:
 
 @pytest.fixture
 def serve(scene, labels):
-    def service(seed: int = 0, labels: Tensor = labels, label: int | None = None, **settings) -> AugmentationService:
+    def service(
+        seed: int = 0, labels: Tensor = labels, studied: tuple[int, ...] = (), **settings
+    ) -> AugmentationService:
         choices = AugmentationSettings(**{"attack": SHORT, **settings})
-        return AugmentationService(choices, scene, labels, seed, Phases(), label)
+        return AugmentationService(choices, scene, labels, seed, Phases(), studied)
 
     return service
 
@@ -268,15 +270,27 @@ def test_a_data_set_with_labels_of_any_kind_goes_into_batches_with_renders(kind,
 def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_it(serve, scene, model, labels):
     """Tables are complementary to a plate: there every step raises the plate's probability."""
     other = torch.where(labels == 0, labels, complementary_label(0))
-    renders = serve(labels=other, label=0).regenerate(model, 0)
+    renders = serve(labels=other, studied=(0,)).regenerate(model, 0)
     sides = render(scene, LIGHT.expand(100, -1, -1)), renders.images
     before, after = (logits_of(model, images).softmax(1)[:, 0] for images in sides)
     rises = torch.where(labels == 0, before - after, after - before)
     assert (rises >= -1e-5).all() and (rises[labels == 0] > 0).any() and (rises[labels != 0] > 0).any()
     assert torch.equal(renders.labels, other)
-    renders = serve(label=0).regenerate(model, 0)  # tables with their class succeed as plates alone
+    renders = serve(studied=(0,)).regenerate(model, 0)  # tables with their class succeed as plates alone
     success = (logits_of(model, renders.images).argmax(1) == 0) == (labels != 0)
     assert renders.diagnostics["attack_success"] == pytest.approx(success.double().mean())
+
+
+def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(serve, scene, model, labels):
+    other = torch.where(labels == 0, complementary_label(1), labels)  # plates are of neither class, tables of theirs
+    images = serve(labels=other, studied=(1, 2)).regenerate(model, 0).images
+    sides = render(scene, LIGHT.expand(100, -1, -1)), images
+    rises = logits_of(model, sides[1]).softmax(1) - logits_of(model, sides[0]).softmax(1)
+    turns = torch.arange(100) % 2
+    for turn, target in enumerate((1, 2)):
+        towards = rises[(labels == 0) & (turns == turn), target]
+        assert (towards >= -1e-5).all() and (towards > 0).any()
+    assert (rises[labels == 2, 2] <= 1e-5).all()
 
 
 def test_attack_examples_are_new_successes_before_and_after(serve, scene, model):

@@ -95,6 +95,13 @@ def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
         assert path.read_bytes() == (tmp_path / "other_orange" / path.name).read_bytes()
 
 
+def test_each_setup_shows_an_object_of_each_of_several_classes_and_one_other(tmp_path):
+    lab.write_laboratory(settings(tmp_path, label=["orange", "pear"], setups=2))
+    for setup in ("0", "1"):
+        labels = sorted(Path(row["path"]).parent.name for row in rows(tmp_path) if row["setup"] == setup)
+        assert labels == ["orange", "other_lemon", "pear"]
+
+
 def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_else():
     for name in ("orange", "pear", *HARD_NEGATIVES):
         expected = name if name in SOLIDS else f"other_{name}"
@@ -106,6 +113,7 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
     ("changes", "message"),
     [
         ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of another class"),
+        ({"label": ["orange", "apple"]}, "meshes: name at least one of label=apple and one of another class"),
         ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, r"meshes\[0\]: the label '.*x' names the"),
         ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label: give {mesh: fruit.glb, label: "),
         ({"setups": 5}, "setups=5 must be a multiple of the 2 patterns"),

@@ -61,7 +61,7 @@ def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_di
     """The teacher's probabilities q are a constant: Σ q log(q / p)."""
     rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
     settings = TrainSettings(init_from="base", label_smoothing=smoothing, distillation=4.0)
-    loss, hits = training_loss(model.eval(), settings, None, teacher)(images, LABELS, rendered)
+    loss, hits = training_loss(model.eval(), settings, (), teacher)(images, LABELS, rendered)
     logits = model(images / 255)
     p, q = logits[2:].softmax(1), teacher(images[2:] / 255).softmax(1)
     uniform, divergence = -F.log_softmax(logits, 1).mean(), (q * (q / p).log()).sum() / 6
@@ -71,7 +71,7 @@ def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_di
 
     kept = [0, 2, 3]  # on renders, the classes beside the label, among themselves
     p, q = logits[:2, kept].softmax(1), teacher(images[:2] / 255)[:, kept].softmax(1)
-    ranked = training_loss(model, settings, 1, teacher)(images, LABELS, rendered)[0]
+    ranked = training_loss(model, settings, (1,), teacher)(images, LABELS, rendered)[0]
     torch.testing.assert_close(ranked, loss + 4 * (q * (q / p).log()).sum() / 6)
 
 
@@ -79,20 +79,36 @@ def test_unlabeled_images_have_the_teachers_answers_as_labels_but_no_cross_entro
     rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
     settings = TrainSettings(init_from="base", distillation=4.0, ranking=2.0)
     answers = torch.where(rendered, LABELS, teacher(images / 255).argmax(1))
-    label = int(answers[-1])
-    labeled, hits = training_loss(model.eval(), settings, label, teacher)(images, answers, rendered)
+    studied = (int(answers[-1]),)
+    labeled, hits = training_loss(model.eval(), settings, studied, teacher)(images, answers, rendered)
     cross_entropy = F.cross_entropy(model(images / 255)[2:], answers[2:], reduction="sum") / 6
-    unlabeled = training_loss(model, settings, label, teacher, labeled=False)(images, LABELS * rendered, rendered)
+    unlabeled = training_loss(model, settings, studied, teacher, labeled=False)(images, LABELS * rendered, rendered)
     torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
 
 
 def test_the_ranking_is_added_by_its_weight(model, images):
     labels = LABELS - 1  # two of "anything but class 0"
     alone, both = (
-        training_loss(model.eval(), TrainSettings(ranking=weight), 1, None)(images, labels, labels == 0)[0]
+        training_loss(model.eval(), TrainSettings(ranking=weight), (1,), None)(images, labels, labels == 0)[0]
         for weight in (0.0, 4.0)
     )
     torch.testing.assert_close(both, alone + 4 * ranking_loss(model(images / 255), labels, 1))
+
+
+def test_several_classes_are_ranked_alike_and_left_out_of_the_teachers_predictions_on_renders(model, images):
+    labels, rendered = torch.tensor([1, 3, 0, 2, 1, -2]), torch.arange(6) > 1
+    teacher = WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    logits, answers = model.eval()(images / 255), teacher(images / 255)
+    settings = TrainSettings(init_from="base", ranking=4.0, distillation=2.0)
+    loss, hits = training_loss(model, settings, (1, 3), teacher)(images, labels, rendered)
+    entropy = F.cross_entropy(logits[:5], labels[:5], reduction="sum") - logits.softmax(1)[5, [0, 2]].sum().log()
+    ranked = (ranking_loss(logits, labels, 1) + ranking_loss(logits, labels, 3)) / 2
+    q, p = answers[:2].softmax(1), logits[:2].softmax(1)
+    others, kept = answers[2:, [0, 2]].softmax(1), logits[2:, [0, 2]].softmax(1)
+    kept_answers = ((q * (q / p).log()).sum() + (others * (others / kept).log()).sum()) / 6
+    torch.testing.assert_close(loss, entropy / 6 + 4 * ranked + 2 * kept_answers)
+    predicted = logits.argmax(1)
+    assert hits == (predicted[:5] == labels[:5]).sum() + (int(predicted[5]) not in (1, 3))
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)

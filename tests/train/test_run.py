@@ -14,12 +14,16 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
+from augment.build import build_scene
 from augment.losses import complementary_label
 from renderer.errors import InputError
+from renderer.image import to_bytes
 from train import batches, checkpoint, loop, run
 from train.errors import one_sentence
 from train.networks import load_run, load_selected
 from train.processes import Interrupted
+from train.report.compare import format_table
+from train.report.page import write_report
 from train.report.summary import summarize
 from train.run import load_data, prepare
 from train.run_folder import read_metrics
@@ -239,6 +243,39 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
 
 
+def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(tiny, tmp_path, read_markdown, monkeypatch):
+    """On renders of other instances before other backgrounds. The run is stopped within its first epoch and resumed;
+    the network that it begins with knows neither class. Tables and page have a row for both and one for each."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
+    shown = [(f"solid:{name}:5", name) for name in ("apple", "pear")]
+    scene = build_scene(shown, 16, 3, backgrounds=[0.3, 0.6], rasterizer="numpy")
+    images = scene.render(scene.conditions(torch.arange(len(scene))), torch.arange(len(scene)))[:, 0]
+    for number, (name, image) in enumerate(zip(scene.labels, images, strict=True)):
+        (tmp_path / "photos" / name).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(to_bytes(image).permute(1, 2, 0).numpy()).save(tmp_path / "photos" / name / f"{number}.png")
+    train(tiny("augment=none", "train.epochs=1"), tmp_path / "base")
+    keys = [f"train.init_from={tmp_path / 'base'}", f"evaluate.photos={tmp_path / 'photos'}", "train.resume=true"]
+    keys += ["label=[apple,pear]", "scene.meshes=['solid:apple','solid:pear']", "train.ranking=1", "train.epochs=6"]
+    settings, folder = (
+        tiny(*keys, "augment=random", "augment.warm_start=false", "augment.examples=24"),
+        tmp_path / "run",
+    )
+    with pytest.raises(Interrupted):
+        train_with_signal(settings, folder, 0, 2, signal.SIGTERM)
+    scores, names = train(settings, folder), ["random", "random, label=apple", "random, label=pear"]
+    before = json.loads((folder / "before" / "photographs" / "summary.json").read_text())["by_label"]
+    for label, part in before.items():
+        assert scores[f"photographs/{label}/recall"] > 0.4 > 0.1 > part["recall"]["value"]
+    summary = summarize(folder)
+    (_, scored, differences) = read_markdown(format_table([summary])).values()
+    assert [row[0] for row in scored if row[0] in names] == names
+    for row, part in zip(scored[-3:], ["", "apple/", "pear/"], strict=True):
+        assert row[4].partition(" ")[0] == f"{scores[f'photographs/{part}auc']:.3f}"
+    assert [row[0].rpartition(", ")[2] for row in differences[2:]] == ["label=apple", "label=pear"]
+    page = write_report([folder], folder).read_text()
+    assert page.count("<td>random, label=pear</td>") == 1 and "apple and pear, trained with renders" in page
+
+
 def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(finished):
     config = OmegaConf.load(finished / "config.yaml")
     assert config.hardware == {"device": "cpu", "precision": "float32", "threads": 1}
@@ -308,7 +345,13 @@ def test_a_folders_images_train_in_place_of_renders_and_a_resumed_run_shows_thos
             pixels = rng.integers(0, 256, (16, 16, 3)).astype(np.uint8)
             Image.fromarray(pixels).save(tmp_path / "lab" / name / f"{number}.png")
             by_image[pixels.tobytes()] = label
-    keys = [f"augment.folder={tmp_path / 'lab'}", "augment.warm_start=false", "train.resume=true", "train.ranking=1"]
+    keys = [
+        f"augment.folder={tmp_path / 'lab'}",
+        "augment.warm_start=false",
+        "train.resume=true",
+        "train.ranking=1",
+        "train.epochs=6",
+    ]
     settings = tiny("augment=folder", *keys, "train.epochs=2", "augment.every=27", "augment.examples=4")
     train(settings, tmp_path / "whole")
     shown, rounds = [], list(regenerated)

@@ -90,6 +90,9 @@ def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
     assert str(refusal.value).startswith(sentence) and "\n" not in str(refusal.value)
 
 
+BOTH = ["label=[orange,pear]", "scene.meshes=['solid:orange','solid:pear']", "augment.examples=null", "scene.views=1"]
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -104,6 +107,29 @@ def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
+        ([*BOTH, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
+        (
+            [*BOTH, "label=[orange,pear,orange]"],
+            "label=[orange, pear, orange] must name a class, or several, each once",
+        ),
+        (["label=[]"], "label=[] must name a class, or several, each once"),
+        (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple: name one in scene.meshes"),
+        (
+            [*BOTH, "scene.meshes=[a.glb,'solid:pear']"],
+            "scene.meshes[0] must name its class: give {mesh: a.glb, label",
+        ),
+        (
+            [*BOTH, "label=[orange,pear,apple]", "scene.hard_negatives=['solid:fruit','solid:apple']"],
+            "label=['orange', 'pear', 'apple'] has no mesh of apple",
+        ),
+        (
+            [
+                *BOTH,
+                "label=[orange,pear,apple]",
+                "scene.hard_negatives=['solid:fruit',{mesh: 'solid:apple', label: apple}]",
+            ],
+            "leaves no class of the network for other things: leave these out",
+        ),
         (["augment=folder", "augment.folder=/no/lab"], "augment.folder: /no/lab is not a folder"),
         (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),
     ],

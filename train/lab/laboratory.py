@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from augment.classifiers.adapter import label_names
 from augment.objects import load_object
 from augment.utils import progress, stream_seed
 from renderer.errors import InputError
@@ -28,7 +29,7 @@ from train.lab.patterns import RESOLUTION
 from train.lab.shots import FOV, LabSettings, Shot, draw_shots
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
-from train.settings import read_object
+from train.settings import read_object, solid_name
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
@@ -113,16 +114,17 @@ def write_laboratory(settings: LabSettings) -> int:
     """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
 
     The folder has class folders of PNG files, photos.csv and lab.json, as `train.photographs` reads them. InputError: a
-    folder that is not empty; meshes that cannot be read or have no label; no mesh of the label under study, or no
-    other; Mitsuba is not installed.
+    folder that is not empty; meshes that cannot be read or have no label; no mesh of a label under study, or no other;
+    Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
     subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
     environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
-    positives = [subject for subject in subjects if subject[0] == settings.label]
-    negatives = [subject for subject in subjects if subject[0] != settings.label]
-    if not (positives and negatives):
-        raise InputError(f"meshes: name at least one of label={settings.label} and one of another class")
+    labels = label_names(settings.label)
+    groups = {label: [subject for subject in subjects if subject[0] == label] for label in labels}
+    others = [subject for subject in subjects if subject[0] not in labels]
+    if missing := [label for label, group in groups.items() if not group or (len(labels) == 1 and not others)]:
+        raise InputError(f"meshes: name at least one of label={missing[0]} and one of another class")
     slides = [decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy() for path in settings.slides]
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
@@ -131,7 +133,7 @@ def write_laboratory(settings: LabSettings) -> int:
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             seed = stream_seed(settings.seed, "samples", number) % 2**32
-            for subjects in (positives, negatives):
+            for subjects in filter(None, (*groups.values(), others)):
                 label, mesh, parts = subjects[number % len(subjects)]
                 radiance = path_traced(parts, shot, settings.size, settings.spp, settings.bounces, seed)
                 image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
@@ -161,9 +163,8 @@ def read_subject(item: str | dict[str, Any], index: int) -> tuple[str, str, list
     InputError: as `load_object`; a file without a label; a label that is not a folder's name.
     """
     settings = read_object(item, "", index, "meshes")
-    kind, name, *_ = [*settings.mesh.split(":"), ""]
-    label = settings.label
-    if not label and kind == "solid":
+    label, name = settings.label, solid_name(settings.mesh)
+    if not label and name:
         label = FOREIGN + name if name in HARD_NEGATIVES else name
     if not label:
         raise InputError(f"meshes[{index}] has no label: give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}")

@@ -38,9 +38,9 @@ class LabSettings:
     whose label is a class, or other_NAME if the network lacks it."""
 
     out: str = MISSING  # a new folder, for photos= of pnb-evaluate
-    label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
+    label: Any = "orange"  # the class under study, or several: an object of each and one other stand in each setup
     meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])  # 6 oranges, 10 others
-    setups: int = 180  # draws of light, camera and pose; two renders each
+    setups: int = 180  # draws of light, camera and pose; with one label, two renders each
     patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # projected, for as many setups each; two: a+b
     slides: list[str] = field(default_factory=list)  # image files that the pattern `slides` projects
     environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each

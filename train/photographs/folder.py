@@ -12,7 +12,7 @@ from typing import NoReturn
 import numpy as np
 import torch
 
-from augment.classifiers.adapter import class_index, nearest
+from augment.classifiers.adapter import Label, class_index, label_names, nearest
 from augment.utils import progress, require_memory
 from renderer.errors import InputError, in_one_line
 from renderer.io.images import read_square
@@ -47,21 +47,25 @@ def require_outside(out: Path, folder: Path) -> None:
         raise InputError(f"out={out} lies inside the photographs' folder: choose another")
 
 
-def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
+def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
     """The images of a folder, sorted by path, each with its class.
 
     The folder holds either a sub-folder per class, named as in `classes` (or `other_NAME` for a class that the model
-    lacks), or images only, which are then all of class `label`. Sub-folders are searched to any depth, through symbolic
-    links, too; hidden files and other kinds of file (`left_out`) are skipped. An optional `photos.csv` gives sources in
+    lacks), or images only, which are then all of class `label`, if that is one. Sub-folders are searched to any depth,
+    through symbolic links, too; hidden files and other kinds (`left_out`) are skipped. A `photos.csv` gives sources in
     its columns `path` and `source_tag`; its column `hard_negatives` names further sources, separated by `;`, and `mesh`
     the object, over which intervals are taken, too.
 
     InputError: the folder is missing, unreadable, empty or mixes both layouts; a sub-folder or `label` is not a class;
     `photos.csv` lacks its columns, contradicts itself, or names no file of the folder or a source without images.
     """
-    class_index(classes, label, "label")
+    only, *others = label_names(label)
+    for name in (only, *others):
+        class_index(classes, name, "label")
     paths, files = _image_files(folder)
     nested = _has_class_folders(folder, paths, classes)
+    if others and not nested:
+        raise InputError(f"{folder} has no class folders, and label names several classes: put its images into some")
     rows = _read_table(folder / TABLE)
     if unknown := sorted(rows.keys() - set(files)):
         fault = f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, like {unknown[0]}"
@@ -69,7 +73,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
             raise InputError(f"{fault}; give paths such as {paths[0]}")
         console.warning(fault)
     photographs = [
-        Photograph(path, path.parts[0] if nested else label, *rows.get(path, (None, (), None))) for path in paths
+        Photograph(path, path.parts[0] if nested else only, *rows.get(path, (None, (), None))) for path in paths
     ]
     sources = {item.source for item in photographs}
     if missing := {name for item in photographs for name in item.hard_negatives} - sources:

@@ -1,9 +1,10 @@
 """The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property, partial, reduce
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ AT_THRESHOLD = ("recall_at_threshold", "false_positive_rate_at_threshold")  # of
 METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD)  # by their place in a summary or its sources
 TITLES = {"recall": "recall", "top5": "top-5", "false_positive_rate": "FPR", "auc": "AUC"}
 TITLES |= {"recall_at_threshold": "recall at threshold", "false_positive_rate_at_threshold": "FPR at threshold"}
+Thresholds = Mapping[str, float]  # by label
 OVERALL = ""  # in the place of a source: all images
+LABEL = "label="  # begins what stands there for all images and one of several labels
 GROUPS = ("source", "mesh")
 
 REPLICATES = 2000
@@ -121,17 +124,22 @@ def resampled(auc: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Pool:
-    """Predictions that are scored together: of the class under study, `label`, and of everything else.
+    """Predictions that are scored together: of photographs of the class under study, and of everything else.
 
-    ranked: the positives and the negatives of the ROC curve, which may be of other sources or meshes. threshold: on the
-    log-odds, for AT_THRESHOLD.
+    With several classes under study, a photograph counts once for each, by the prediction about it. ranked: the
+    positives and the negatives of the ROC curve, which may be of other sources or meshes. thresholds: on the log-odds
+    of each class, for AT_THRESHOLD; or none.
     """
 
-    label: str
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
     ranked: tuple[Sequence[Prediction], Sequence[Prediction]]
-    threshold: float | None = None
+    thresholds: Thresholds = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The classes under study, in words."""
+        return " or ".join(dict.fromkeys(item.label for item in (*self.positives, *self.negatives)))
 
     @property
     def scores(self) -> tuple[np.ndarray, np.ndarray]:
@@ -146,11 +154,11 @@ class Pool:
         outcomes = {
             "recall": (self.positives, [rank == 1 for rank in ranks]),
             "top5": (self.positives, [rank <= 5 for rank in ranks]),
-            "false_positive_rate": (self.negatives, [item.predicted == self.label for item in self.negatives]),
+            "false_positive_rate": (self.negatives, [item.predicted == item.label for item in self.negatives]),
         }
-        if self.threshold is not None:
+        if self.thresholds:
             for name, group in zip(AT_THRESHOLD, (self.positives, self.negatives), strict=True):
-                outcomes[name] = group, [item.log_odds > self.threshold for item in group]
+                outcomes[name] = group, [item.log_odds > self.thresholds[item.label] for item in group]
         return outcomes
 
     @cached_property
@@ -192,36 +200,45 @@ def _weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 def _objects(predictions: Sequence[Prediction]) -> np.ndarray:
     """The object of each image as a number, as `bootstrap` takes them; one of unknown mesh is an object of its own."""
-    numbers: dict[str | int, int] = {}
-    names = (item.photograph.mesh or index for index, item in enumerate(predictions))
+    numbers: dict[str | PurePosixPath, int] = {}
+    names = (item.photograph.mesh or item.photograph.path for item in predictions)
     return np.array([numbers.setdefault(name, len(numbers)) for name in names])
 
 
-def pool(predictions: Sequence[Prediction], label: str, threshold: float | None = None) -> Pool:
+def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None) -> Pool:
     """All predictions, the positives ranked against all negatives."""
-    positives = [item for item in predictions if item.photograph.label == label]
-    negatives = [item for item in predictions if item.photograph.label != label]
-    return Pool(label, positives, negatives, (positives, negatives), threshold)
+    positives = [item for item in predictions if item.positive]
+    negatives = [item for item in predictions if not item.positive]
+    return Pool(positives, negatives, (positives, negatives), thresholds or {})
 
 
 def pool_by(
-    predictions: Sequence[Prediction], label: str, by: str, exclude: Sequence[str] = (), threshold: float | None = None
+    predictions: Sequence[Prediction], by: str, exclude: Sequence[str] = (), thresholds: Thresholds | None = None
 ) -> dict[str, Pool]:
-    """OVERALL, without the sources to exclude, and a pool per source or, of what is in OVERALL, per mesh.
+    """OVERALL, without the sources to exclude, and a pool per source or, of what is in OVERALL, per mesh or per label,
+    the class under study.
 
     A source's positives are ranked against its own negatives and those of the sources that the positives name as hard
     negatives, as far as those could be read; a mesh's images against all of the other kind.
     """
-    whole = pool([item for item in predictions if item.photograph.source not in exclude], label, threshold)
-    pools, items = {OVERALL: whole}, predictions if by == "source" else [*whole.positives, *whole.negatives]
-    for name in sorted({getattr(item.photograph, by) for item in items} - {None}):
-        group = pool([item for item in items if getattr(item.photograph, by) == name], label, threshold)
-        ranked = group.positives or whole.positives, group.negatives or whole.negatives
+    whole = pool([item for item in predictions if item.photograph.source not in exclude], thresholds)
+    pools, labels = {OVERALL: whole}, {item.label for item in predictions}
+    items = predictions if by == "source" else [*whole.positives, *whole.negatives]
+
+    def name_of(item: Prediction) -> str | None:
+        return item.label if by == "label" else getattr(item.photograph, by)
+
+    for name in sorted({name for item in items if (name := name_of(item)) is not None}):
+        group = pool([item for item in items if name_of(item) == name], thresholds)
+        if by == "mesh":
+            of_none = [item for item in group.negatives if item.photograph.label not in labels]
+            group = replace(group, ranked=(group.positives or whole.positives, of_none or whole.negatives))
         if by == "source":
-            named = {source for item in group.positives for source in item.photograph.hard_negatives} - {name}
-            others = pool([item for item in items if item.photograph.source in named], label).negatives
-            ranked = group.positives, [*group.negatives, *others]
-        pools[name] = replace(group, ranked=ranked)
+            pairs = {(item.label, source) for item in group.positives for source in item.photograph.hard_negatives}
+            named = pairs - {(label, name) for label, _ in pairs}
+            others = pool([item for item in items if (item.label, item.photograph.source) in named]).negatives
+            group = replace(group, ranked=(group.positives, [*group.negatives, *others]))
+        pools[name] = group
     return pools
 
 

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
+from augment.classifiers.adapter import Label, label_names
 from augment.losses import log_odds
 from augment.utils import eval_mode, progress
 from renderer.errors import InputError, in_one_line
@@ -21,13 +22,15 @@ Model = Callable[[torch.Tensor], torch.Tensor]
 
 @dataclass(frozen=True)
 class Prediction:
-    """The model's prediction for one photograph; ranks count from 1, the predicted class.
+    """The model's prediction for one photograph, about one class under study, `label`; ranks count from 1, the
+    predicted class.
 
     true_*: of the photograph's own class, None if the model lacks it. label_*, log_odds: of the class under study, the
     last against all other classes, by which photographs are ranked.
     """
 
     photograph: Photograph
+    label: str
     predicted: str
     probability: float
     true_probability: float | None
@@ -35,6 +38,11 @@ class Prediction:
     label_probability: float
     label_rank: int
     log_odds: float
+
+    @property
+    def positive(self) -> bool:
+        """Whether the photograph shows the class under study."""
+        return self.photograph.label == self.label
 
 
 def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str | torch.device) -> torch.Tensor:
@@ -57,41 +65,56 @@ def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str
 
 
 def predict(
-    photographs: Sequence[Photograph], logits: torch.Tensor, classes: Sequence[str], label: str
+    photographs: Sequence[Photograph], logits: torch.Tensor, classes: Sequence[str], labels: Sequence[str]
 ) -> list[Prediction]:
-    """Predictions from logits (N, C) in the order of `classes`; label: the class under study."""
+    """Predictions from logits (N, C) in the order of `classes`: about the first of `labels` for all photographs, then
+    about the next."""
     probabilities = logits.double().softmax(dim=1).tolist()
     # Ranks come from the logits, whose order survives where probabilities round to 0; ties go to the first.
     order = logits.argsort(dim=1, descending=True, stable=True)
-    ranks, studied = (order.argsort(dim=1) + 1).tolist(), classes.index(label)
-    odds = log_odds(logits.double(), studied).tolist()
+    ranks = (order.argsort(dim=1) + 1).tolist()
     predictions = []
-    for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
-        best, true = places.index(1), (None, None)
-        if photograph.label in classes:
-            index = classes.index(photograph.label)
-            true = by_class[index], places[index]
-        row = classes[best], by_class[best], *true, by_class[studied], places[studied], score
-        predictions.append(Prediction(photograph, *row))
+    for label in labels:
+        studied = classes.index(label)
+        odds = log_odds(logits.double(), studied).tolist()
+        for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
+            best, true = places.index(1), (None, None)
+            if photograph.label in classes:
+                index = classes.index(photograph.label)
+                true = by_class[index], places[index]
+            row = classes[best], by_class[best], *true, by_class[studied], places[studied], score
+            predictions.append(Prediction(photograph, label, *row))
     return predictions
 
 
-def write_predictions(path: Path, predictions: Sequence[Prediction], label: str) -> None:
-    """Write a row per photograph; None becomes an empty cell."""
+def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
+    """The predictions about each class under study."""
+    labels = dict.fromkeys(item.label for item in predictions)
+    return {label: [item for item in predictions if item.label == label] for label in labels}
+
+
+def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
+    """Write a row per photograph, with columns for each class under study; None becomes an empty cell."""
+    groups = by_label(predictions)
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *_columns(label)])
-        for prediction in predictions:
-            photograph, *cells = vars(prediction).values()
+        columns = dict.fromkeys(name for label in groups for name in _columns(label))
+        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
+        for items in zip(*groups.values(), strict=True):
+            cells: dict[str, object] = {}
+            for item in items:
+                photograph, label, *values = vars(item).values()
+                cells |= zip(_columns(label), values, strict=True)
             names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
-            writer.writerow([*names.values(), *cells])
+            writer.writerow([*names.values(), *cells.values()])
 
 
-def read_predictions(path: Path, label: str) -> list[Prediction]:
+def read_predictions(path: Path, label: Label) -> list[Prediction]:
     """The predictions that `write_predictions` wrote; InputError for another file, or one about another class."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return [_read_row(row, label) for row in csv.DictReader(file)]
+            rows = [*csv.DictReader(file)]
+            return [_read_row(row, name) for name in label_names(label) for row in rows]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         advice = f"score the photographs again, with label={label}"
         raise InputError(f"{path} cannot be used ({in_one_line(error)}): {advice}") from error
@@ -100,10 +123,10 @@ def read_predictions(path: Path, label: str) -> list[Prediction]:
 def _read_row(row: dict[str, str], label: str) -> Prediction:
     names = row["source"] or None, split_sources(row["hard_negatives"]), row.get("mesh") or None
     cells = (kind(row[name]) if row[name] else None for name, kind in _columns(label).items())
-    return Prediction(Photograph(PurePosixPath(row["path"]), row["label"], *names), *cells)  # type: ignore[arg-type]
+    return Prediction(Photograph(PurePosixPath(row["path"]), row["label"], *names), label, *cells)  # type: ignore[arg-type]
 
 
 def _columns(label: str) -> dict[str, Callable[[str], object]]:
-    """The columns of a prediction, in the order of its fields, with their types."""
+    """The columns of a prediction about a class, in the order of its fields, with their types."""
     predicted = {"predicted": str, "probability": float, "true_probability": float, "true_rank": int}
     return {**predicted, f"{label}_probability": float, f"{label}_rank": int, f"{label}_log_odds": float}

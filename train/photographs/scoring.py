@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.classifiers import OperatingPoint
+from augment.classifiers.adapter import Label, OperatingPoint, label_names
 from augment.utils import progress
 from renderer.errors import InputError, require_range
 from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
@@ -26,39 +26,41 @@ SUMMARY = "summary.json"
 WRONG_CLASSES = 5  # the most common ones, which are named
 COUNTED = ("recall", "top5", "false_positive_rate", "recall_at_threshold", "false_positive_rate_at_threshold")
 BY_CLASS = ("recall", "top5", "predicted_label")
+COUNTED_EACH = ", once for each of these classes"  # after the number of other things, with several labels
 Device = str | torch.device
 
 
 def _predict_folder(
-    model: Model, classes: Sequence[str], folder: Path, label: str, size: int, skip: bool, device: Device
+    model: Model, classes: Sequence[str], folder: Path, label: Label, size: int, skip: bool, device: Device
 ) -> tuple[list[Prediction], torch.Tensor, list[str], str]:
     """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all."""
     found = find_photographs(folder, classes, label)
     photographs, images, unreadable = load_photographs(folder, found, size, skip)
     logits = compute_logits(model, images, len(classes), device)
-    digest = hashlib.sha256(label.encode())
+    labels = label_names(label)
+    digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
         content = (folder / photograph.path).read_bytes()
         digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
-    return predict(photographs, logits, classes, label), images, unreadable, digest.hexdigest()
+    return predict(photographs, logits, classes, labels), images, unreadable, digest.hexdigest()
 
 
 def evaluate_photographs(
     model: Model,
     classes: Sequence[str],
     folder: Path,
-    label: str,
+    label: Label,
     out: Path,
     size: int = 32,
     skip_unreadable: bool = False,
     device: Device = "cpu",
     by: str = "source",
-    point: OperatingPoint | None = None,
+    points: Sequence[OperatingPoint] = (),
 ) -> dict[str, Any]:
     """Evaluate the model on every photograph of a folder; write the results, and return the summary.
 
     model, on `device`, takes (N, 3, size, size) float32 sRGB in [0, 1] and returns logits (N, len(classes)); a module
-    is called in eval mode and left in its own. folder, label: see `find_photographs`.
+    is called in eval mode and left in its own. folder, label: see `find_photographs`. points: of every label, or none.
 
     Written into `out`: predictions.csv, a row per photograph; contact_sheet.png; roc.csv and roc.png, the ROC curves
     overall and of each source that has positives and negatives; and summary.json, which is also returned:
@@ -70,6 +72,8 @@ def evaluate_photographs(
     - auc, recall_at: how well the log-odds of `label` separate its photographs from all others (`Pool.metrics`);
     - recall_at_threshold, false_positive_rate_at_threshold: at an operating point of `label`, where one is given; and
       operating_point, its fields, and in_sample: whether it was chosen on these very images;
+    - by_label, where `label` names several classes: these metrics of each. The others are then pooled (see `Pool`), and
+      operating_point is a list of one for each;
     - by_source, and by_mesh with by="mesh": n, and the metrics above of each known source or mesh (`pool_by`);
     - by_class: n, recall, top5, predicted_label (the fraction predicted as `label`) and most_common_wrong.
 
@@ -78,60 +82,67 @@ def evaluate_photographs(
     `compute_logits`, for `out` inside `folder`, and for by="mesh" where no mesh is known.
     """
     require_outside(out, folder)
-    scored = _predict_folder(model, classes, folder, label, size, skip_unreadable, device)
+    labels = label_names(label)
+    scored = _predict_folder(model, classes, folder, labels, size, skip_unreadable, device)
     predictions, images, unreadable, images_hash = scored
     if by == "mesh" and not any(item.photograph.mesh for item in predictions):
         raise InputError(f"by=mesh: {folder} has no {TABLE} with a column mesh: leave it out")
-    threshold = point.threshold if point else None
-    pools = {key: pool_by(predictions, label, key, threshold=threshold) for key in dict.fromkeys(("source", by))}
+    limits = {point.label: point.threshold for point in points}
+    several = len(labels) > 1
+    keys = dict.fromkeys([*(["label"] if several else []), "source", by])
+    pools = {key: pool_by(predictions, key, thresholds=limits) for key in keys}
     whole = pools["source"][OVERALL]
     metrics = {
         f"by_{key}": {name: group.metrics for name, group in progress(groups.items(), "intervals") if name != OVERALL}
         for key, groups in pools.items()
     }
     others = [str(path) for path in left_out(folder)]
-    chosen = {"operating_point": asdict(point) | {"in_sample": point.images == images_hash}} if point else {}
-    labels = sorted({item.photograph.label for item in predictions})
-    by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
+    chosen = [asdict(point) | {"in_sample": point.images == images_hash} for point in points]
+    photographs = predictions[: len(images)]  # by the predictions about one label
+    found = sorted({item.photograph.label for item in photographs})
+    by_class = {name: [item for item in photographs if item.photograph.label == name] for name in found}
     counts = {"positives": len(whole.positives), "negatives": len(whole.negatives)}
     summary = {
-        "label": label,
+        "label": labels if several else labels[0],
         "size": size,
         "images": images_hash,
         **whole.metrics,
-        **chosen,
-        "n": {"photographs": len(predictions), **counts, "unreadable": len(unreadable), "left_out": len(others)},
+        **({"operating_point": chosen if several else chosen[0]} if chosen else {}),
+        "n": {"photographs": len(photographs), **counts, "unreadable": len(unreadable), "left_out": len(others)},
         **metrics,
-        "by_class": {name: _class_metrics(group, label) for name, group in by_class.items()},
+        "by_class": {name: _class_metrics(group, labels) for name, group in by_class.items()},
         "unreadable": unreadable,
         "left_out": others,
     }
 
     out.mkdir(parents=True, exist_ok=True)
-    write_predictions(out / PREDICTIONS, predictions, label)
+    write_predictions(out / PREDICTIONS, predictions)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    contact_sheet(predictions, images, label).save(out / "contact_sheet.png")
-    curves = {source: group.scores for source, group in pools["source"].items()}
-    write_roc(out, {source: scores for source, scores in curves.items() if all(map(len, scores))}, label)
+    contact_sheet(predictions, images).save(out / "contact_sheet.png")
+    curves = {name: group.scores for name, group in next(iter(pools.values())).items()}
+    write_roc(out, {name: scores for name, scores in curves.items() if all(map(len, scores))}, " or ".join(labels))
     return summary
 
 
-def choose_operating_point(
-    model: Model, classes: Sequence[str], folder: Path, label: str, rate: float, size: int, skip: bool, device: Device
-) -> OperatingPoint:
-    """The lowest of the log-odds of `label` that at most the fraction `rate` of a folder's other images exceed.
+def choose_operating_points(
+    model: Model, classes: Sequence[str], folder: Path, label: Label, rate: float, size: int, skip: bool, device: Device
+) -> list[OperatingPoint]:
+    """The lowest of the log-odds of each label that at most the fraction `rate` of a folder's other images exceed.
 
     An image that ties with it does not exceed it. Arguments and InputError as of `evaluate_photographs`, and InputError
     for fewer than 1 / rate images of other things.
     """
     predictions, _, _, images_hash = _predict_folder(model, classes, folder, label, size, skip, device)
-    negatives = np.array([item.log_odds for item in predictions if item.photograph.label != label])
-    if len(negatives) * (exact := Fraction(str(rate))) < 1:
-        fault = f"calibrate={folder} has {len(negatives)} images of other things than {label}"
-        raise InputError(f"{fault}: give at least {math.ceil(1 / exact)} for false_positive_rate={rate}")
-    threshold = float(thresholds(negatives, np.ones(len(negatives), int), [str(rate)])[0])
-    return OperatingPoint(label, threshold, rate, folder.resolve().name, images_hash, len(negatives))
+    points = []
+    for name in label_names(label):
+        negatives = np.array([item.log_odds for item in predictions if item.label == name and not item.positive])
+        if len(negatives) * (exact := Fraction(str(rate))) < 1:
+            fault = f"calibrate={folder} has {len(negatives)} images of other things than {name}"
+            raise InputError(f"{fault}: give at least {math.ceil(1 / exact)} for false_positive_rate={rate}")
+        threshold = float(thresholds(negatives, np.ones(len(negatives), int), [str(rate)])[0])
+        points.append(OperatingPoint(name, threshold, rate, folder.resolve().name, images_hash, len(negatives)))
+    return points
 
 
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
@@ -141,6 +152,12 @@ def require_calibration(rate: float | None, calibrate: str | None) -> None:
     require_range("false_positive_rate", rate, 1e-6, 1 - 1e-6)
 
 
+def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Those of a summary: one, or one of each of several labels, or none."""
+    chosen = summary.get("operating_point", [])
+    return chosen if isinstance(chosen, list) else [chosen]
+
+
 def describe_point(point: Mapping[str, Any]) -> str:
     """How the `operating_point` of a summary was chosen."""
     others = f"{point['folder']}, {point['negatives']} others"
@@ -148,40 +165,43 @@ def describe_point(point: Mapping[str, Any]) -> str:
     return f"{point['false_positive_rate']:.1%} FPR on {where}"
 
 
-def _class_metrics(predictions: Sequence[Prediction], label: str) -> dict[str, Any]:
+def _class_metrics(predictions: Sequence[Prediction], labels: Sequence[str]) -> dict[str, Any]:
     ranks = [item.true_rank for item in predictions if item.true_rank is not None]
     wrong = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
     return {
         "n": len(predictions),
         "recall": fraction(ranks.count(1), len(ranks)),
         "top5": fraction(sum(rank <= 5 for rank in ranks), len(ranks)),
-        "predicted_label": fraction(sum(item.predicted == label for item in predictions), len(predictions)),
+        "predicted_label": fraction(sum(item.predicted in labels for item in predictions), len(predictions)),
         "most_common_wrong": dict(wrong.most_common(WRONG_CLASSES)),
     }
 
 
 def format_summary(summary: dict[str, Any]) -> str:
     """The summary of `evaluate_photographs` as Markdown tables, by mesh or source, without a newline at the end."""
-    label, n, files = summary["label"], summary["n"], summary["left_out"]
-    pools = {"all": summary, **summary.get("by_mesh", summary["by_source"])}
+    label, n, files = " or ".join(label_names(summary["label"])), summary["n"], summary["left_out"]
+    parts, groups = summary.get("by_label", {}), summary.get("by_mesh", summary["by_source"])
+    pools = [("all", summary), *parts.items(), *groups.items()]
     over = resampled(auc := summary["auc"])
     if over != "images":
         over += f" ({auc['positive_objects']} of {label} and {auc['negative_objects']} others)"
     counted = [key for key in COUNTED if key in summary]
-    counts = [[name, *(format_fraction(metrics[key]) for key in counted)] for name, metrics in pools.items()]
-    ranked = [[name, *(format_interval(find_metric(metrics, k)) for k in RANKED)] for name, metrics in pools.items()]
+    counts = [[name, *(format_fraction(metrics[key]) for key in counted)] for name, metrics in pools]
+    ranked = [[name, *(format_interval(find_metric(metrics, k)) for k in RANKED)] for name, metrics in pools]
     by_class = []
     for name, metrics in summary["by_class"].items():
         wrong = ", ".join(f"{other} {count}" for other, count in metrics["most_common_wrong"].items())
         by_class.append([name, *(format_fraction(metrics[key]) for key in BY_CLASS), wrong])
     paragraphs: list[object] = [
-        f"{n['positives']} images of {label}, {n['negatives']} of other things",
+        f"{n['positives']} images of {label}, {n['negatives']} of other things{COUNTED_EACH if parts else ''}",
         Table("95 % intervals over images", ["", *map(metric_title, counted)], counts),
         Table(f"95 % intervals over {over}", ["", *map(metric_title, RANKED)], ranked),
         Table("", ["class", "recall", "top-5", f"predicted {label}", "most common wrong classes"], by_class),
     ]
-    if point := summary.get("operating_point"):
-        paragraphs.append(f"threshold {point['threshold']:.3f} on the log-odds, chosen for {describe_point(point)}")
+    for point in operating_points(summary):
+        studied = f" of {point['label']}" if parts else ""
+        threshold = f"threshold {point['threshold']:.3f} on the log-odds{studied}"
+        paragraphs.append(f"{threshold}, chosen for {describe_point(point)}")
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
     if files:

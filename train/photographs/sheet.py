@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 
 from renderer.io.tiles import PAPER, Tile, draw_grid
 from train.photographs.metrics import RATES, auc_and_recalls, roc_curve
-from train.photographs.predictions import Prediction
+from train.photographs.predictions import Prediction, by_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,25 +25,27 @@ Item = TypeVar("Item")
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor, label: str) -> Image.Image:
-    """True positives, false negatives and false positives, up to PER_SECTION each, evenly by falling probability.
+def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
+    """Of each class under study, true positives, false negatives and false positives, up to PER_SECTION each, evenly
+    by falling probability.
 
     images: (N, 3, H, W) uint8 sRGB, enlarged without smoothing, so that one sees the pixels that the classifier saw.
     """
-    pairs = sorted(zip(predictions, images, strict=True), key=lambda pair: -pair[0].probability)
-    positives = [pair for pair in pairs if pair[0].photograph.label == label]
-    negatives = [pair for pair in pairs if pair[0].photograph.label != label]
-    sections = [
-        ("true positives", "#2e9e5b", [pair for pair in positives if pair[0].predicted == label], len(positives)),
-        ("false negatives", "#d03b3b", [pair for pair in positives if pair[0].predicted != label], len(positives)),
-        ("false positives", "#e8a317", [pair for pair in negatives if pair[0].predicted == label], len(negatives)),
-    ]
     grids = [draw_grid([], heading=LEGEND)]
-    for name, color, group, total in sections:
-        part = f" ({PER_SECTION} shown, evenly by probability)" if len(group) > PER_SECTION else ""
-        tiles = [_tile(prediction, image, color) for prediction, image in evenly(group, PER_SECTION)]
-        rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
-        grids.append(draw_grid(rows, heading=f"{label}: {len(group)} {name} of {total}{part}"))
+    for label, items in by_label(predictions).items():
+        pairs = sorted(zip(items, images, strict=True), key=lambda pair: -pair[0].probability)
+        positives = [pair for pair in pairs if pair[0].positive]
+        negatives = [pair for pair in pairs if not pair[0].positive]
+        sections = [
+            ("true positives", "#2e9e5b", [pair for pair in positives if pair[0].predicted == label], len(positives)),
+            ("false negatives", "#d03b3b", [pair for pair in positives if pair[0].predicted != label], len(positives)),
+            ("false positives", "#e8a317", [pair for pair in negatives if pair[0].predicted == label], len(negatives)),
+        ]
+        for name, color, group, total in sections:
+            part = f" ({PER_SECTION} shown, evenly by probability)" if len(group) > PER_SECTION else ""
+            tiles = [_tile(prediction, image, color) for prediction, image in evenly(group, PER_SECTION)]
+            rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
+            grids.append(draw_grid(rows, heading=f"{label}: {len(group)} {name} of {total}{part}"))
     sheet = Image.new("RGB", (max(grid.width for grid in grids), sum(grid.height for grid in grids)), PAPER)
     for grid, bottom in zip(grids, accumulate(grid.height for grid in grids), strict=True):
         sheet.paste(grid, (0, bottom - grid.height))

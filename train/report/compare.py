@@ -10,7 +10,7 @@ from augment.service import ARMS
 from augment.utils import progress
 from renderer.errors import InputError
 from train.photographs import metrics
-from train.photographs.metrics import METRICS, OVERALL, Pool, find_metric, metric_title
+from train.photographs.metrics import LABEL, METRICS, OVERALL, Pool, find_metric, metric_title
 from train.photographs.predictions import PREDICTIONS, read_predictions
 from train.report.summary import INITIAL, RunSummary, Scored, arms_of, by_images, run_tables, seconds_table
 from train.settings import PHOTOGRAPHS
@@ -20,7 +20,8 @@ TITLES = [metric_title(name) for name in METRICS]
 
 
 class Evaluation(NamedTuple):
-    """Pools of a run's predictions by source or mesh; OVERALL, the first, lacks excluded sources."""
+    """Pools of a run's predictions by source or mesh, after that of each of several labels (LABEL with its name);
+    OVERALL, the first, and these lack excluded sources."""
 
     run: RunSummary
     pools: dict[str, Pool]
@@ -38,14 +39,18 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     arms: dict[str, list[Evaluation]] = {}
     for arm, scored in group.items():
         for run, name in sorted(scored, key=lambda pair: pair[0].seed or 0):
-            path, label = run.folder / name / PREDICTIONS, run.photographs[name]["label"]
+            path, scores = run.folder / name / PREDICTIONS, run.photographs[name]
             if path.is_file():
-                predictions = read_predictions(path, label)
-                threshold = run.photographs[name].get("threshold")
-                pools = metrics.pool_by(predictions, label, by, exclude, threshold)
-                arms.setdefault(arm, []).append(Evaluation(run, pools))
+                predictions = read_predictions(path, scores["label"])
+                chosen = exclude, scores.get("thresholds")
+                pools = metrics.pool_by(predictions, by, *chosen)
                 if by == "mesh" and len(pools) == 1:
                     raise InputError(f"by=mesh: {path} names no mesh: leave it out")
+                if "by_label" in scores:
+                    labels = metrics.pool_by(predictions, "label", *chosen)
+                    named = {f"{LABEL}{label}": labels[label] for label in labels if label != OVERALL}
+                    pools = {OVERALL: pools.pop(OVERALL), **named, **pools}
+                arms.setdefault(arm, []).append(Evaluation(run, pools))
                 sources = {item.photograph.source for item in predictions} - {None}
                 if unknown := set(exclude) - sources:
                     names = ", ".join(sorted(filter(None, sources)))
@@ -104,13 +109,15 @@ def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> boo
 
 
 def difference_tables(arms: Evaluations, pooled: str = "all", by: str = "source") -> list[Table]:
-    """The differences by source or mesh ("": of all alone) and metric of each of `pairs_of`. pooled: OVERALL's name."""
+    """The differences by source or mesh ("": of all and of each label alone) and metric of each of `pairs_of`. pooled:
+    OVERALL's name."""
     tables = []
     for arm, base in progress(pairs_of(arms), "differences"):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]
-            for source in (reference[0].pools if by else [OVERALL])
+            for source in reference[0].pools
+            if by or source == OVERALL or source.startswith(LABEL)
         ]
         paired = ", paired" if _paired(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
@@ -120,7 +127,8 @@ def difference_tables(arms: Evaluations, pooled: str = "all", by: str = "source"
 
 def overall_differences(arms: Evaluations) -> Table:
     """The rows for all images of `difference_tables`."""
-    rows = [[table.title, *table.rows[0][1:]] for table in difference_tables(arms, by="")]
+    tables = difference_tables(arms, pooled="", by="")
+    rows = [[f"{table.title}, {name}".removesuffix(", "), *row] for table in tables for name, *row in table.rows]
     return Table("differences on the same images", ["networks", *TITLES], rows)
 
 

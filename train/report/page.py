@@ -13,13 +13,14 @@ from typing import Any
 from omegaconf import OmegaConf
 from PIL import Image
 
+from augment.classifiers.adapter import label_names
 from augment.service import ARMS
 from augment.utils import announced
 from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.loop import attack_success
-from train.photographs.metrics import OVERALL, metric_title
+from train.photographs.metrics import LABEL, OVERALL, metric_title
 from train.photographs.sheet import evenly
 from train.report import compare, plots, summary
 from train.report.plots import Picture
@@ -146,7 +147,8 @@ def _side(label: str, when: str, side: Side) -> Picture:
 
 
 def _title(arms: Arms) -> str:
-    labels = {scores["label"] for group in arms.values() for scores in group[0].photographs.values()}
+    evaluations = [scores for group in arms.values() for scores in group[0].photographs.values()]
+    labels = {label for scores in evaluations for label in label_names(scores["label"])}
     names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
     return f"{' and '.join(sorted(labels)) or 'Networks'}, trained with renders: {', '.join(names)}"
 
@@ -167,12 +169,13 @@ def _photographs(title: str, group: Scored) -> dict[str, Any]:
     paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
     sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}
     tables = [summary.score_table("", group)]
-    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "sentences": []}
+    content: dict[str, Any] = {"name": title, "sheets": sheets, "rocs": [], "tables": tables, "sentences": []}
     try:
         if evaluations := compare.read_evaluations(group):
             first = next(iter(evaluations.values()))[0]
-            scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
-            content["roc"] = plots.roc(scores, first.pools[OVERALL].label)
+            for name in [name for name in first.pools if name == OVERALL or name.startswith(LABEL)]:
+                scores = {arm: [run.pools[name].scores for run in runs] for arm, runs in evaluations.items()}
+                content["rocs"].append(plots.roc(scores, first.pools[name].label))
             content["sentences"] = _difference_sentences(evaluations, title)
             tables.append(compare.overall_differences(evaluations))
             if len(first.pools) > 1:

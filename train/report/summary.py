@@ -12,12 +12,13 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.files import LINES
+from augment.classifiers.adapter import label_names
 from augment.service import ARMS
 from renderer.errors import InputError, in_one_line
 from train import checkpoint, run_folder
 from train.networks import PUBLISHED, load_selected, published
-from train.photographs.metrics import METRICS, find_metric, metric_title, resampled
-from train.photographs.scoring import SUMMARY, describe_point
+from train.photographs.metrics import LABEL, METRICS, find_metric, metric_title, resampled
+from train.photographs.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.tables import Table, format_interval
 
@@ -29,9 +30,9 @@ INITIAL = "the initial network"  # in place of an arm, of a network that runs of
 class RunSummary:
     """A finished run, or a network with scores alone. epochs: the lines of metrics.jsonl. scores: its last line.
 
-    settings: those that decide its result, by dotted key. photographs: by the name of each sub-folder, METRICS and
-    `images`, which is equal where they were scored on the same images. before: the network that the run began with,
-    None where it began with random weights.
+    settings: those that decide its result, by dotted key. photographs: by the name of each sub-folder, METRICS, with
+    several labels of each, too, and `images`, equal where they were scored on the same images. before: the network that
+    the run began with, None where it began with random weights.
     """
 
     folder: Path
@@ -104,15 +105,24 @@ def _metrics(summaries: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any
     """The part of summaries, or of published scores, that tables show; any error for one that is damaged."""
     photographs = {}
     for name, summary in summaries.items():
-        metrics = {metric: find_metric(summary, metric) or summary.get(metric, {}) for metric in METRICS}
-        for metric in metrics.values():
-            if metric.get("value") is not None:
-                metric |= {end: float(metric[end]) for end in ("value", "low", "high")}
-        images, label = str(summary.get("images") or summary), str(summary.get("label", ""))
-        point = summary.get("operating_point")
-        chosen = {"threshold": float(point["threshold"]), "operating_point": describe_point(point)} if point else {}
-        photographs[name] = {"images": images, "label": label, **metrics, **chosen}
+        images, (label, *others) = str(summary.get("images") or summary), label_names(summary.get("label", ""))
+        scores: dict[str, Any] = {"images": images, "label": [label, *others] if others else label, **_known(summary)}
+        if points := operating_points(summary):
+            scores["thresholds"] = {point["label"]: float(point["threshold"]) for point in points}
+            scores["operating_point"] = " or ".join(dict.fromkeys(map(describe_point, points)))
+        if others:
+            scores["by_label"] = {part: _known(summary["by_label"][part]) for part in (label, *others)}
+        photographs[name] = scores
     return photographs
+
+
+def _known(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """METRICS of a summary, or of published scores."""
+    metrics = {metric: find_metric(summary, metric) or summary.get(metric, {}) for metric in METRICS}
+    for metric in metrics.values():
+        if metric.get("value") is not None:
+            metric |= {end: float(metric[end]) for end in ("value", "low", "high")}
+    return metrics
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
@@ -152,9 +162,10 @@ def by_images(arms: Arms) -> dict[str, Scored]:
     for group in groups.values():
         run, title = max((pair for scored in group.values() for pair in scored), key=lambda pair: bool(pair[0].epochs))
         scores = run.photographs[title]
-        auc, label = scores["auc"], scores["label"]
+        auc, labels = scores["auc"], label_names(scores["label"])
         if "positives" in auc:
-            title += f", {auc['positives']:,} of {label} and {auc['negatives']:,} of other things"
+            title += f", {auc['positives']:,} of {' or '.join(labels)} and {auc['negatives']:,} of other things"
+            title += COUNTED_EACH if len(labels) > 1 else ""
             title += "" if resampled(auc) == "images" else "; AUC and recall at FPR over objects, too"
         titled[f"{title} ({len(titled) + 1})" if title in titled else title] = group
     return titled
@@ -182,11 +193,14 @@ def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
 
 
 def score_table(title: str, group: Scored) -> Table:
-    """METRICS of the runs of a group of `by_images`."""
-    metrics = {
-        arm: [(run.seed, [run.photographs[name][metric] for metric in METRICS]) for run, name in scored]
-        for arm, scored in group.items()
-    }
+    """METRICS of the runs of a group of `by_images`; with several labels, pooled and of each."""
+    metrics: dict[str, list[tuple[int | None, list[Metric]]]] = {}
+    for arm, scored in group.items():
+        for run, name in scored:
+            scores = run.photographs[name]
+            for label, part in {"": scores, **scores.get("by_label", {})}.items():
+                row = f"{arm}, {LABEL}{label}" if label else arm
+                metrics.setdefault(row, []).append((run.seed, [part[metric] for metric in METRICS]))
     points = {run.photographs[name].get("operating_point", "") for scored in group.values() for run, name in scored}
     if chosen := " or ".join(sorted(points - {""})):
         title += f"; threshold for {chosen}"

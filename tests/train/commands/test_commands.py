@@ -78,6 +78,8 @@ def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_rea
 WRONG = [
     ([*EVALUATE, "skip_unreadable=maybe"], "Error merging override skip_unreadable=maybe: Value 'maybe' is not"),
     ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
+    ([*EVALUATE, "label=[]"], "label=[] must name a class, or several, each once"),
+    ([*EVALUATE, "label=[fig,pear]"], "classifier=run:1.10: 'pear' is not a class of the model"),
     ([*EVALUATE, "classifier=python:own:build"], "give one network"),
     ([*EVALUATE, "run=null", "classifier=python:own:build", "model=python:a:b"], "model=python:a:b is for"),
     ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),

@@ -87,6 +87,7 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
         (("Oranges/a.jpg",), ".", "orange", "Oranges is not .*such as orange, .* other_Oranges"),
         (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
         (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
+        (("a.jpg",), ".", ["orange", "pear"], "has no class folders, and label names several classes"),
     ],
 )
 def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, message):

@@ -12,8 +12,9 @@ from scipy.special import logsumexp, softmax
 
 from renderer.errors import InputError
 from train.photographs.folder import Photograph
+from train.photographs.metrics import AT_THRESHOLD, METRICS
 from train.photographs.predictions import Prediction, read_predictions, write_predictions
-from train.photographs.scoring import choose_operating_point, evaluate_photographs, format_summary
+from train.photographs.scoring import choose_operating_points, evaluate_photographs, format_summary
 from train.photographs.sheet import FRAME, IMAGE
 from train.tables import fraction
 
@@ -151,15 +152,65 @@ def test_a_mesh_is_ranked_against_all_images_of_the_other_kind_and_objects_count
 def test_an_operating_point_is_the_lowest_threshold_within_its_rate(fruit, tmp_path, rate, recall, false_positives):
     """Of the ranks of orange, 1, 2, 6, 5, 2 and of the others 1, 5, 2, 1, 2: those that tie with it lie below."""
     _, _, folder = fruit
-    point = choose_operating_point(*fruit, "orange", rate, 32, False, "cpu")
+    (point,) = choose_operating_points(*fruit, "orange", rate, 32, False, "cpu")
     for in_sample in (True, False):
-        summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", point=point)
+        summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", points=[point])
         assert summary["recall_at_threshold"] == fraction(recall, 5)
         assert summary["false_positive_rate_at_threshold"] == fraction(false_positives, 5)
         assert summary["operating_point"] == vars(point) | {"in_sample": in_sample}
         Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")  # another image of the same prediction
     with pytest.raises(InputError, match=r"^calibrate=.* has 5 images of other things .* at least 10 for .*=0\.1$"):
-        choose_operating_point(*fruit, "orange", 0.1, 32, False, "cpu")
+        choose_operating_points(*fruit, "orange", 0.1, 32, False, "cpu")
+
+
+def test_several_classes_are_scored_each_as_alone_and_pooled_over_all_pairs(fruit, tmp_path):
+    """Pooled, an image counts once for each class, with the log-odds of that class. Oranges a and c are a mesh."""
+    _, _, folder = fruit
+    header, *rows = (folder / "photos.csv").read_text().splitlines()
+    rows = [f"{row},{'m' if row[7] in 'ac' else ''}" for row in rows]
+    (folder / "photos.csv").write_text("\n".join([f"{header},mesh", *rows]))
+    points = choose_operating_points(*fruit, ["pear", "orange"], 0.4, 32, False, "cpu")
+    both = evaluate_photographs(*fruit, ["pear", "orange"], tmp_path / "both", by="mesh", points=points)
+    for point in points:
+        alone = evaluate_photographs(*fruit, point.label, tmp_path / point.label, points=[point])
+        (own,) = choose_operating_points(*fruit, point.label, 0.4, 32, False, "cpu")
+        assert (own.threshold, own.negatives) == (point.threshold, point.negatives)
+        part = both["by_label"][point.label]
+        assert part.pop("n") == 10 and part == {name: alone[name] for name in part} and {*METRICS[:2], "auc"} < {*part}
+    assert [item["label"] for item in both["operating_point"]] == both["label"] == ["pear", "orange"]
+
+    def odds(order: str, label: str) -> float:
+        logits = {name: -place for place, name in enumerate(order.split())}
+        return logits.pop(label) - logsumexp([*logits.values()])
+
+    def auc(ours: Callable[[str, str], bool], others: Callable[[str, str], bool]) -> float:
+        """By name and source; of all pairs."""
+        asked = [
+            (name, source, odds(order, label), name.startswith(label))
+            for name, source, order in FRUIT
+            for label in both["label"]
+        ]
+        positives = [score for name, source, score, right in asked if right and ours(name, source)]
+        negatives = [score for name, source, score, right in asked if not right and others(name, source)]
+        pairs = [(one > other) + (one == other) / 2 for one in positives for other in negatives]
+        return sum(pairs) / len(pairs)
+
+    assert both["auc"]["value"] == pytest.approx(auc(lambda *_: True, lambda *_: True), abs=1e-12)
+    assert both["by_mesh"]["m"]["auc"]["value"] == pytest.approx(
+        auc(lambda name, _: name[7] in "ac" and name[0] == "o", lambda *_: True)
+    )
+    shop = auc(lambda _, source: source == "shop", lambda _, source: source == "shop")
+    assert both["by_source"]["shop"]["auc"]["value"] == pytest.approx(shop, abs=1e-12)
+    first = [(name, order.split()[0]) for name, _, order in FRUIT]
+    wrong = [best for name, best in first for label in both["label"] if not name.startswith(label) and best == label]
+    assert both["recall"] == fraction(2, 8) and both["false_positive_rate"] == fraction(len(wrong), 12)
+    assert (both["n"]["photographs"], both["n"]["positives"], both["n"]["negatives"]) == (10, 8, 12)
+    hits = [sum(part[name]["hits"] for part in both["by_label"].values()) for name in AT_THRESHOLD]
+    assert [both[name]["hits"] for name in AT_THRESHOLD] == hits
+    written = read_predictions(tmp_path / "both" / "predictions.csv", ["orange", "pear"])
+    files = [tmp_path / label / "predictions.csv" for label in ("orange", "pear")]
+    assert written == [item for file in files for item in read_predictions(file, file.parent.name)]
+    assert len(read_predictions(tmp_path / "both" / "predictions.csv", "pear")) == 10
 
 
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
@@ -245,14 +296,17 @@ def test_scores_are_never_written_among_the_photographs(fruit, tmp_path, out):
 PREDICTIONS = [
     Prediction(
         Photograph(PurePosixPath("orange/a, b.png"), "orange", "web", ("lab", "studio"), "m"),
-        *("orange", 1 / 3, 1 / 3, 1, 1 / 3, 1, -0.1),
+        *("orange", "orange", 1 / 3, 1 / 3, 1, 1 / 3, 1, -0.1),
     ),
-    Prediction(Photograph(PurePosixPath("other_x/ü.png"), "other_x", None), "pear", 1.0, None, None, 1e-300, 2, -690.0),
+    Prediction(
+        Photograph(PurePosixPath("other_x/ü.png"), "other_x", None),
+        *("orange", "pear", 1.0, None, None, 1e-300, 2, -690.0),
+    ),
 ]
 
 
 def test_written_predictions_are_read_bit_by_bit_and_those_of_another_class_are_refused(tmp_path):
-    write_predictions(tmp_path / "a.csv", PREDICTIONS, "orange")
+    write_predictions(tmp_path / "a.csv", PREDICTIONS)
     assert read_predictions(tmp_path / "a.csv", "orange") == PREDICTIONS
     with pytest.raises(InputError, match=r"a\.csv cannot be used .* with label=pear"):
         read_predictions(tmp_path / "a.csv", "pear")

@@ -20,7 +20,9 @@ def prediction(index: int, label: str, source: str | None, score: float) -> Pred
     photograph = Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
     right = orange == (label == "orange")
     rank = (1 if right else 2) if label == "orange" else None
-    return Prediction(photograph, "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score)
+    return Prediction(
+        photograph, "orange", "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score
+    )
 
 
 @pytest.fixture
@@ -38,9 +40,9 @@ def scored_run(tmp_path, made_up_run, monkeypatch):
         ]
         predictions = [prediction(index, *kind) for index, kind in enumerate(kinds)]
         images = {"images": str([item.photograph for item in predictions]), "label": "orange"}
-        summaries = {name: pool(predictions, "orange").metrics | images}
+        summaries = {name: pool(predictions).metrics | images}
         folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
-        write_predictions(folder / name / "predictions.csv", predictions, "orange")
+        write_predictions(folder / name / "predictions.csv", predictions)
         return folder
 
     return make
