@@ -4,8 +4,8 @@ Rasterized once and then fixed, while light, albedo or the positions of the vert
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ class Fragments:
     pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
     sample: (S,) int64, their position in the image: pixel by pixel, and row by row within a pixel.
     depths: (G, 3) float64 of the corners, by which perspective divides (`Camera.depths`); None without perspective.
-    eye: (4,) float64, homogeneous: the camera's position and 1, or the direction to it and 0.
+    camera: whose view it is; None of surface that is gathered without one.
     """
 
     size: int
@@ -48,7 +48,12 @@ class Fragments:
     face: Tensor
     sample: Tensor
     depths: Tensor | None = None
-    eye: Tensor = field(default_factory=partial(torch.zeros, 4))
+    camera: Camera | None = None
+
+    @property
+    def eye(self) -> Tensor:
+        """(4,) homogeneous: the camera's position and 1, or the direction to it and 0. Only gloss asks for it."""
+        return torch.zeros(4) if self.camera is None else torch.from_numpy(self.camera.eye())
 
     @cached_property
     def barycentric(self) -> Tensor:
@@ -194,12 +199,16 @@ def build_fragments(
     closed = closed and bool((points[..., 2] >= -1).all())
     ids = rasterizer.rasterize(points, faces, settings.size * settings.samples, closed=closed)
     depths = [camera.depths(vertices) for camera in cameras]
-    views = (_fragments(*view, faces, settings) for view in zip(points, depths, ids, strict=True))
-    return [replace(view, eye=torch.from_numpy(camera.eye())) for view, camera in zip(views, cameras, strict=True)]
+    return [_fragments(*view, faces, settings) for view in zip(cameras, points, depths, ids, strict=True)]
 
 
 def _fragments(
-    projected: np.ndarray, depths: np.ndarray | None, ids: np.ndarray, faces: np.ndarray, settings: ImageSettings
+    camera: Camera,
+    projected: np.ndarray,
+    depths: np.ndarray | None,
+    ids: np.ndarray,
+    faces: np.ndarray,
+    settings: ImageSettings,
 ) -> Fragments:
     size, samples = settings.size, settings.samples
     within = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)  # a pixel's row of samples as one item
@@ -226,6 +235,7 @@ def _fragments(
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
+        camera=camera,
     )
 
 
