@@ -12,7 +12,7 @@ from renderer.errors import InputError
 from train.attack import AttackExperimentSettings
 from train.batches import rounds_of_epoch
 from train.run import load_data, prepare
-from train.settings import ExperimentSettings, as_override, compose, dotted, quoted, read_settings
+from train.settings import OTHER, ExperimentSettings, as_override, compose, dotted, quoted, read_settings
 
 
 @pytest.mark.parametrize(
@@ -29,11 +29,19 @@ def test_the_dataclasses_have_the_defaults_of_the_configuration(command, kind, o
     assert {key for key in config if config[key] != schema.get(key, "missing")} == different
 
 
-@pytest.mark.parametrize("experiment", ["best", "cpu", "demo", "fast", "harden", "paper"])
+@pytest.mark.parametrize("experiment", ["best", "classifier", "cpu", "demo", "fast", "harden", "paper"])
 def test_every_experiment_takes_other_data(experiment):
     overrides = [f"experiment={experiment}", "data=npz", "data.path=a.npz", "train.init_from=b", "run=here"]
     settings = read_settings(ExperimentSettings, compose("train", overrides))
     assert (settings.data.name, settings.data.path, settings.train.init_from in ("b", None)) == ("npz", "a.npz", True)
+
+
+def test_a_classifier_of_others_needs_no_class_but_the_label():
+    settings = read_settings(
+        ExperimentSettings,
+        compose("train", ["experiment=classifier", "train.init_from=b", "run=a", "label=mug", "data.path=c"]),
+    )
+    assert {item.label for item in settings.objects.values()} == {"mug", OTHER} and settings.data.name == "unlabelled"
 
 
 def test_the_demonstration_keeps_its_last_network_of_three_rounds_with_new_renders_each():
