@@ -20,6 +20,7 @@ GROUPS = {  # by command: folders of conf/ whose files are choices, some for a k
     "train": ("experiment", "data", "augment", "launcher", "attack@augment.attack"),
     "attack": ("attack",),
 }
+SCHEMAS = {"lab": "train/lab/shots.py", "audit": "train/audit/audit.py"}  # with a command's settings, if not its own
 
 
 def format_help(name: str, arguments: Sequence[str]) -> str:
@@ -29,7 +30,7 @@ def format_help(name: str, arguments: Sequence[str]) -> str:
     code = min(CONF.parent.glob(own)).read_text(encoding="utf-8")
     parts = [str(ast.get_docstring(ast.parse(code))), ""]
     if not file.exists():
-        code += (CONF.parent / "train/lab/shots.py").read_text(encoding="utf-8") if name == "lab" else ""
+        code += (CONF.parent / SCHEMAS[name]).read_text(encoding="utf-8") if name in SCHEMAS else ""
         schema = code.partition("Settings:\n")[2].partition("\n    def ")[0].replace("= MISSING", "= ???")
         settings = (_aligned(f"{k}={_value(a or b)}", comment) for k, a, b, comment in FIELD.findall(schema))
         return "\n".join([*parts, "Settings:", *settings])

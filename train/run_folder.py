@@ -6,7 +6,7 @@ import logging
 import os
 import platform
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields
 from functools import cache
@@ -37,13 +37,14 @@ logging.raiseExceptions = False  # on a full disk train.log lacks lines, and onl
 
 # Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
 CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "command", "working_folder", "hardware", "versions", "inputs"),
-    "test_images",
+    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
+    *("inputs", "test_images"),
     *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
     *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
+    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos"),
 )
 
 
@@ -154,7 +155,7 @@ def _object(text: str) -> dict[str, Any]:
     return parsed
 
 
-def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
+def decisive_settings(settings: Any) -> dict[str, object]:
     """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
     plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
     moved = _moved(plain, str(plain.get("run")), "<run>")
@@ -207,10 +208,23 @@ def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool 
     return config
 
 
+def require_same_settings(folder: Path, settings: Any, added: Collection[str]) -> None:
+    """InputError where a command's folder was made with other settings or input files, but for keys in `added` that
+    were null."""
+    if (folder / CONFIG).exists():
+        config = read_config(folder / CONFIG)
+        before = {**decisive_settings(config), **(config.get("inputs") or {})}
+        for key, new in (decisive_settings(settings) | fingerprints(settings)).items():
+            if (old := before.get(key, new)) != new and not (old is None and key in added):
+                remedy = "give the same, or another folder with out="
+                raise InputError(f"{folder} was made with {key}={old}, which is now {new}: {remedy}")
+
+
 def fingerprints(settings: Any) -> dict[str, str]:
     """SHA-256 by path: of files that INPUTS name, of a run's network, and of the names and sizes in other folders."""
     by_key = dict(dotted(asdict(settings)))
     paths = _texts([by_key.get(key) for key in INPUTS])
+    paths = {path.removeprefix("run:") for path in paths}
     return {path: _fingerprint(Path(path)) for path in sorted(paths) if os.path.exists(path)}
 
 

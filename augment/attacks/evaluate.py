@@ -104,7 +104,7 @@ def _fraction(values: Tensor) -> float:
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
     """Search norm-balls around an attack's start from the smallest to the largest, by descent and at random.
 
-    scales: factors of each parameter's radius or, without one, the radii. A success at one radius counts at all larger
+    scales: factors of radii and steps or, without a radius, the radii. A success at one radius counts at all larger
     radii; only the rest is attacked again, from where it ended at the radius before, for `max_steps` more steps, and
     gets as many uniform draws. Returns for each scale, ascending: radii, by parameter; adversarial and random, (N,)
     bool of the N clean-correct examples, whether a descent or a random search succeeds.
@@ -123,7 +123,9 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     random, rows = success.clone(), []
     for scale in progress(sorted(set(scales)), "radii"):
         balls: dict[str, Any] = {
-            name: replace(steps, radius=scale * (1.0 if steps.radius is None else steps.radius))
+            name: replace(steps, radius=scale)
+            if steps.radius is None
+            else replace(steps, radius=scale * steps.radius, step_size=scale * steps.step_size)
             for name, steps in settings.parameters.items()
         }
         scaled = replace(settings, **balls).problem(problem.scene)

@@ -5,6 +5,7 @@ import io
 import itertools
 import os
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from train.run_folder import (
     read_config,
     read_metrics,
     require_same_run,
+    require_same_settings,
     write_config,
 )
 from train.settings import ExperimentSettings, read_settings
@@ -146,3 +148,20 @@ def test_tensorboard_shows_the_renders(tmp_path):
     for number, render in enumerate(renders):
         tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
         np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+
+
+def test_a_folder_goes_on_with_the_same_settings_and_files_and_what_was_null(tmp_path):
+    @dataclass
+    class Settings:
+        photos: str | None = None
+        meshes: list[str] = field(default_factory=list)
+
+    mesh = tmp_path / "a.obj"
+    mesh.write_text("v 0 0 0")
+    write_config(tmp_path, Settings(meshes=[str(mesh)]))
+    require_same_settings(tmp_path, Settings("photos", [str(mesh)]), ["photos"])
+    with pytest.raises(InputError, match="was made with photos=None, which is now photos: give the same"):
+        require_same_settings(tmp_path, Settings("photos", [str(mesh)]), [])
+    mesh.write_text("v 0 0 1")
+    with pytest.raises(InputError, match=r"was made with .*a\.obj="):
+        require_same_settings(tmp_path, Settings(meshes=[str(mesh)]), [])

@@ -20,7 +20,8 @@ from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.images import read_image
 from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
-from renderer.light.environment import read_panorama
+from renderer.light.environment import read_panorama, to_map
+from renderer.light.presets import PROBES, load_light
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES
@@ -33,6 +34,7 @@ from train.settings import read_object, solid_name
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
+PROBE_HEIGHT = 64  # rows of the map of a built-in light
 FLOOR = 100.0  # half of the width of table and wall
 SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: at a right-angled edge at most 0.82
 
@@ -149,7 +151,10 @@ def write_laboratory(settings: LabSettings) -> int:
 
 
 def _read_environment(path: Path) -> np.ndarray:
-    """Radiance (H, W, 3); InputError where it is negative somewhere, or no light comes from above."""
+    """Radiance (H, W, 3) of a map, or of a built-in light, of which negative radiance is left out; InputError where a
+    map is negative somewhere, or no light comes from above."""
+    if str(path) in PROBES:
+        return to_map(load_light(str(path)), PROBE_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
     if radiance.min() < 0 or not radiance[: len(radiance) // 2].max() > 0:
         raise InputError(f"environments: {path} is negative somewhere or dark above: give a map of emitted light")

@@ -187,14 +187,15 @@ class Pool:
     def replicates(self) -> dict[str, np.ndarray]:
         """METRICS and `outcomes` in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
         replicates = {
-            name: bootstrap(partial(_weighted_mean, np.array(hits)), _objects(group))
+            name: bootstrap(partial(weighted_mean, np.array(hits)), _objects(group))
             for name, (group, hits) in self.outcomes.items()
             if hits
         }
         return replicates | dict(zip(RANKED, self._ranked_replicates if all(self.ranked) else (), strict=False))
 
 
-def _weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """A statistic for `bootstrap`: the mean of values (n,), each of which counts as often as it is drawn (..., n)."""
     return counts @ values / counts.sum(axis=-1)
 
 

@@ -26,7 +26,7 @@ from train.report import compare, plots, summary
 from train.report.plots import Picture
 from train.report.summary import Arms, RunSummary, Scored
 from train.run_folder import CONFIG, read_config
-from train.tables import as_text, format_interval
+from train.tables import as_text, format_fraction, format_interval, fraction
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
@@ -43,8 +43,6 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
     A run or attack that cannot be read is named on the page. InputError as of `find`.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     runs, attacks, unfinished = summary.find(folders)
     arms = summary.arms_of(runs)
     drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
@@ -54,27 +52,39 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
     read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
     times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
-    options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
-    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
-    page = environment.get_template("page.html.jinja").render(
+    counts = {f"network{'s' * (len(runs) != 1)}": len(runs), "unfinished or unreadable": len(unfinished)}
+    about = ", ".join(f"{count} {name}" for name, count in {**counts, "attacks": len(attacks)}.items() if count)
+    place = ", ".join(map(str, folders)) + (f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "")
+    return write_page(
+        out,
+        "runs.html.jinja",
+        about=f"{about}; in {place}",
         arms=arms,
         title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
-        networks=len(runs),
-        place=", ".join(map(str, folders)),
-        date=f"{datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "",
         lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
         captions=ARMS,
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
         curves=_curves(epochs),
         seconds=summary.seconds_table(drawn),
-        photographs=[_photographs(title, group) for title, group in summary.by_images(drawn).items()],
+        photographs=[scores_section(title, group) for title, group in summary.by_images(drawn).items()],
         renders={arm: _renders(run) for arm, run in trained.items()},
         examples={arm: _attack_examples(run) for arm, run in trained.items()},
         attacks=attacks,
         shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
+
+
+def write_page(out: Path, body: str, **content: Any) -> Path:
+    """Write report.html into a folder: a template's sections in the page that all share. content: of the template, with
+    the page's `title`, and `about`, the line beneath it."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
+    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
+    environment.filters |= {"fraction": fraction, "hits": format_fraction, "interval": format_interval}
+    page = environment.get_template("page.html.jinja").render(body=body, **content)
     out.mkdir(parents=True, exist_ok=True)
     (out / PAGE).write_text(page, encoding="utf-8", errors="replace")
     return out / PAGE
@@ -164,7 +174,7 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     return sentences
 
 
-def _photographs(title: str, group: Scored) -> dict[str, Any]:
+def scores_section(title: str, group: Scored) -> dict[str, Any]:
     """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
     paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
     sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}

@@ -91,13 +91,14 @@ def _read_run(folder: Path) -> RunSummary:
     if "test/accuracy_before" in scores:
         start = {"train.init_from": config.train.init_from}
         path, accuracy = folder / BEFORE, scores["test/accuracy_before"]
-        before = RunSummary(path, INITIAL, start, _read_summaries(path), accuracy)
+        before = RunSummary(path, INITIAL, start, read_summaries(path), accuracy)
     arm, settings, seed = str(config.augment.arm), run_folder.decisive_settings(config), int(config.seed)
-    accuracy, photographs = scores["test/accuracy"], _read_summaries(folder)
+    accuracy, photographs = scores["test/accuracy"], read_summaries(folder)
     return RunSummary(folder, arm, settings, photographs, accuracy, seed, config, epochs, scores, before)
 
 
-def _read_summaries(folder: Path) -> dict[str, dict[str, Any]]:
+def read_summaries(folder: Path) -> dict[str, dict[str, Any]]:
+    """`RunSummary.photographs` of a run's folder."""
     return _metrics({path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))})
 
 

@@ -14,6 +14,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from train import settings
+from train.audit.audit import AuditSettings
 from train.lab.shots import LabSettings
 from train.settings import compose, dotted, given_command
 
@@ -43,9 +44,10 @@ def test_help_shows_each_setting_with_its_comment_and_the_choices_that_apply(nam
     assert ("experiment=best" in printed, "\n  attack=lighting" in printed) == (name == "train", name == "attack")
 
 
-@pytest.mark.parametrize("name", ["compare", "evaluate", "lab", "light", "publish", "report"])
+@pytest.mark.parametrize("name", ["audit", "compare", "evaluate", "lab", "light", "publish", "report"])
 def test_help_of_a_command_without_a_file_shows_its_settings_with_their_comments(name):
-    schema = LabSettings if name == "lab" else import_module(f"scripts.{name}").Settings
+    schemas = {"audit": AuditSettings, "lab": LabSettings}
+    schema = schemas.get(name) or import_module(f"scripts.{name}").Settings
     printed = help_of(name)
     assert re.findall(r"^  (\w+)=", printed, re.M) == [field.name for field in fields(schema)]
     comments = re.findall("  # (.*)", inspect.getsource(schema).partition("  def ")[0])

@@ -1,0 +1,146 @@
+"""How surely a classifier recognizes renders, and how far each kind of light must change until it errs.
+
+Every classifier gets the same objects from the same sides, at its own size. Light is nowhere negative.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from augment.attacks.attack import AttackResult, AttackSettings, attack, logits_of, predictions
+from augment.attacks.evaluate import success_by_radius
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import SkylightSettings
+from augment.build import LampsSettings, ProjectorSettings
+from augment.classifiers import Classifier
+from augment.objects import SceneObject
+from augment.scene import Conditions, Scene
+from augment.utils import generator, progress
+from augment.variation import VariationSettings, vary
+from renderer.camera import orbit_cameras
+from renderer.errors import FACTOR
+from renderer.image import ImageSettings, to_bytes
+from renderer.light.basis import HARMONICS, with_local_lights
+from renderer.light.presets import load_light, perturb
+from renderer.rasterizer import choose
+
+BATCH = 16  # images per pass
+LIGHT = "grace"  # in which all attacks but that of the sky begin
+AMPLITUDE = 0.5  # of random light, in each coefficient: that of the paper's random arm
+RANDOM = "random "  # begins the name of a random light
+CAMERA = orbit_cameras(1, 2.6, *map(math.radians, (60, 45, 40)))
+VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
+STEPS = 10  # of a descent at each radius, and random draws
+FURTHER = 20  # steps of an attack that goes on after its success
+SIDE = 200  # pixels of a picture
+
+
+class LightKind(NamedTuple):
+    """Light that an attack changes, within L∞ balls of radii. local: lights beside those from all around."""
+
+    title: str
+    unit: str  # of the radii
+    radii: tuple[float, ...]
+    local: tuple[ProjectorSettings | LampsSettings, ...] = ()
+
+
+KINDS = {
+    "lighting": LightKind("light from all around", "in each coefficient", (0.02, 0.05, 0.1, 0.3)),
+    "skylight": LightKind("a daylight sky", "radians of the sun, a quarter of turbidity", (0.1, 0.3, 1.0, 3.0)),
+    "projector": LightKind("a projector", "of its power, in each pixel", (0.03, 0.1, 0.3, 1.0), (ProjectorSettings(),)),
+    "lamps": LightKind("four lamps", "of power, in each channel", (0.3, 1.0, 3.0, 10.0), (LampsSettings(),)),
+}
+
+
+@dataclass(frozen=True)
+class Views:
+    """The objects in turn, each turned and seen from the projector's side at random; the seed alone decides how."""
+
+    objects: Sequence[SceneObject]
+    count: int
+    seed: int
+    device: torch.device
+
+    def scene(self, size: int, kind: str = "lighting") -> Scene:
+        """An example of each view, in the lights of a kind of attack."""
+        shown = [self.objects[index % len(self.objects)] for index in range(self.count)]
+        basis, lights = with_local_lights(load_light(LIGHT), [light.build() for light in KINDS[kind].local])
+        image, gray = (
+            ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
+            torch.full((1, 1, size, size), 0.5),
+        )
+        scene = Scene.grid(
+            shown, CAMERA, gray, lights.to(self.device), image, choose("auto"), shared=False, basis=basis
+        )
+        return vary(scene, VARIATION, generator(self.seed, "views"))
+
+
+def recognized(classifier: Classifier, views: Views, environments: Sequence[str], count: int) -> dict[str, list[bool]]:
+    """By name of a light, an environment as `load_light` takes it or one of `count` random lights, whether each view is
+    classified as its label."""
+    drawn = perturb(load_light(LIGHT), count, AMPLITUDE, None, generator(views.seed, "lights"))
+    lights = {Path(name).stem: load_light(name) for name in environments}
+    lights |= {f"{RANDOM}{number}": light for number, light in enumerate(HARMONICS.project_nonnegative(drawn), 1)}
+    scene, rows, correct = views.scene(classifier.size), torch.arange(views.count, device=views.device), {}
+    for name, light in progress(lights.items(), "renders in other light"):
+        with torch.no_grad():
+            images = scene.render(Conditions(light.to(scene.lights).expand(len(scene), -1, -1)), rows)
+        correct[name] = (~_wrong(classifier, scene, images)).tolist()
+    return correct
+
+
+def _wrong(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
+    """(E,) bool: whether images (E, 1, 3, H, W) are misclassified; resized where the classifier takes another size."""
+    if images.shape[-1] != classifier.size:
+        resize: dict[str, Any] = {"mode": "bilinear", "antialias": True, "align_corners": False}
+        images = F.interpolate(images[:, 0], (classifier.size, classifier.size), **resize)[:, None].clamp(0, 1)
+    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=images.device)
+    return logits_of(classifier, images, BATCH)[:, 0].argmax(1) != labels
+
+
+def adversaries(classifier: Classifier, scene: Scene, kind: str, seed: int, further: bool = False) -> AttackResult:
+    """An attack within a kind's largest radius, by signed steps of a quarter of it, until the classifier errs; or all
+    of FURTHER steps, however surely it errs."""
+    radius = KINDS[kind].radii[-1]
+    changed = {kind: (SkylightSettings if kind == "skylight" else StepSettings)("linf", radius, "sign", radius / 4)}
+    options: dict[str, Any] = {"max_steps": FURTHER, "margin": FACTOR} if further else {"max_steps": STEPS, "margin": 0}
+    settings = AttackSettings(**(options | changed), batch_size=BATCH)
+    return attack(classifier, scene, settings=settings, seed=seed, force=True)
+
+
+def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
+    """n: views; correct: of these, before. adversarial, random: at each radius, how many of the correct ones a descent
+    or random draws turn wrong, and the draws alone. One is written to out/KIND.png; predicted: its classes."""
+    scene, radii = views.scene(classifier.size, kind), KINDS[kind].radii
+    result = adversaries(classifier, scene, kind, views.seed)
+    clean, rows = result.clean_correct, success_by_radius(result, [radius / radii[-1] for radius in radii])
+    rows[-1]["adversarial"] |= result.success[clean].cpu()  # from the start, not from where smaller radii ended
+    counts: dict[str, Any] = {"adversarial": [int((row["adversarial"] | row["random"]).sum()) for row in rows]}
+    counts["random"] = [int(row["random"].sum()) for row in rows]
+    if (clean & result.success).any():
+        row = int((clean & result.success).nonzero()[0])
+        logits = torch.stack([result.logits_before[row, 0], result.logits[row, 0]])
+        counts["predicted"] = predictions(logits, classifier.classes)["predicted"]
+        pair = to_bytes(torch.cat([result.images_before[row, 0], result.images[row, 0]], dim=2).cpu()).permute(1, 2, 0)
+        enlarged = pair.repeat_interleave(factor := max(1, SIDE // scene.settings.size), 0).repeat_interleave(factor, 1)
+        Image.fromarray(enlarged.numpy()).save(out / f"{kind}.png")
+    return {"n": len(scene), "correct": int(clean.sum()), **counts}
+
+
+def transfers(attacked: Classifier, other: Classifier, views: Views) -> dict[str, dict[str, list[int]]]:
+    """[successes, n] by kind of adversaries shown to another classifier, which is right before in `n`."""
+    counts: dict[str, dict[str, list[int]]] = {}
+    for kind in progress(KINDS, "transfer"):
+        scene, counts[kind] = views.scene(attacked.size, kind), {}
+        for name in ("first", "further"):
+            result = adversaries(attacked, scene, kind, views.seed, name == "further")
+            counted = result.clean_correct & result.success & ~_wrong(other, scene, result.images_before)
+            counts[kind][name] = [int((counted & _wrong(other, scene, result.images)).sum()), int(counted.sum())]
+    return counts
