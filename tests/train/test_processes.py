@@ -67,7 +67,7 @@ def folder_arm(file: Path) -> None:
     torch.manual_seed(0)
     images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
     settings = AugmentationSettings(arm="folder", folder="unread", examples=5)
-    process = None, utils.rank(), utils.world_size()
+    process = (), utils.rank(), utils.world_size()
     service = AugmentationService(settings, None, labels, 0, utils.Phases(), *process, images)
     made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
     torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
