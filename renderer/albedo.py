@@ -17,11 +17,17 @@ from renderer.mesh import Mesh
 
 @dataclass(frozen=True)
 class Texture:
-    """texels: row-major indices (S,) → linear albedo (3, S)."""
+    """texels: row-major indices (S,) → linear values (C, S)."""
 
     height: int
     width: int
     texels: Callable[[Tensor], Tensor]
+
+    @staticmethod
+    def of(values: Tensor) -> "Texture":
+        """Of linear values (H, W, C). InputError: NaN."""
+        require_bounded(texture=values)
+        return Texture(values.shape[0], values.shape[1], partial(torch.index_select, values.flatten(0, 1).T, 1))
 
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
@@ -32,23 +38,22 @@ def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Se
     if textures is None:
         sources = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
     else:
-        sources = []
-        for texture in textures:
-            require_bounded(texture=texture)
-            texels = texture.flatten(0, 1).T
-            sources.append(Texture(texture.shape[0], texture.shape[1], partial(torch.index_select, texels, 1)))
-    if not sources:
-        return albedo
-    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
+        sources = [Texture.of(texture) for texture in textures]
+    return albedo * sample_textures(sources, mesh, fragments).T if sources else albedo
+
+
+def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragments) -> Tensor:
+    """(C, S) at the samples, each of the texture of its face, or 1 where a face has none."""
+    faces = fragments.faces.cpu().numpy()
+    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(fragments.coverage)).T
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
-    if len(sources) == 1 and not texture_ids.any():
-        return albedo * bilinear(sources[0], uvs).T
-    albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
-    for index, source in enumerate(sources):
-        here = torch.nonzero(texture_ids == index).squeeze(1)
-        value = bilinear(source, uvs.index_select(1, here))
-        albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
-    return albedo.T
+    if len(textures) == 1 and not texture_ids.any():
+        return bilinear(textures[0], uvs)
+    texture_ids = texture_ids.index_select(0, fragments.face)
+    here = [torch.nonzero(texture_ids == index).squeeze(1) for index in range(len(textures))]
+    values = [bilinear(texture, uvs.index_select(1, at)) for texture, at in zip(textures, here, strict=True)]
+    ones = values[0].new_ones(len(values[0]), len(texture_ids))
+    return ones.index_copy(1, torch.cat(here), torch.cat(values, 1))
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:

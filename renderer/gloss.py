@@ -14,13 +14,12 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from renderer.albedo import Texture, bilinear
+from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
 from renderer.light.harmonics import unit
@@ -136,15 +135,8 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
     values = [column if len(column) == 1 else column[fragments.faces][fragments.face] for column in columns]
     roughness, metallic, strength = values
     if textures:
-        faces = fragments.faces.cpu().numpy()
-        uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs[faces]).to(fragments.coverage)).T
-        texture_ids = torch.from_numpy(mesh.texture_ids[faces]).to(fragments.face.device)[fragments.face]
-        factors = uvs.new_ones(2, len(fragments.face))
-        for index, texture in enumerate(textures):
-            here = torch.nonzero(texture_ids == index).squeeze(1)
-            texels = torch.from_numpy(texture.reshape(-1, 2).T.copy()).to(uvs) / 255
-            source = Texture(texture.shape[0], texture.shape[1], partial(torch.index_select, texels, 1))
-            factors[:, here] = bilinear(source, uvs[:, here])
+        sources = [Texture.of(torch.from_numpy(texture).to(fragments.coverage) / 255) for texture in textures]
+        factors = sample_textures(sources, mesh, fragments)
         roughness, metallic = roughness * factors[0], metallic * factors[1]
     if (roughness < LEAST).any():
         warnings.warn(

@@ -279,8 +279,9 @@ def _glossy_box_filter(
     weights = albedo / fragments.samples**2
     for some, at, block in _blocks(fragments.pixel, filtered, max(1, GLOSSY // fragments.samples**2)):
         seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
-        colored, white, world = gloss.at(some).transfer(*seen, basis.degree)
-        rows = basis.irradiance(surface.normals[some]) * gloss.at(some).diffuse(*seen)[:, None]
+        part = gloss.at(some)
+        colored, white, world = part.transfer(*seen, basis.degree)
+        rows = basis.irradiance(seen[0]) * part.diffuse(*seen)[:, None]
         for channel, weight in zip(block, weights[some].T, strict=False):
             channel[basis.nonzero] = _over_pixels(rows * weight[:, None], at, pixels).to(dtype)
             if colored is not None:
