@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = attach(
         "objects": ["PropSettings", "ObjectSettings"],
         "scene": ["Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],
-        "variation": ["CameraEffectSettings", "VariationSettings"],
+        "camera_effects": ["CameraEffectSettings"],
+        "variation": ["VariationSettings"],
     },
 )
