@@ -70,12 +70,11 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     if settings.data.name == UNLABELED and not (base and settings.train.distillation):
         missing = "set train.init_from and train.distillation"
         raise InputError(f"data={UNLABELED}: a network keeps its answers on it: {missing}")
-    if base and (settings.data.name in ("shapes", UNLABELED) or CLASSIFIER in base[1]["architecture"]):
-        classes = base[1]["architecture"]["classes"]
-        if settings.data.name == UNLABELED:
-            data = replace(data, classes=tuple(classes))
-        else:
-            data = relabeled(data, classes, f"data={settings.data.name}")
+    architecture = base[1]["architecture"] if base else {}
+    if settings.data.name == UNLABELED:
+        data = replace(data, classes=tuple(architecture["classes"]))
+    elif base and (settings.data.name == "shapes" or CLASSIFIER in architecture):
+        data = relabeled(data, architecture["classes"], f"data={settings.data.name}")
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)

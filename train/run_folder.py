@@ -6,7 +6,7 @@ import logging
 import os
 import platform
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields
 from functools import cache
@@ -21,17 +21,20 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from augment.service import AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
-from train.attack_examples import SUFFIX, write_attack_examples
+from renderer.io.tiles import draw_grid, tiles_of
+from renderer.rendering import light_sphere
 from train.checkpoint import write_whole
 from train.networks import selected_file
-from train.settings import ExperimentSettings, dotted
+from train.settings import ExperimentSettings, dotted, mapped
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
 BEFORE = "before"  # sub-folder with the scores of the network that the run began with
+EXAMPLE = 128  # px: the least side of the examples of an attack
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
 
@@ -44,7 +47,7 @@ CIRCUMSTANCES = (
 INPUTS = (
     *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
-    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos"),
+    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos", "laboratory"),
 )
 
 
@@ -165,12 +168,7 @@ def decisive_settings(settings: Any) -> dict[str, object]:
 
 def _moved(value: Any, folder: str, to: str) -> Any:
     """A setting, or nested ones, whose paths in a folder lie in another one instead."""
-    if isinstance(value, dict):
-        return {key: _moved(item, folder, to) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_moved(item, folder, to) for item in value]
-    inside = isinstance(value, str) and f"{value}/".startswith(f"{folder}/")
-    return to + value.removeprefix(folder) if inside else value
+    return mapped(value, lambda text: to + text.removeprefix(folder) if f"{text}/".startswith(f"{folder}/") else text)
 
 
 def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
@@ -192,32 +190,30 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
 
 
 def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> DictConfig:
-    """The configuration of the run in the folder; InputError where its decisive settings or input files are others,
-    but for more epochs and another evaluation of a run that is not finished."""
-    config, elsewhere = read_config(folder / CONFIG), "another folder with run= (sweep=)"
-    before, asked = decisive_settings(ExperimentSettings()) | decisive_settings(config), decisive_settings(settings)
+    """`require_same` of a training run; one that is not finished may get more epochs and another evaluation."""
+
+    def permitted(key: str, old: Any, new: Any) -> bool:
+        longer = key == "train.epochs" and isinstance(old, int) and new > old
+        return not finished and (longer or key.startswith("evaluate."))
+
+    return require_same(folder, settings, "run= (sweep=)", permitted)
+
+
+def require_same(folder: Path, settings: Any, elsewhere: str, permitted: Callable[[str, Any, Any], bool]) -> DictConfig:
+    """The configuration that a command wrote into the folder; InputError where its decisive settings or input files
+    are others. elsewhere: the keys that name the folder. permitted: whether a key, by its old and new value, may be."""
+    config, elsewhere = read_config(folder / CONFIG), f"another folder with {elsewhere}"
+    before = decisive_settings(OmegaConf.structured(type(settings))) | decisive_settings(config)
+    asked = decisive_settings(settings)
     for key in sorted(before.keys() | asked.keys()):
         old, new = before.get(key), asked.get(key)
-        longer = key == "train.epochs" and isinstance(old, int) and settings.train.epochs > old
-        if old != new and (finished or not (longer or key.startswith("evaluate."))):
-            raise InputError(f"{folder} was trained with {key}={old}, not {new}: give its setting, or {elsewhere}")
+        if old != new and not permitted(key, old, new):
+            raise InputError(f"{folder} was made with {key}={old}, not {new}: give its setting, or {elsewhere}")
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
             raise InputError(f"{path} has changed since {folder} began: put it back, or start in {elsewhere}")
     return config
-
-
-def require_same_settings(folder: Path, settings: Any, added: Collection[str]) -> None:
-    """InputError where a command's folder was made with other settings or input files, but for keys in `added` that
-    were null."""
-    if (folder / CONFIG).exists():
-        config = read_config(folder / CONFIG)
-        before = {**decisive_settings(config), **(config.get("inputs") or {})}
-        for key, new in (decisive_settings(settings) | fingerprints(settings)).items():
-            if (old := before.get(key, new)) != new and not (old is None and key in added):
-                remedy = "give the same, or another folder with out="
-                raise InputError(f"{folder} was made with {key}={old}, which is now {new}: {remedy}")
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
@@ -289,6 +285,16 @@ class RunLog:
         self._board.add_image("renders", grid, epoch)
 
     def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
-        """A few successful attacks of the epoch, before and after, in renders/."""
+        """A few successful attacks of the epoch in renders/: a row each, with the prediction before and after, over
+        the right class, and a white ball in either light. Images larger than EXAMPLE are reduced to it."""
+        columns, labels = {}, [classes[index] if index >= 0 else "other things" for index in attack_examples.labels]
+        sides = attack_examples.images, attack_examples.lights, attack_examples.predictions
+        for name, images, lights, probabilities in zip(("before", "after"), *sides, strict=True):
+            best = zip(*(values.tolist() for values in probabilities.max(1)), labels, strict=True)
+            captions = [(f"{value:.0%} {classes[index]}", label) for value, index, label in best]
+            reduced = interpolate(images, min(EXAMPLE, images.shape[-1]), mode="area")
+            columns[name] = tiles_of(reduced, captions, EXAMPLE)
+            spheres = (light_sphere(light, EXAMPLE // 2, basis=attack_examples.basis) for light in lights)
+            columns[f"light {name}"] = tiles_of(spheres)
         self._renders.mkdir(exist_ok=True)
-        write_attack_examples(self._renders / f"epoch_{epoch:03d}{SUFFIX}", attack_examples, classes)
+        draw_grid([*zip(*columns.values(), strict=True)], [*columns]).save(self._renders / f"attacks_{epoch:03d}.png")

@@ -17,7 +17,7 @@ from augment.utils import progress
 from renderer.errors import require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
-from renderer.io.tiles import Tile, draw_grid
+from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rasterizer import Rasterizer
 from renderer.rendering import light_sphere
 
@@ -140,8 +140,7 @@ def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer)
 def figure(result: AttackResult, example: int) -> Image.Image:
     """A row per view: an example's images before and after, predictions, difference, and the light where it changed.
 
-    Differences are gray where there is none, and scaled alike so that the largest reaches black or white. Images are
-    enlarged without smoothing, so that one sees the pixels that the classifier saw.
+    Differences are gray where there is none, and scaled alike so that the largest reaches black or white.
     """
     problem, one = result.problem, result.problem.everything[[example]]
     sides = [problem.conditions(values[one], one) for values in (problem.start, result.descent.values)]
@@ -150,17 +149,16 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
     scale = 1 / max(1 / 255, *largest)  # smaller ones than a step of eight bits stay as small as they are
+    shown = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
     columns = {
-        "initial": _tiles(before, _captions(result, result.logits_before, example)),
-        "adversarial": _tiles(after, _captions(result, result.logits, example)),
-        "difference": _tiles(
-            (1 + scale * differences) / 2, [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
-        ),
+        "initial": tiles_of(before, _captions(result, result.logits_before, example), SIDE),
+        "adversarial": tiles_of(after, _captions(result, result.logits, example), SIDE),
+        "difference": tiles_of((1 + scale * differences) / 2, shown, SIDE),
     }
     if not torch.equal(lights[0][0], lights[1][0]) or lights[0][1] != lights[1][1]:
         for name, (light, basis) in zip(("initial", "adversarial"), lights, strict=True):
-            spheres = [light_sphere(light, SIDE, camera, basis) for camera in problem.scene.cameras[example]]
-            columns[f"{name} light"] = _tiles(spheres, [()] * len(spheres))
+            cameras = problem.scene.cameras[example]
+            columns[f"{name} light"] = tiles_of(light_sphere(light, SIDE, camera, basis) for camera in cameras)
     return draw_grid([*zip(*columns.values(), strict=True)], [*columns])
 
 
@@ -171,10 +169,3 @@ def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[
         tuple(f"{view[index]:.1%} {classes[index]}" for index in dict.fromkeys([int(view.argmax()), label]))
         for view, label in zip(logits[example].softmax(1), labels, strict=True)
     ]
-
-
-def _tiles(images: Tensor | Sequence[Tensor], captions: Sequence[tuple[str, ...]]) -> list[Tile]:
-    """Tiles of images (V, 3, H, W) in [0, 1], at least SIDE pixels wide."""
-    factor = -(-SIDE // images[0].shape[2])
-    enlarged = [image.repeat_interleave(factor, 1).repeat_interleave(factor, 2) for image in images]
-    return [Tile.of(image, caption) for image, caption in zip(enlarged, captions, strict=True)]

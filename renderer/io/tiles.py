@@ -1,8 +1,8 @@
 """Sheets of images: tiles with captions in a grid."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, zip_longest
+from itertools import accumulate, repeat, zip_longest
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -24,11 +24,6 @@ class Tile:
     image: np.ndarray
     caption: tuple[str, ...]
 
-    @staticmethod
-    def of(image: Tensor, caption: tuple[str, ...]) -> "Tile":
-        """Of an image (3, H, W) of values in [0, 1]."""
-        return Tile(to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy(), caption)
-
     def captioned(self) -> Image.Image:
         """The image over its caption, as wide as the wider of them."""
         font, image = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(self.image)
@@ -39,6 +34,16 @@ class Tile:
             position = (0, image.height + 2 + number * LINE_HEIGHT)
             ImageDraw.Draw(captioned).text(position, line, FAINT if number else INK, font)
         return captioned
+
+
+def tiles_of(images: Iterable[Tensor], captions: Iterable[tuple[str, ...]] = repeat(()), side: int = 1) -> list[Tile]:
+    """Of images (3, H, W) of values in [0, 1], enlarged by a whole factor to at least `side` pixels, without smoothing,
+    so that one sees the pixels that the classifier saw."""
+    tiles = []
+    for image, caption in zip(images, captions, strict=False):
+        pixels, factor = to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy(), -(-side // image.shape[2])
+        tiles.append(Tile(pixels.repeat(factor, 0).repeat(factor, 1), caption))
+    return tiles
 
 
 def draw_grid(rows: Sequence[Sequence[Tile]], titles: Sequence[str] = (), heading: str = "") -> Image.Image:

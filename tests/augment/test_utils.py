@@ -14,9 +14,9 @@ from augment import AugmentationService, AugmentationSettings, scene, utils
 from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.build import build_scene
+from augment.camera_effects import CameraEffectSettings
 from augment.service import TrainingAttackSettings
 from augment.utils import generator, progress, require_memory, stream_seed
-from augment.variation import CameraEffectSettings
 from renderer.errors import InputError
 from renderer.image import to_bytes
 

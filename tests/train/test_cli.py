@@ -174,7 +174,7 @@ def test_ctrl_c_tells_how_to_go_on_from_a_checkpoint(call, capsys, monkeypatch, 
 
 def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):
     files = {path: path.stat().st_mtime_ns for path in stopped.rglob("*")}
-    for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was trained with ")):
+    for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was made with ")):
         assert call("train", f"run={stopped}", "train.resume=true", override) == cli.USER_ERROR
         assert key in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in stopped.rglob("*")} == files

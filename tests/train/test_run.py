@@ -161,7 +161,7 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
     for settings, message in [
         (tiny(), "holds a run already: set train.resume=true to go on, or choose another"),
-        (tiny("train.resume=true", "seed=8"), "was trained with seed=7, not 8"),
+        (tiny("train.resume=true", "seed=8"), "was made with seed=7, not 8"),
     ]:
         with pytest.raises(InputError, match=message):
             prepare(settings, load_data(settings), finished)
@@ -283,7 +283,8 @@ def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(fi
     last, best = (torch.load(finished / name, weights_only=True) for name in ("last.pt", "best.pt"))
     assert (last["epoch"], last["seed"], last["arm"], last["precision"]) == (3, 7, "adversarial", "float32")
     assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
-    assert sorted(path.name for path in (finished / "renders").glob("*.png")) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
+    renders = sorted(path.name for path in (finished / "renders").glob("epoch_*.png"))
+    assert renders == ["epoch_001.png", "epoch_002.png", "epoch_003.png"]
     assert {path.name for path in (finished / "photographs").iterdir()} == {
         "predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
     }  # fmt: skip

@@ -14,7 +14,9 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from augment.service import AttackExamples
 from renderer.errors import InputError
+from renderer.light.basis import HARMONICS
 from train.run_folder import (
     CONFIG,
     METRICS,
@@ -22,8 +24,8 @@ from train.run_folder import (
     decisive_settings,
     read_config,
     read_metrics,
+    require_same,
     require_same_run,
-    require_same_settings,
     write_config,
 )
 from train.settings import ExperimentSettings, read_settings
@@ -150,7 +152,24 @@ def test_tensorboard_shows_the_renders(tmp_path):
         np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
 
 
-def test_a_folder_goes_on_with_the_same_settings_and_files_and_what_was_null(tmp_path):
+@pytest.mark.parametrize("side", [16, 512])
+def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_path, side):
+    images = torch.rand(2, 3, 3, side, side)
+    predictions = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, 3, 2)
+    lights = torch.rand(2, 3, HARMONICS.size, 3)
+    examples = AttackExamples(images, lights, predictions, torch.tensor([0, 1, -1]))
+    RunLog(tmp_path).attack_examples(examples, ["apple", "orange"], epoch=2)
+    sheet = np.asarray(Image.open(tmp_path / "renders" / "attacks_002.png")).astype(int)
+    for image in images.flatten(0, 1):
+        shown = image.numpy().transpose(1, 2, 0)
+        shown = shown.reshape(128, 4, 128, 4, 3).mean((1, 3)) if side > 128 else shown.repeat(8, 0).repeat(8, 1)
+        corners = np.argwhere((abs(sheet - 255 * shown[0, 0]) < 1).all(2))
+        windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
+        windows = [window for window in windows if window.shape == shown.shape]
+        assert any((abs(window - 255 * shown) < 1).all() for window in windows)
+
+
+def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes(tmp_path):
     @dataclass
     class Settings:
         photos: str | None = None
@@ -159,9 +178,10 @@ def test_a_folder_goes_on_with_the_same_settings_and_files_and_what_was_null(tmp
     mesh = tmp_path / "a.obj"
     mesh.write_text("v 0 0 0")
     write_config(tmp_path, Settings(meshes=[str(mesh)]))
-    require_same_settings(tmp_path, Settings("photos", [str(mesh)]), ["photos"])
-    with pytest.raises(InputError, match="was made with photos=None, which is now photos: give the same"):
-        require_same_settings(tmp_path, Settings("photos", [str(mesh)]), [])
+    settings = Settings("photos", [str(mesh)])
+    require_same(tmp_path, settings, "out=", lambda *change: change == ("photos", None, "photos"))
+    with pytest.raises(InputError, match="was made with photos=None, not photos: give its setting"):
+        require_same(tmp_path, settings, "out=", lambda *change: False)
     mesh.write_text("v 0 0 1")
-    with pytest.raises(InputError, match=r"was made with .*a\.obj="):
-        require_same_settings(tmp_path, Settings(meshes=[str(mesh)]), [])
+    with pytest.raises(InputError, match=r"a\.obj has changed since .* began: .* another folder with out="):
+        require_same(tmp_path, Settings(meshes=[str(mesh)]), "out=", lambda *change: False)

@@ -202,7 +202,7 @@ def test_a_run_with_other_settings_is_refused_before_any_is_trained(
         (folder / "metrics.jsonl").unlink()
     assert run_sweep(folder.parent, "seed=2,0") == USER_ERROR
     printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith(f"error: {folder} was trained with train.epochs=7, not 2")
+    assert printed.out == "" and printed.err.startswith(f"error: {folder} was made with train.epochs=7, not 2")
     assert not folder_of(folder.parent, "seed=2").exists()
 
 

@@ -11,13 +11,11 @@ from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
-from PIL import Image
 
 from augment.classifiers.adapter import label_names
 from augment.service import ARMS
 from augment.utils import announced
 from renderer.errors import InputError
-from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.loop import attack_success
 from train.photographs.metrics import LABEL, OVERALL, metric_title
@@ -68,8 +66,8 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         curves=_curves(epochs),
         seconds=summary.seconds_table(drawn),
         photographs=[scores_section(title, group) for title, group in summary.by_images(drawn).items()],
-        renders={arm: _renders(run) for arm, run in trained.items()},
-        examples={arm: _attack_examples(run) for arm, run in trained.items()},
+        renders={arm: _pictures(run, "epoch", "Renders") for arm, run in trained.items()},
+        examples={arm: _pictures(run, "attacks", "Renders before and after") for arm, run in trained.items()},
         attacks=attacks,
         shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
@@ -123,37 +121,12 @@ def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | Non
     return rates
 
 
-def _first_middle_last(run: RunSummary, suffix: str) -> list[tuple[int, Path]]:
-    """Of a run's files renders/epoch_NUMBER with a suffix, three with their numbers."""
-    numbers = [(path.stem.removeprefix("epoch_"), path) for path in (run.folder / "renders").glob(f"epoch_*{suffix}")]
-    return evenly(sorted((int(number), path) for number, path in numbers if number.isdigit()), 3)
-
-
-def _renders(run: RunSummary) -> list[Picture]:
-    files = _first_middle_last(run, ".png")
-    images = [plots.from_file(path, f"Renders of epoch {n}, {run.arm}", GRID, f"epoch {n}") for n, path in files]
+def _pictures(run: RunSummary, name: str, title: str) -> list[Picture]:
+    """A run's images renders/NAME_EPOCH.png of its first, middle and last epoch with any."""
+    numbers = [(path.stem.rpartition("_")[2], path) for path in (run.folder / "renders").glob(f"{name}_*.png")]
+    files = evenly(sorted((int(number), path) for number, path in numbers if number.isdigit()), 3)
+    images = [plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}") for n, path in files]
     return [image for pictures in images for image in pictures]
-
-
-def _attack_examples(run: RunSummary) -> dict[int, list[Picture]]:
-    """The examples of the first, middle and last epoch with any, before and after their attacks, by epoch."""
-    pictures = {}
-    for epoch, path in _first_middle_last(run, SUFFIX):
-        with suppress(InputError):
-            rows = read_attack_examples(path)
-            pictures[epoch] = [
-                _side(label, *side) for label, *sides in rows for side in zip(("before", "after"), sides, strict=True)
-            ]
-    return pictures
-
-
-def _side(label: str, when: str, side: Side) -> Picture:
-    image, sphere = (Image.fromarray(pixels.permute(1, 2, 0).numpy()) for pixels in (side.image, side.sphere))
-    pair = Image.new("RGB", (plots.SMALL + plots.GAP + sphere.width, plots.SMALL), "white")  # as around the ball
-    pair.paste(image.resize((plots.SMALL, plots.SMALL), Image.Resampling.NEAREST))
-    pair.paste(sphere, (plots.SMALL + plots.GAP, (plots.SMALL - sphere.height) // 2))
-    predicted = f"{side.confidence:.0%} {side.predicted}"
-    return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
 def _title(arms: Arms) -> str:

@@ -21,8 +21,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES, MARKERS = ("--", "-", ":", "-."), "osD^vP"
 SIZE = (4.4, 3.3)  # inches
 WIDTH = 440  # CSS pixels
-SMALL = 96  # pixels per side of small images
-GAP = 8  # pixels between an image and the ball in its light
+SMALL = 192  # pixels per side of images that stay PNG
 INK = "#123456"  # replaced by the ink of the reader's color scheme
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
 PLOT = {
@@ -113,7 +112,7 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
     """As PNG if it is small, else as JPEG."""
-    file, small = io.BytesIO(), max(image.size) <= 2 * SMALL
+    file, small = io.BytesIO(), max(image.size) <= SMALL
     shown = image if small else image.convert("RGB")
     shown.save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
     return Picture(file.getvalue(), "png" if small else "jpeg", alt, image.width, caption)

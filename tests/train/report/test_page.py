@@ -91,7 +91,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
         assert states[name][0].startswith(f"cannot be read: {page.parents[1]}/{name}")
     assert any(cells[:3] == ["none", "2 seeds", "0.765 ± 0.000"] for cells in parsed.rows)
     assert any(alt.startswith("training accuracy") and "unfinished: going 0.75" in alt for alt in parsed.alts)
-    assert any(alt.startswith("orange before: ") and alt.endswith("; a ball in its light") for alt in parsed.alts)
+    assert any(alt.startswith("Renders before and after, epoch ") for alt in parsed.alts)
     assert any(alt.startswith(f"Example 0, {HOSTILE}: success in 3 steps; ") for alt in parsed.alts)
     sentence = "Attacks succeed on 1 of 2 examples; 1 more were wrong before any step; random search with as many"
     assert f"{sentence} renders succeeds on 50%." in text
