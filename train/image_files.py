@@ -103,7 +103,7 @@ class _Reader(Dataset[tuple[Tensor, dict[PurePosixPath, str]]]):
         if seed is None:
             return central_square(image, self._files.size)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)  # not a GPU's, too
             return self._crop(image)
 
 

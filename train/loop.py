@@ -99,7 +99,7 @@ class Trainer:
         if compiled:
             torch.compiler.reset()  # since torch limits the graphs of all runs of a process
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-        self._augment = augmentation(settings.augmentation, model, self.seed)
+        self._augment = augmentation(settings.augmentation, model, self.seed, service.studied[1:])
         self._attacked: nn.Module = GraphedModel(model) if compiled else model
         self._validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
 

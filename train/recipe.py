@@ -173,13 +173,16 @@ class MovingAverage(AveragedModel):
         self.n_averaged += 1
 
 
-def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
-    """One of `AUGMENTATIONS`: PGD against the model, or a transform of torchvision's, the jitter at half the strengths
-    of Chen et al. 2020, as is usual for small images. The draws for an image depend on seed, step and its index."""
+def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()) -> Augment:
+    """One of `AUGMENTATIONS`: PGD against the model's `label_loss`, which takes `absent`; or a transform of
+    torchvision's, the jitter at half the strengths of Chen et al. 2020, as is usual for small images. The draws for an
+    image depend on seed, step and its index."""
     if name == "none":
         return lambda images, labels, step: images
     if name == "pgd":
-        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", utils.rank()))
+        return lambda images, labels, step: pgd(
+            model, images, labels, generator(seed, step, "pgd", utils.rank()), absent
+        )
     from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
 
     jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
@@ -198,7 +201,7 @@ def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
 
 
 @torch.enable_grad()
-def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator) -> Tensor:
+def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator, absent: Sequence[int] = ()) -> Tensor:
     """Images in the L∞ ball around the given ones, by steps along the sign of the loss's gradient from a random start
     (Madry et al. 2018); the model is in eval mode meanwhile."""
     clean = to_unit(images)
@@ -207,7 +210,7 @@ def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator
     with as_found(model):
         for _ in range(PGD_STEPS):
             adversarial.requires_grad_(True)
-            loss = label_loss(model(adversarial), labels).sum()
+            loss = label_loss(model(adversarial), labels, absent=absent).sum()
             (gradient,) = torch.autograd.grad(loss, adversarial)
             moved = adversarial.detach() + PGD_STEP * gradient.sign()
             adversarial = moved.clamp(clean - PGD_RADIUS, clean + PGD_RADIUS).clamp(0, 1)

@@ -145,8 +145,9 @@ def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
     assert after > before + 10 * abs(random - before)
 
 
-def test_pgd_raises_the_probability_of_the_class_that_hard_negatives_are_not(images, model):
+def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(images, model):
     labels = torch.full((6,), -1 - 2)
-    adversarial = augmentation("pgd", model.eval(), 0)(images, labels, 0)
-    before, after = (model(to_unit(batch)).softmax(1)[:, 2].mean() for batch in (images, adversarial))
-    assert after > before
+    one, both = (augmentation("pgd", model.eval(), 0, absent)(images, labels, 0) for absent in ([], [0]))
+    before, with_one, with_both = (model(to_unit(batch)).softmax(1).mean(0) for batch in (images, one, both))
+    assert with_one[2] > before[2]
+    assert with_both[[0, 2]].sum() > max(with_one[[0, 2]].sum(), before[[0, 2]].sum())
