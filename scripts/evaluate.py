@@ -61,13 +61,14 @@ def main(settings: Settings) -> None:
         network.label(name)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
-    points = [network.operating_point] if network.operating_point else []
+    points = network.operating_points
     options = network.size, settings.skip_unreadable, device
     with sole_writer("out", out):
         if settings.calibrate and settings.false_positive_rate:
             folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
             points = scoring.choose_operating_points(model, network.classes, folder, labels, rate, *options)
-        points = points if [point.label for point in points] == labels else []
+        by_label = {point.label: point for point in points}
+        points = [by_label[name] for name in labels] if by_label.keys() >= set(labels) else []
         photos, by = published(Path(settings.photos)), settings.by
         summary = scoring.evaluate_photographs(model, network.classes, photos, labels, out, *options, by, points)
     print(f"{scoring.format_summary(summary)}\n\ntable, scores and image: {out}")

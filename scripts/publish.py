@@ -18,6 +18,7 @@ from train.errors import writable_folder
 from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish, published
 from train.photographs import scoring
 from train.report.summary import summarize
+from train.settings import mapped
 
 
 @dataclass
@@ -26,23 +27,11 @@ class Settings:
     out: str = MISSING  # the folder of the weights
     false_positive_rate: float | None = None  # for a threshold on the log-odds of `label`, chosen on calibrate
     calibrate: str | None = None  # a folder of photographs as for pnb-evaluate; null: the threshold it has, if any
-    label: str = "orange"  # the class of the threshold
+    label: Any = "orange"  # the class of the threshold, or several, each with its own
     model: str | None = None  # python:package.module:function, if such a function made the run's network
 
     def __post_init__(self) -> None:
         scoring.require_calibration(self.false_positive_rate, self.calibrate)
-
-
-def without_folders(value: Any) -> Any:
-    """Settings with the names of files in place of their paths, which are of this machine alone."""
-    match value:
-        case dict():
-            return {key: without_folders(item) for key, item in value.items()}
-        case list():
-            return [without_folders(item) for item in value]
-        case str() if value.startswith("/"):
-            return Path(value).name
-    return value
 
 
 @cli.command()
@@ -51,7 +40,9 @@ def main(settings: Settings) -> None:
     path, state = load_selected(given)
     if path.suffix != Path(PUBLISHED).suffix:  # a run of pnb-train
         run = summarize(given)
-        state["settings"], state["versions"] = without_folders(run.settings), dict(run.config.versions)
+        # Names of files in place of their paths, which are of this machine alone.
+        state["settings"] = mapped(dict(run.settings), lambda text: Path(text).name if text[:1] == "/" else text)
+        state["versions"] = dict(run.config.versions)
         state["scores"] = {**run.scores, **run.photographs}
     if settings.calibrate or not str(state["architecture"].get("name")).startswith(PYTHON):  # its user runs that code
         network = load_run(path, model=settings.model)  # or InputError, since nobody could use it
@@ -59,9 +50,10 @@ def main(settings: Settings) -> None:
         network.half().float()  # as it is published
         folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
         options = network.classes, folder, settings.label, rate, network.size, False, "cpu"
-        (point,) = scoring.choose_operating_points(network, *options)
-        state["operating_point"] = asdict(point)
-        print(f"threshold {point.threshold:.3f} for {scoring.describe_point(state['operating_point'])}")
+        points = scoring.choose_operating_points(network, *options)
+        state["operating_point"] = [asdict(point) for point in points]
+        for point in points:
+            print(f"{point.label}: threshold {point.threshold:.3f} for {scoring.describe_point(asdict(point))}")
     out.mkdir(parents=True, exist_ok=True)
     publish(out / PUBLISHED, state)
     print(f"published in {settings.out}")

@@ -16,7 +16,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import utils
-from augment.classifiers import BUILDERS, SOURCES, Classifier, OperatingPoint, build_classifier, load_classifier
+from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier, load_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
@@ -192,7 +192,7 @@ def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: st
 def is_classifier(name: str) -> bool:
     """Whether `train.init_from` names a classifier, rather than a run or a file."""
     source, colon, _ = name.partition(":")
-    return source + colon in BUILDERS
+    return (found := SOURCES.get(source + colon)) is not None and found.build is not None
 
 
 def load_initial(name: str, weights: str | None, size: int | None = None) -> tuple[Path, dict[str, Any]]:
@@ -243,13 +243,14 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
         network = build_network(classes, size, **shape)
         network.load_state_dict(state["model"])
         classifier = Classifier(network, size, classes, f"run:{run}")
-        if point := state.get("operating_point"):
-            classifier.operating_point = OperatingPoint(**point)
-            classifier.label(classifier.operating_point.label)  # or InputError
+        points = state.get("operating_point", [])  # one, or several
+        classifier.operating_points = [OperatingPoint(**p) for p in (points if isinstance(points, list) else [points])]
+        for point in classifier.operating_points:
+            classifier.label(point.label)  # or InputError
         return classifier
 
 
-SOURCES["run:"] = load_run  # a classifier's name in the commands
+SOURCES["run:"] = Source(load_run, None)  # a classifier's name in the commands
 
 
 @contextmanager

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
 from augment.classifiers.imagenet import (
@@ -22,23 +23,27 @@ from augment.classifiers.imagenet import (
 from augment.utils import announced
 from renderer.errors import InputError
 
-__all__ = ["SOURCES", "Classifier", "OperatingPoint", "build_classifier", "load_classifier"]
+__all__ = ["SOURCES", "Classifier", "OperatingPoint", "Source", "build_classifier", "load_classifier"]
 
-# A name that ends in a colon is followed by the source's own name for the model, the loader's first argument.
+
+class Source(NamedTuple):
+    """How to make a classifier with its weights, and with fresh ones for images of a size; the latter None for no."""
+
+    load: Callable[..., Classifier]
+    build: Any
+
+
+# A name that ends in a colon is followed by the source's own name for the model, the first argument of both.
 # `train.networks` adds `run:`, the networks that this project trains.
-SOURCES: dict[str, Callable[..., Classifier]] = {
-    **{f"efficientnet_lite{version}": partial(load_efficientnet_lite, version) for version in range(3)},
-    SQUEEZENET_CAFFE: load_squeezenet_caffe,
-    "torchvision:": load_torchvision,
-    "timm:": load_timm,
-    "python:": load_python,
-}
-BUILDERS: dict[str, Callable[..., Classifier]] = {
-    **{f"efficientnet_lite{version}": partial(build_efficientnet_lite, version) for version in range(3)},
-    SQUEEZENET_CAFFE: build_squeezenet_caffe,
-    "torchvision:": build_torchvision,
-    "timm:": build_timm,
-    "python:": lambda model, size: load_python(model),
+SOURCES = {
+    **{
+        f"efficientnet_lite{n}": Source(partial(load_efficientnet_lite, n), partial(build_efficientnet_lite, n))
+        for n in range(3)
+    },
+    SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
+    "torchvision:": Source(load_torchvision, build_torchvision),
+    "timm:": Source(load_timm, build_timm),
+    "python:": Source(load_python, lambda model, size: load_python(model)),
 }
 
 
@@ -57,7 +62,7 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     if source + colon not in SOURCES:
         choices = [f"{source}NAME" if source.endswith(":") else source for source in SOURCES]
         raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
-    load = SOURCES[source + colon]
+    load = SOURCES[source + colon].load
     path = None if weights is None else Path(weights)
     with announced(f"loading {name}"):
         return load(model, path) if colon else load(path)
@@ -66,4 +71,4 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
 def build_classifier(name: str, size: int) -> Classifier:
     """The network of `load_classifier` for images of a size, with fresh weights, those of `python:` aside."""
     source, colon, model = name.partition(":")
-    return BUILDERS[source + colon](*([model] if colon else []), size)
+    return SOURCES[source + colon].build(*([model] if colon else []), size)

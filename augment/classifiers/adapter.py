@@ -49,10 +49,10 @@ class Classifier(nn.Module):
 
     name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
     the C names, each once. The parameters need no gradient and the mode stays eval, also after `train()`.
-    operating_point: of a published network that carries one, for `detect`.
+    operating_points: of a published network that carries some, one for each class, for `detect`.
     """
 
-    operating_point: OperatingPoint | None = None
+    operating_points: Sequence[OperatingPoint] = ()
 
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
@@ -91,13 +91,19 @@ class Classifier(nn.Module):
             raise InputError(f"{name} returned logits without a gradient: compute them in torch")
         return logits
 
-    def detect(self, images: Float[Tensor, "N 3 size size"]) -> Bool[Tensor, " N"]:
-        """Whether images, RGB in [0, 1], show the class of the operating point, by its threshold instead of argmax.
+    def detect(self, images: Float[Tensor, "N 3 size size"], label: str | None = None) -> Bool[Tensor, " N"]:
+        """Whether images, RGB in [0, 1], show a class, by the threshold of its operating point instead of argmax.
 
-        InputError without an operating point, and as of `forward`.
+        label: the class, where there are operating points of several. InputError without one, and as of `forward`.
         """
-        if (point := self.operating_point) is None:
-            raise InputError(f"classifier={self.name} has no operating point: publish it with pnb-publish calibrate=")
+        points = [point for point in self.operating_points if label in (None, point.label)]
+        if len(points) != 1:
+            known = ", ".join(point.label for point in self.operating_points)
+            remedy = (
+                f"s but of {known}: give one of these as label" if known else ": publish it with pnb-publish calibrate="
+            )
+            raise InputError(f"classifier={self.name} has no operating point{remedy}")
+        (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
     def train(self, mode: bool = True) -> Self:

@@ -1,11 +1,13 @@
 """The audit: a brute-force scan of radii, closed forms, and audits that were stopped."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import augment
 from augment.objects import ObjectSettings, load_object
@@ -14,10 +16,8 @@ from renderer.errors import InputError
 from renderer.light.basis import parts_of
 from train.audit import audit, lights, page
 from train.audit.audit import AuditSettings, run_audit
-from train.audit.lights import KINDS, Views, success_by_light
+from train.audit.lights import KINDS, Views, adversaries, success_by_light, transfers
 from train.lab import patterns
-
-pytest.importorskip("mitsuba")
 
 CLASSES = ("orange", "other")
 
@@ -58,6 +58,22 @@ def test_the_smallest_radius_is_that_of_a_scan_of_all_radii(views, tmp_path):
     assert counts["correct"] == int(correct.sum()) and 0 < expected[1] < expected[-1]
     assert counts["adversarial"] == expected
     assert all(random <= hits for random, hits in zip(counts["random"], expected, strict=True))
+
+
+def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(views, tmp_path, monkeypatch):
+    monkeypatch.setattr(lights, "STEPS", 3)
+    monkeypatch.setattr(lights, "FURTHER", 5)
+    for kind in ("skylight", "projector", "lighting"):
+        monkeypatch.delitem(KINDS, kind)
+    monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
+    views, attacked, other = replace(views, count=2), brightness(0.5), brightness(0.515, size=12)
+    success_by_light(attacked, views, "lamps", tmp_path)
+    counts = transfers(attacked, other, views, tmp_path)["lamps"]
+    for name, further in (("first", False), ("further", True)):
+        (row,) = augment.transfer(adversaries(attacked, views, "lamps", further), [other])
+        pairs = [*zip(row["clean_correct"], row["success"], strict=True)]
+        assert counts[name] == [pairs.count((True, True)), sum(row["clean_correct"])]
+    assert (counts["first"], counts["further"]) == ([1, 2], [2, 2])
 
 
 def test_classifiers_of_all_sizes_get_the_same_views_which_the_seed_decides(views):
@@ -102,6 +118,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 def test_an_audit_that_was_stopped_goes_on_and_writes_the_same_report(given, monkeypatch, tmp_path):
+    pytest.importorskip("mitsuba")
     run_audit(AuditSettings(**given, hardened="b"))
     whole, folder = files(tmp_path / "audit"), tmp_path / "audit"
     assert len(whole) > 15
@@ -121,8 +138,31 @@ def test_an_audit_that_was_stopped_goes_on_and_writes_the_same_report(given, mon
     run_audit(AuditSettings(**given, hardened="b"))  # which may be added
     assert files(folder) == whole
     assert made == {path: path.stat().st_mtime_ns for path in made}
-    with pytest.raises(InputError, match="audit was made with seed=0, which is now 1: give the same, or another"):
+    with pytest.raises(
+        InputError, match="audit was made with seed=0, not 1: give its setting, or another folder with out="
+    ):
         run_audit(AuditSettings(**given, hardened="b", seed=1))
+
+
+def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_renders_serves(given, monkeypatch, tmp_path):
+    def missing():
+        raise InputError("Mitsuba is not installed")
+
+    counts = {"n": 2, "correct": 2, "adversarial": [0, 0, 0, 0], "random": [0, 0, 0, 0]}
+    monkeypatch.setattr(audit, "mitsuba", missing)
+    monkeypatch.setattr(audit, "recognized", lambda *arguments: {"uniform": [True], "random 1": [True]})
+    monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
+    report = run_audit(AuditSettings(**given))
+    text = "The laboratory is left out, and look_alikes with it (Mitsuba is not installed)."
+    assert text in report.read_text() and not (tmp_path / "audit/renders").exists()
+    assert not (tmp_path / "audit/classifier/laboratory").exists()
+    for label in CLASSES:
+        (tmp_path / "lab" / label).mkdir(parents=True)
+        Image.new("RGB", (8, 8), "black" if label == "orange" else "white").save(tmp_path / "lab" / label / "a.png")
+    folders = {"look_alikes": [], "laboratory": str(tmp_path / "lab"), "out": str(tmp_path / "ready")}
+    assert text not in run_audit(AuditSettings(**given | folders)).read_text()
+    summary = json.loads((tmp_path / "ready/classifier/laboratory/summary.json").read_text())
+    assert summary["recall"]["value"] == 1 and summary["false_positive_rate"]["value"] == 0
 
 
 @pytest.mark.parametrize(
@@ -136,6 +176,8 @@ def test_an_audit_that_was_stopped_goes_on_and_writes_the_same_report(given, mon
         ),
         ({"look_alikes": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
+        ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
+        ({"laboratory": "nowhere"}, "look_alikes are rendered in place of laboratory=nowhere"),
     ],
 )
 def test_what_cannot_be_audited_is_refused_before_anything_is_written(given, tmp_path, changes, message):

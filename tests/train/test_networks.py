@@ -254,7 +254,7 @@ def test_a_published_network_is_found_from_any_folder_unless_that_has_its_own(tm
     monkeypatch.chdir(tmp_path)
     names = [networks.load_run(name).name for name in ("pretrained/none", "pretrained/none/model.safetensors")]
     assert names == ["run:pretrained/none", "run:pretrained/none/model.safetensors"]
-    assert networks.load_run("pretrained/best").operating_point.false_positive_rate == 0.05
+    assert networks.load_run("pretrained/best").operating_points[0].false_positive_rate == 0.05
     (tmp_path / "pretrained" / "none").mkdir(parents=True)
     with pytest.raises(InputError, match=r"run=pretrained/none holds neither best\.pt nor model\.safetensors"):
         networks.load_run("pretrained/none")

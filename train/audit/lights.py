@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -72,13 +72,9 @@ class Views:
         """An example of each view, in the lights of a kind of attack."""
         shown = [self.objects[index % len(self.objects)] for index in range(self.count)]
         basis, lights = with_local_lights(load_light(LIGHT), [light.build() for light in KINDS[kind].local])
-        image, gray = (
-            ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
-            torch.full((1, 1, size, size), 0.5),
-        )
-        scene = Scene.grid(
-            shown, CAMERA, gray, lights.to(self.device), image, choose("auto"), shared=False, basis=basis
-        )
+        image = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")
+        given = CAMERA, torch.full((1, 1, size, size), 0.5), lights.to(self.device), image, choose("auto")
+        scene = Scene.grid(shown, *given, shared=False, basis=basis)
         return vary(scene, VARIATION, generator(self.seed, "views"))
 
 
@@ -92,55 +88,59 @@ def recognized(classifier: Classifier, views: Views, environments: Sequence[str]
     for name, light in progress(lights.items(), "renders in other light"):
         with torch.no_grad():
             images = scene.render(Conditions(light.to(scene.lights).expand(len(scene), -1, -1)), rows)
-        correct[name] = (~_wrong(classifier, scene, images)).tolist()
+        correct[name] = _correct(classifier, scene, images).tolist()
     return correct
 
 
-def _wrong(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
-    """(E,) bool: whether images (E, 1, 3, H, W) are misclassified; resized where the classifier takes another size."""
-    if images.shape[-1] != classifier.size:
-        resize: dict[str, Any] = {"mode": "bilinear", "antialias": True, "align_corners": False}
-        images = F.interpolate(images[:, 0], (classifier.size, classifier.size), **resize)[:, None].clamp(0, 1)
-    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=images.device)
-    return logits_of(classifier, images, BATCH)[:, 0].argmax(1) != labels
+def _correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
+    """(E,) bool: whether images (E, 1, 3, H, W) of a scene, whose objects are of one class, are classified as it."""
+    return logits_of(classifier, images, BATCH)[:, 0].argmax(1) == classifier.label(scene.labels[0])
 
 
-def adversaries(classifier: Classifier, scene: Scene, kind: str, seed: int, further: bool = False) -> AttackResult:
+def adversaries(classifier: Classifier, views: Views, kind: str, further: bool = False) -> AttackResult:
     """An attack within a kind's largest radius, by signed steps of a quarter of it, until the classifier errs; or all
     of FURTHER steps, however surely it errs."""
     radius = KINDS[kind].radii[-1]
     changed = {kind: (SkylightSettings if kind == "skylight" else StepSettings)("linf", radius, "sign", radius / 4)}
     options: dict[str, Any] = {"max_steps": FURTHER, "margin": FACTOR} if further else {"max_steps": STEPS, "margin": 0}
     settings = AttackSettings(**(options | changed), batch_size=BATCH)
-    return attack(classifier, scene, settings=settings, seed=seed, force=True)
+    return attack(classifier, views.scene(classifier.size, kind), settings=settings, seed=views.seed, force=True)
 
 
 def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """n: views; correct: of these, before. adversarial, random: at each radius, how many of the correct ones a descent
-    or random draws turn wrong, and the draws alone. One is written to out/KIND.png; predicted: its classes."""
-    scene, radii = views.scene(classifier.size, kind), KINDS[kind].radii
-    result = adversaries(classifier, scene, kind, views.seed)
-    clean, rows = result.clean_correct, success_by_radius(result, [radius / radii[-1] for radius in radii])
-    rows[-1]["adversarial"] |= result.success[clean].cpu()  # from the start, not from where smaller radii ended
-    counts: dict[str, Any] = {"adversarial": [int((row["adversarial"] | row["random"]).sum()) for row in rows]}
-    counts["random"] = [int(row["random"].sum()) for row in rows]
-    if (clean & result.success).any():
-        row = int((clean & result.success).nonzero()[0])
+    or random draws turn wrong, and the draws alone. The adversaries at the largest radius are kept in out/KIND.npz for
+    `transfers`; one is written to out/KIND.png; predicted: its classes."""
+    result, radii = adversaries(classifier, views, kind), KINDS[kind].radii
+    clean, by_radius = result.clean_correct, success_by_radius(result, [radius / radii[-1] for radius in radii])
+    by_radius[-1]["adversarial"] |= result.success[clean].cpu()  # from the start, not from where smaller radii ended
+    counts: dict[str, Any] = {"adversarial": [int((row["adversarial"] | row["random"]).sum()) for row in by_radius]}
+    counts["random"] = [int(row["random"].sum()) for row in by_radius]
+    wrong = clean & result.success
+    np.savez(out / f"{kind}.npz", wrong=wrong.cpu(), values=result.descent.values.cpu())
+    if wrong.any():
+        row = int(wrong.nonzero()[0])
         logits = torch.stack([result.logits_before[row, 0], result.logits[row, 0]])
         counts["predicted"] = predictions(logits, classifier.classes)["predicted"]
         pair = to_bytes(torch.cat([result.images_before[row, 0], result.images[row, 0]], dim=2).cpu()).permute(1, 2, 0)
-        enlarged = pair.repeat_interleave(factor := max(1, SIDE // scene.settings.size), 0).repeat_interleave(factor, 1)
-        Image.fromarray(enlarged.numpy()).save(out / f"{kind}.png")
-    return {"n": len(scene), "correct": int(clean.sum()), **counts}
+        method = Image.Resampling.NEAREST if classifier.size < SIDE else Image.Resampling.LANCZOS
+        Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method).save(out / f"{kind}.png")
+    return {"n": views.count, "correct": int(clean.sum()), **counts}
 
 
-def transfers(attacked: Classifier, other: Classifier, views: Views) -> dict[str, dict[str, list[int]]]:
-    """[successes, n] by kind of adversaries shown to another classifier, which is right before in `n`."""
+def transfers(attacked: Classifier, other: Classifier, views: Views, out: Path) -> dict[str, dict[str, list[int]]]:
+    """[successes, n] by kind of adversaries, those that `success_by_light` kept in `out` and further ones, rendered at
+    the size of another classifier, which is right before in `n`."""
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
-        scene, counts[kind] = views.scene(attacked.size, kind), {}
-        for name in ("first", "further"):
-            result = adversaries(attacked, scene, kind, views.seed, name == "further")
-            counted = result.clean_correct & result.success & ~_wrong(other, scene, result.images_before)
-            counts[kind][name] = [int((counted & _wrong(other, scene, result.images)).sum()), int(counted.sum())]
+        result = adversaries(attacked, views, kind, further=True)
+        found = {"further": (result.clean_correct & result.success, result.descent.values)}
+        with np.load(out / f"{kind}.npz") as kept:
+            found["first"] = torch.from_numpy(kept["wrong"]), torch.from_numpy(kept["values"])
+        problem = result.settings.problem(views.scene(other.size, kind))
+        right, counts[kind] = _correct(other, problem.scene, problem.images(problem.start)), {}
+        for name, (wrong, values) in found.items():
+            both = wrong.to(right) & right
+            lost = both & ~_correct(other, problem.scene, problem.images(values.to(problem.start)))
+            counts[kind][name] = [int(lost.sum()), int(both.sum())]
     return counts

@@ -27,9 +27,11 @@ SAFE = 0.9  # least fraction of the label that is recognized, and of other thing
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]  # by name of a network, and part
 
 
-def write_audit_page(label: str, names: Mapping[str, str], folders: Mapping[str, Path], out: Path) -> Path:
+def write_audit_page(
+    label: str, names: Mapping[str, str], folders: Mapping[str, Path], out: Path, left_out: Sequence[str]
+) -> Path:
     """Write report.html of the parts in `out`. names: of the networks, by their folders. folders: of the images that
-    were scored, by part."""
+    were scored, by part. left_out: sentences on what was not."""
     at = {name: out / key for key, name in names.items()}
     counts = {name: {kind: read_json(path / f"{kind}.json") for kind in KINDS} for name, path in at.items()}
     correct = {name: read_json(path / RECOGNIZED) for name, path in at.items()}
@@ -51,7 +53,10 @@ def write_audit_page(label: str, names: Mapping[str, str], folders: Mapping[str,
     }
     content |= {"title": f"Audit: {label} in strange light", "about": " and ".join(at), "label": label}
     content |= {"kinds": KINDS, "steps": (STEPS, FURTHER), "counts": counts, "correct": correct, "pictures": pictures}
-    content |= {"agreement": fraction(sum(same), len(same)), "config": read_config(out / CONFIG)}
+    for key in folders:
+        if files := read_json(path / key / SUMMARY)["unreadable"]:  # by all networks
+            left_out = [*left_out, f"{len(files)} of the {key} cannot be read, the first being {files[0]}."]
+    content |= {"left_out": left_out, "agreement": fraction(sum(same), len(same)), "config": read_config(out / CONFIG)}
     return write_page(out, "audit.html.jinja", **content)
 
 
@@ -63,7 +68,7 @@ def _answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
         scores = read_json(folder / part / SUMMARY)
         texts[f"it recognizes {{:.0%}} of {label} in the {part}"] = scores["recall"], False
         texts[f"it takes {{:.0%}} of other things for {label} in the {part}"] = scores["false_positive_rate"], True
-    faults, known = list[str](), True
+    faults, known = list[str](), bool(parts)
     for text, (rate, false) in texts.items():
         if rate["value"] is not None:
             worst, value = (1 - rate["high"], 1 - rate["value"]) if false else (rate["low"], rate["value"])
@@ -97,15 +102,12 @@ def _worst(label: str, folders: Mapping[str, Path], scored: Predictions) -> dict
         rows.sort(key=lambda row: row[2].log_odds)
         own = [row for row in rows if row[2].photograph.label == label][:WORST]
         others = [row for row in reversed(rows) if row[2].photograph.label != label][:WORST]
-        for title, chosen in (
-            (f"{label} that {name} doubts most", own),
-            (f"what {name} most takes for {label}", others),
-        ):
+        galleries = {f"{label} that {name} doubts most": own, f"what {name} most takes for {label}": others}
+        for title, chosen in galleries.items():
             pictures[title] = []
             for part, index, item in chosen:
-                texts = [
-                    f"{n}: {scored[n][part][index].probability:.0%} {scored[n][part][index].predicted}" for n in scored
-                ]
+                about = {network: predictions[part][index] for network, predictions in scored.items()}
+                texts = [f"{network}: {each.probability:.0%} {each.predicted}" for network, each in about.items()]
                 caption = f"{item.photograph.label}, {item.photograph.source}: {'; '.join(texts)}"
                 image = Image.fromarray(read_square(folders[part] / item.photograph.path, SIDE))
                 pictures[title].append(plots.encoded(image, caption, caption))

@@ -5,6 +5,8 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cache
 from math import prod
 from pathlib import Path, PurePosixPath
 from typing import NoReturn
@@ -50,20 +52,21 @@ def require_outside(out: Path, folder: Path) -> None:
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
     """The images of a folder, sorted by path, each with its class.
 
-    The folder holds either a sub-folder per class, named as in `classes` (or `other_NAME` for a class that the model
-    lacks), or images only, which are then all of class `label`, if that is one. Sub-folders are searched to any depth,
-    through symbolic links, too; hidden files and other kinds (`left_out`) are skipped. A `photos.csv` gives sources in
-    its columns `path` and `source_tag`; its column `hard_negatives` names further sources, separated by `;`, and `mesh`
-    the object, over which intervals are taken, too.
+    The folder holds either a sub-folder per class, named as in `classes`, or images only, which are then all of class
+    `label`, if that is one. A sub-folder of no class shows other things, with a warning unless it is named `other_*`.
+    Sub-folders are searched to any depth, through symbolic links, too; hidden files and other kinds (`left_out`) are
+    skipped. A `photos.csv` gives sources in its columns `path` and `source_tag`; its column `hard_negatives` names
+    further sources, separated by `;`, and `mesh` the object, over which intervals are taken, too.
 
-    InputError: the folder is missing, unreadable, empty or mixes both layouts; a sub-folder or `label` is not a class;
-    `photos.csv` lacks its columns, contradicts itself, or names no file of the folder or a source without images.
+    InputError: the folder is missing, unreadable, empty or mixes both layouts; `label` is not a class; a sub-folder is
+    none, but has a name like `label`; no sub-folder is a class; `photos.csv` lacks its columns, contradicts itself, or
+    names no file of the folder or a source without images.
     """
     only, *others = label_names(label)
     for name in (only, *others):
         class_index(classes, name, "label")
     paths, files = _image_files(folder)
-    nested = _has_class_folders(folder, paths, classes)
+    nested = _has_class_folders(folder, paths, classes, label_names(label))
     if others and not nested:
         raise InputError(f"{folder} has no class folders, and label names several classes: put its images into some")
     rows = _read_table(folder / TABLE)
@@ -71,7 +74,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
         fault = f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, like {unknown[0]}"
         if len(unknown) == len(rows):
             raise InputError(f"{fault}; give paths such as {paths[0]}")
-        console.warning(fault)
+        _warn_once(fault)
     photographs = [
         Photograph(path, path.parts[0] if nested else only, *rows.get(path, (None, (), None))) for path in paths
     ]
@@ -102,6 +105,11 @@ def left_out(folder: Path) -> list[PurePosixPath]:
     return sorted(path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in known)
 
 
+@cache
+def _warn_once(text: str) -> None:
+    console.warning(text)
+
+
 def is_hidden(name: str) -> bool:
     """Whether a file or folder belongs to the system rather than to the user."""
     return name.startswith(".") or name == MACS
@@ -121,13 +129,21 @@ def _files(folder: Path) -> Iterator[PurePosixPath]:
         yield from (parent / name for name in files if not is_hidden(name))
 
 
-def _has_class_folders(folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str]) -> bool:
-    """Whether images lie in class folders; InputError for another folder, or for images beside folders."""
+def _has_class_folders(
+    folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str], labels: Sequence[str]
+) -> bool:
+    """Whether images lie in class folders; InputError for folders of no class alone, or for one that may be meant for a
+    label, or for images beside folders."""
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
-    for name in names:
-        if name not in classes and not name.startswith(FOREIGN):
+    others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
+    for name in others:
+        likely = [label for label in labels if label in name.lower() or get_close_matches(name.lower(), [label])]
+        if likely or others == names:
             fault = f"is not named after a class of the model (such as {nearest(name, classes)})"
-            raise InputError(f"{folder / name} {fault}: rename it, to {FOREIGN}{name} if the model lacks its class")
+            raise InputError(f"{folder / name} {fault}: rename it, to {FOREIGN}{name} if it shows other things")
+    if others:
+        count = f"{len(others)} of {len(names)} folders in {folder}"
+        _warn_once(f"{count} are of no class of the model and count as other things: {', '.join(others)}")
     if names and (loose := [path for path in paths if len(path.parts) == 1]):
         raise InputError(f"{folder / loose[0]} lies beside class folders: move it into the folder of its class")
     return bool(names)

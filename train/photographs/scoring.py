@@ -30,10 +30,17 @@ COUNTED_EACH = ", once for each of these classes"  # after the number of other t
 Device = str | torch.device
 
 
-def _predict_folder(
-    model: Model, classes: Sequence[str], folder: Path, label: Label, size: int, skip: bool, device: Device
+def predict_folder(
+    model: Model,
+    classes: Sequence[str],
+    folder: Path,
+    label: Label,
+    size: int,
+    skip: bool = False,
+    device: Device = "cpu",
 ) -> tuple[list[Prediction], torch.Tensor, list[str], str]:
-    """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all."""
+    """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all.
+    Arguments and InputError: see `evaluate_photographs`."""
     found = find_photographs(folder, classes, label)
     photographs, images, unreadable = load_photographs(folder, found, size, skip)
     logits = compute_logits(model, images, len(classes), device)
@@ -83,7 +90,7 @@ def evaluate_photographs(
     """
     require_outside(out, folder)
     labels = label_names(label)
-    scored = _predict_folder(model, classes, folder, labels, size, skip_unreadable, device)
+    scored = predict_folder(model, classes, folder, labels, size, skip_unreadable, device)
     predictions, images, unreadable, images_hash = scored
     if by == "mesh" and not any(item.photograph.mesh for item in predictions):
         raise InputError(f"by=mesh: {folder} has no {TABLE} with a column mesh: leave it out")
@@ -133,7 +140,7 @@ def choose_operating_points(
     An image that ties with it does not exceed it. Arguments and InputError as of `evaluate_photographs`, and InputError
     for fewer than 1 / rate images of other things.
     """
-    predictions, _, _, images_hash = _predict_folder(model, classes, folder, label, size, skip, device)
+    predictions, _, _, images_hash = predict_folder(model, classes, folder, label, size, skip, device)
     points = []
     for name in label_names(label):
         negatives = np.array([item.log_odds for item in predictions if item.label == name and not item.positive])

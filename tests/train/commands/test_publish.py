@@ -48,11 +48,29 @@ def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_pat
     files = [path for path in sorted(photos.rglob("*.png")) if path.parent.name != "orange"]
     images = torch.stack([torch.from_numpy(np.array(read_square(path, 16))).permute(2, 0, 1) / 255 for path in files])
     odds = torch.logit(network(images).double().softmax(1)[:, 1])
-    assert network.operating_point.threshold == pytest.approx(float(odds.sort().values[1]), rel=1e-5)
+    (point,) = network.operating_points
+    assert point.threshold == pytest.approx(float(odds.sort().values[1]), rel=1e-5)
     assert network.detect(images).sum() == 2
     evaluate.main.__wrapped__(evaluate.Settings(str(second), photos=str(photos), out=str(tmp_path / "scores")))
     summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
-    assert summary["operating_point"] == vars(network.operating_point) | {"in_sample": True}
+    assert summary["operating_point"] == vars(point) | {"in_sample": True}
+
+
+def test_each_of_several_labels_has_its_own_threshold(finished, photos, tmp_path):
+    labels, both = ["orange", "apple"], tmp_path / "both"
+    for name, label in {"both": labels, "orange": "orange", "apple": "apple"}.items():
+        main.__wrapped__(Settings(str(finished), str(tmp_path / name), 0.5, str(photos), label))
+    network, images = load_run(both), torch.rand(9, 3, 16, 16)
+    for label, point in zip(labels, network.operating_points, strict=True):
+        (own,) = load_run(tmp_path / label).operating_points
+        assert (point.label, point.threshold) == (label, own.threshold)
+        assert torch.equal(network.detect(images, label), load_run(tmp_path / label).detect(images))
+    with pytest.raises(InputError, match="but of orange, apple: give one of these as label"):
+        network.detect(images)
+    settings = evaluate.Settings(str(both), photos=str(photos), label=labels[::-1], out=str(tmp_path / "scores"))
+    evaluate.main.__wrapped__(settings)
+    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
+    assert [point["label"] for point in summary["operating_point"]] == labels[::-1]
 
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):

@@ -85,6 +85,8 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
         (("a.jpg",), "a.jpg", "orange", r"a\.jpg is not a folder"),
         (("orange/notes.txt",), ".", "orange", "holds no photographs"),
         (("Oranges/a.jpg",), ".", "orange", "Oranges is not .*such as orange, .* other_Oranges"),
+        (("pear/a.jpg", "blood_oranges/b.jpg"), ".", "orange", "blood_oranges is not .* other_blood_oranges if"),
+        (("lion/a.jpg", "bee/b.jpg"), ".", "orange", "bee is not named after a class"),
         (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
         (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
         (("a.jpg",), ".", ["orange", "pear"], "has no class folders, and label names several classes"),
@@ -94,6 +96,12 @@ def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, m
     touch(tmp_path, *files)
     with pytest.raises(InputError, match=message):
         find_photographs(tmp_path / folder, CLASSES, label)
+
+
+def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tmp_path, caplog):
+    found = find(touch(tmp_path, "orange/a.jpg", "lion/b.jpg", "other_bee/c.jpg"))
+    assert found == [("lion/b.jpg", "lion"), ("orange/a.jpg", "orange"), ("other_bee/c.jpg", "other_bee")]
+    assert "1 of 3 folders" in caplog.text and "count as other things: lion" in caplog.text
 
 
 def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns(tmp_path, caplog):
