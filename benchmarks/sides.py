@@ -40,14 +40,14 @@ from train.loop import evaluate
 from train.networks import load_run
 from train.photographs.folder import TABLE
 from train.photographs.metrics import METRICS, OVERALL, metric_title, pool_by
-from train.photographs.predictions import PREDICTIONS, read_predictions
-from train.photographs.scoring import evaluate_photographs
+from train.photographs.predictions import PREDICTIONS, write_predictions
+from train.photographs.scoring import predict_folder
 from train.report.compare import Evaluation, difference, mean_metric
 from train.report.summary import summarize
 from train.tables import Table, format_interval
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
-LABEL, VALIDATION, BY = "orange", 0.02, {"photographs": "source"}
+LABEL, VALIDATION = "orange", 0.02
 LEFT_OUT = ("turntable", "studio")  # photographs of few objects, whose two halves would show the same ones
 TRAINED = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}  # meshes of training, with their albedo_scale
 OUTSIDE = {  # meshes from no generator of ours and in no training, in DATA or in packages
@@ -140,18 +140,18 @@ def make(args: argparse.Namespace) -> None:
 
 def log_looks(args: argparse.Namespace, networks: list[str], folders: list[Path]) -> None:
     """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
+    weights = {name: content_hash(load_run(name).state_dict())[:12] for name in networks}
     looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
         images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     for name in networks:
-        weights = content_hash(load_run(name).state_dict())[:12]
-        if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights)]:
+        if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights[name])]:
             print(f"{name} was looked at for {args.table!r} before, on {', '.join(days)}")
         with LOG.open("a", encoding="utf-8", newline="") as file:
-            parts = " ".join(folder.name for folder in folders)
-            row = date.today(), commit.strip(), args.table, name, weights, parts, images.hexdigest()[:12]
+            shown = " ".join(folder.name for folder in folders)
+            row = date.today(), commit.strip(), args.table, name, weights[name], shown, images.hexdigest()[:12]
             csv.writer(file, lineterminator="\n").writerow(row)
 
 
@@ -160,9 +160,14 @@ def score(args: argparse.Namespace) -> None:
     side = {"choose": "choosing", "report": "reporting"}[args.command]
     folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
     folders = [folder for folder in folders if not args.part or folder.name in args.part]
+    if len(folders) < len(args.part or [1]):
+        raise SystemExit(f"{args.sides / side} lacks a part: --part takes its folders with {TABLE}")
     arms = {name: sorted(str(path.parent) for path in Path(name).glob("*/best.pt")) or [name] for name in args.networks}
     if side == "reporting":
         log_looks(args, [run for runs in arms.values() for run in runs], folders)
+    if args.data:
+        data = load_npz(str(args.data / "cifar100.npz"))
+        split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
     lines, scored = [], {}
     for arm, runs in arms.items():
         models = [MixedPrecision(load_run(run), choose_precision("auto", torch.device("cpu"))) for run in runs]
@@ -173,8 +178,6 @@ def score(args: argparse.Namespace) -> None:
                 cells = (format_interval(mean_metric(group, name, metric)) for metric in METRICS)
                 lines.append([arm, folder.name, Path(name).stem or "all", *cells])
         if args.data:
-            data = load_npz(str(args.data / "cifar100.npz"))
-            split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
             values = [evaluate(model, split)["accuracy"] for model in models]
             spread = {"low": min(values), "high": max(values)} if len(values) > 1 else {}
             accuracy = format_interval({"value": fmean(values), **spread})
@@ -189,15 +192,16 @@ def score(args: argparse.Namespace) -> None:
 
 
 def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> Evaluation:
-    """A run's predictions on a folder, pooled by object or source."""
-    network, by = model.network, BY.get(folder.name, "mesh")
-    out, point = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name), network.operating_point
-    points = [point] if point else []
-    evaluate_photographs(model, network.classes, folder, LABEL, out, network.size, by=by, points=points)
-    thresholds = {point.label: point.threshold for point in points}
-    return Evaluation(
-        summarize(Path(run)), pool_by(read_predictions(out / PREDICTIONS, LABEL), by, thresholds=thresholds)
-    )
+    """A run's predictions on a folder, pooled by source, which is a pattern, a map or where photographs come from, and
+    by object."""
+    network = model.network
+    predictions, *_ = predict_folder(model, network.classes, folder, LABEL, network.size)
+    out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
+    out.mkdir(parents=True, exist_ok=True)
+    write_predictions(out / PREDICTIONS, predictions)
+    thresholds = {point.label: point.threshold for point in network.operating_points}
+    pools = [pool_by(predictions, by, thresholds=thresholds) for by in ("mesh", "source")]
+    return Evaluation(summarize(Path(run)), pools[1] | pools[0])
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -209,6 +213,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
     parser.add_argument("--table", default="", help="of report: the name of the table that the scores are for")
     arguments = parser.parse_args(argv)
+    if arguments.command == "report" and not arguments.table:
+        parser.error("report takes --table NAME, under which docs/reporting.csv records the look")
     make(arguments) if arguments.command == "make" else score(arguments)
 
 
