@@ -9,7 +9,7 @@ python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides 
 python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
 
 DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is an arm: of several seeds, the table has the mean,
-the lowest and the highest.
+the lowest and the highest. A network may also be efficientnet_lite0 or another classifier, for images of --size pixels.
 """
 
 import argparse
@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from augment.classifiers import Classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoint import content_hash
@@ -37,13 +38,13 @@ from train.device import MixedPrecision, choose_precision
 from train.lab.laboratory import write_laboratory
 from train.lab.shots import LabSettings
 from train.loop import evaluate
-from train.networks import load_run
+from train.networks import build_network, is_classifier, load_initial, load_run
 from train.photographs.folder import TABLE
 from train.photographs.metrics import METRICS, OVERALL, metric_title, pool_by
-from train.photographs.predictions import PREDICTIONS, write_predictions
+from train.photographs.predictions import PREDICTIONS, Prediction, write_predictions
 from train.photographs.scoring import predict_folder
 from train.report.compare import Evaluation, difference, mean_metric
-from train.report.summary import summarize
+from train.report.summary import RunSummary, summarize
 from train.tables import Table, format_interval
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
@@ -135,12 +136,23 @@ def make(args: argparse.Namespace) -> None:
         divide_photographs(args.data / "photos", args.sides)
     for name, settings in parts(args.data.resolve(), extra).items():
         if not args.part or name in args.part:
-            print(name, write_laboratory(LabSettings(out=str(args.sides / name), **settings)), "renders")
+            lab = LabSettings(out=str(args.sides / name), size=args.size, **settings)
+            print(name, write_laboratory(lab), "renders")
+
+
+def load(name: str, size: int) -> Classifier:
+    """A run's network, or a classifier of others for images of a size."""
+    if not is_classifier(name):
+        return load_run(name)
+    facts, weights = load_initial(name, None, size)[1].values()
+    network = build_network(**facts)
+    network.load_state_dict(weights)
+    return Classifier(network, size, facts["classes"], name)
 
 
 def log_looks(args: argparse.Namespace, networks: list[str], folders: list[Path]) -> None:
     """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
-    weights = {name: content_hash(load_run(name).state_dict())[:12] for name in networks}
+    weights = {name: content_hash(load(name, args.size).state_dict())[:12] for name in networks}
     looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
         images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
@@ -168,32 +180,40 @@ def score(args: argparse.Namespace) -> None:
     if args.data:
         data = load_npz(str(args.data / "cifar100.npz"))
         split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
-    lines, scored = [], {}
+    lines, scored, answers, blank = [], {}, {}, [""] * (len(METRICS) - 1)
     for arm, runs in arms.items():
-        models = [MixedPrecision(load_run(run), choose_precision("auto", torch.device("cpu"))) for run in runs]
+        models = [MixedPrecision(load(run, args.size), choose_precision("auto", torch.device("cpu"))) for run in runs]
         for folder in folders:
-            group = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
+            pairs = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
+            group, answers[arm, folder] = zip(*pairs, strict=True)
             scored[arm, folder] = group
             for name in group[0].pools:
                 cells = (format_interval(mean_metric(group, name, metric)) for metric in METRICS)
                 lines.append([arm, folder.name, Path(name).stem or "all", *cells])
         if args.data:
             values = [evaluate(model, split)["accuracy"] for model in models]
-            spread = {"low": min(values), "high": max(values)} if len(values) > 1 else {}
-            accuracy = format_interval({"value": fmean(values), **spread})
-            lines.append([arm, "CIFAR-100", "accuracy", accuracy, *[""] * (len(METRICS) - 1)])
+            lines.append([arm, "CIFAR-100", "accuracy", mean_and_range(values), *blank])
     first, *others = arms
     for folder in folders:
         for arm in others:
             pair = scored[arm, folder], scored[first, folder]
             cells = (format_interval(difference(*pair, OVERALL, metric), "+") for metric in METRICS)
             lines.append([f"{arm} - {first}", folder.name, "all", *cells])
+            for group, positive in (("same class", True), ("same class, other things", False)):
+                pairs = (zip(own, answers[first, folder][0], strict=True) for own in answers[arm, folder])
+                same = [fmean(a.predicted == b.predicted for a, b in x if positive or not b.positive) for x in pairs]
+                lines.append([f"{arm} - {first}", folder.name, group, mean_and_range(same), *blank])
     print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
 
 
-def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> Evaluation:
+def mean_and_range(values: Sequence[float]) -> str:
+    """Of a number for each seed."""
+    return format_interval({"value": fmean(values)} | ({"low": min(values), "high": max(values)} if values[1:] else {}))
+
+
+def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> tuple[Evaluation, list[Prediction]]:
     """A run's predictions on a folder, pooled by source, which is a pattern, a map or where photographs come from, and
-    by object."""
+    by object; and each."""
     network = model.network
     predictions, *_ = predict_folder(model, network.classes, folder, LABEL, network.size)
     out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
@@ -201,7 +221,8 @@ def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> Evalu
     write_predictions(out / PREDICTIONS, predictions)
     thresholds = {point.label: point.threshold for point in network.operating_points}
     pools = [pool_by(predictions, by, thresholds=thresholds) for by in ("mesh", "source")]
-    return Evaluation(summarize(Path(run)), pools[1] | pools[0])
+    summary = RunSummary(Path(run), run, {}, {}, None) if is_classifier(run) else summarize(Path(run))
+    return Evaluation(summary, pools[1] | pools[0]), predictions
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -210,6 +231,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
     for option in ("--data", "--sides", "--packages"):
         parser.add_argument(option, type=Path, required=option == "--sides")
+    parser.add_argument("--size", type=int, default=64, help="of a render, in pixels per side")
     parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
     parser.add_argument("--table", default="", help="of report: the name of the table that the scores are for")
     arguments = parser.parse_args(argv)

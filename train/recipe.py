@@ -24,6 +24,7 @@ Loss = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 OPTIMIZERS = ("sgd", "adamw")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
+ALL_BUT_LAST = "all_but_last"  # of train.freeze: only the last layer learns, as in Kirichenko et al. 2023
 PGD_RADIUS, PGD_STEP, PGD_STEPS = 2 / 255, 1 / 255, 3  # L∞ norm; Madry et al. 2018: 8/255 on CIFAR-10
 LARGEST = dict(
     epochs=10**6, images_per_epoch=10**9, batch_size=10**6, accumulate=10**6, checkpoint_every=10**6, threads=1024
@@ -109,10 +110,14 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
 
 
 def freeze(network: nn.Module, stage: str) -> None:
-    """Let the parameters of a network stay as they are, from its first one to the last of the module of that name.
-    InputError: there is no such module, or it has none."""
+    """Let the parameters of a network stay as they are, from its first one to the last of the module of that name, or
+    to the one before its last layer (ALL_BUT_LAST). InputError: there is no such module, or it has none."""
     names = [name for name, _ in network.named_parameters()]
-    if not (frozen := [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]):
+    if stage == ALL_BUT_LAST:
+        frozen = [index for index, name in enumerate(names) if name.rpartition(".")[0] != names[-1].rpartition(".")[0]]
+    else:
+        frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
+    if not frozen:
         parts = nearest(stage, sorted({name.rpartition(".")[0] for name in names}))
         raise InputError(f"train.freeze={stage} is no part of the network: choose one, such as {parts}")
     for parameter in list(network.parameters())[: frozen[-1] + 1]:

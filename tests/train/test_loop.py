@@ -129,13 +129,14 @@ def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
     assert resumed.scaler.get_scale() == trainer.scaler.get_scale() == 256
 
 
-def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path):
+@pytest.mark.parametrize("stage, trained", [("groups.1", ("groups.2", "norm", "head")), ("all_but_last", ("head",))])
+def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trained):
     network = WideResNet(3, 10, 1, dropout=0.0)
     before = {name: value.clone() for name, value in network.named_parameters()}
-    freeze(network, "groups.1")
+    freeze(network, stage)
     fit_noise(make_trainer(tmp_path, network, epochs=1))
     changed = [name for name, value in network.named_parameters() if not torch.equal(value, before[name])]
-    assert changed and all(name.startswith(("groups.2", "norm", "head")) for name in changed)
+    assert changed and all(name.startswith(trained) for name in changed)
     with pytest.raises(InputError, match=r"train.freeze=group.1 is no part of the network: choose one, such as groups"):
         freeze(network, "group.1")
 
