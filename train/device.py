@@ -88,20 +88,22 @@ def set_deterministic(deterministic: bool) -> None:
 def choose_precision(precision: str, device: torch.device, trained: nn.Module | None = None) -> str:
     """One of PRECISIONS; "auto" takes bfloat16 where the device computes in it rather than emulate it, otherwise
     float16 on a GPU and float32 on a CPU. There it takes float32, too, to train a network of depthwise convolutions,
-    whose gradients in bfloat16 take 3 times as long."""
+    whose gradients in bfloat16 take 3 times as long; and warns of bfloat16 by name where that is emulated."""
     require_choice("train.precision", precision, ("auto", *PRECISIONS))
+    if device.type == "cuda":
+        known = torch.cuda.is_bf16_supported(including_emulation=False)
+        return precision if precision != "auto" else "bfloat16" if known else "float16"
+    if platform.machine() in ("x86_64", "AMD64"):
+        known = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    else:
+        known = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    if precision == "bfloat16" and not known:
+        console.warning("this CPU emulates bfloat16, some 10 times slower than float32: leave train.precision out")
     if precision != "auto":
         return precision
-    if device.type == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float16"
     layers = [] if trained is None else [layer for layer in trained.modules() if isinstance(layer, nn.Conv2d)]
-    if any(layer.groups == layer.in_channels > 1 for layer in layers):
-        return "float32"
-    if platform.machine() in ("x86_64", "AMD64"):
-        supported = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
-    else:
-        supported = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    return "bfloat16" if supported else "float32"
+    depthwise = any(layer.groups == layer.in_channels > 1 for layer in layers)
+    return "bfloat16" if known and not depthwise else "float32"
 
 
 class MixedPrecision(nn.Module):

@@ -77,12 +77,14 @@ def test_all_cores_are_taken_where_they_are_clearly_faster_than_one(monkeypatch,
         (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported"),
     ],
 )
-def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, where, machine, rule, supported):
+def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, caplog, where, machine, rule, supported):
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     monkeypatch.setattr(rule, lambda **options: supported)
     expected = "bfloat16" if supported else "float32" if where.type == "cpu" else "float16"
     assert choose_precision("auto", where) == expected
-    assert choose_precision("float32", where) == "float32"
+    assert choose_precision("float32", where) == "float32" and not caplog.records
+    assert choose_precision("bfloat16", where) == "bfloat16"
+    assert bool(caplog.records) == (where.type == "cpu" and not supported)
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
     assert choose_precision("auto", where, grouped) == expected
     assert choose_precision("auto", where, depthwise) == ("float32" if where.type == "cpu" else expected)
