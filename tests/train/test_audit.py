@@ -160,7 +160,14 @@ def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_render
         (tmp_path / "lab" / label).mkdir(parents=True)
         Image.new("RGB", (8, 8), "black" if label == "orange" else "white").save(tmp_path / "lab" / label / "a.png")
     folders = {"look_alikes": [], "laboratory": str(tmp_path / "lab"), "out": str(tmp_path / "ready")}
-    assert text not in run_audit(AuditSettings(**given | folders)).read_text()
+    monkeypatch.setattr(
+        audit, "load_classifier", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name])
+    )
+    monkeypatch.setattr(
+        audit, "transfers", lambda *arguments: {kind: {"first": [0, 0], "further": [0, 0]} for kind in KINDS}
+    )
+    report = run_audit(AuditSettings(**given | folders, hardened="larger")).read_text()
+    assert text not in report and "The networks take images of 8 and 12 pixels" in report
     summary = json.loads((tmp_path / "ready/classifier/laboratory/summary.json").read_text())
     assert summary["recall"]["value"] == 1 and summary["false_positive_rate"]["value"] == 0
 

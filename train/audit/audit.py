@@ -111,15 +111,19 @@ def run_audit(settings: AuditSettings) -> Path:
     lights = [UNIFORM, *settings.environments], settings.times(LIGHTS)
     views, attacked = (Views(objects, settings.times(n), settings.seed, device) for n in (VIEWS, ATTACKED))
     out = writable_folder(settings.out, "out")
-    left_out, renders = list[str](), out / "renders"  # an object of the label and another in every light
+    caveats, renders = list[str](), out / "renders"  # an object of the label and another in every light
+    sizes = [str(network.size) for network in networks.values()]
+    if len({*sizes}) > 1:
+        caveats.append(f"The networks take images of {' and '.join(sizes)} pixels, and differ by that, too.")
     lab = settings.renders(renders, max(network.size for network in networks.values()))
     if page.LABORATORY not in folders:
         try:
             with nullcontext() if renders.exists() else mitsuba():
                 folders = {page.LABORATORY: renders} | folders
         except InputError as error:
-            left_out.append(f"The laboratory is left out, and look_alikes with it ({error}).")
-            console.warning(left_out[0])
+            caveats.append(f"The laboratory is left out, and look_alikes with it ({error}).")
+    for sentence in caveats:
+        console.warning(sentence)
     with sole_writer("out", out):
         if (out / CONFIG).exists():
             require_same(out, settings, "out=", lambda key, old, new: old is None and key in ADDED)
@@ -139,7 +143,7 @@ def run_audit(settings: AuditSettings) -> Path:
             if rest:
                 _part(own / page.TRANSFER, transfers, network, *rest, attacked, own)
         names = {key: network.name for key, network in networks.items()}
-        return page.write_audit_page(settings.label, names, folders, out, left_out)
+        return page.write_audit_page(settings.label, names, folders, out, caveats)
 
 
 def _part(path: Path, measure: Callable[..., dict[str, Any]], *arguments: Any) -> None:

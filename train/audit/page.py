@@ -28,10 +28,10 @@ Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]  # by name of a n
 
 
 def write_audit_page(
-    label: str, names: Mapping[str, str], folders: Mapping[str, Path], out: Path, left_out: Sequence[str]
+    label: str, names: Mapping[str, str], folders: Mapping[str, Path], out: Path, caveats: Sequence[str]
 ) -> Path:
     """Write report.html of the parts in `out`. names: of the networks, by their folders. folders: of the images that
-    were scored, by part. left_out: sentences on what was not."""
+    were scored, by part. caveats: sentences that come first."""
     at = {name: out / key for key, name in names.items()}
     counts = {name: {kind: read_json(path / f"{kind}.json") for kind in KINDS} for name, path in at.items()}
     correct = {name: read_json(path / RECOGNIZED) for name, path in at.items()}
@@ -55,8 +55,8 @@ def write_audit_page(
     content |= {"kinds": KINDS, "steps": (STEPS, FURTHER), "counts": counts, "correct": correct, "pictures": pictures}
     for key in folders:
         if files := read_json(path / key / SUMMARY)["unreadable"]:  # by all networks
-            left_out = [*left_out, f"{len(files)} of the {key} cannot be read, the first being {files[0]}."]
-    content |= {"left_out": left_out, "agreement": fraction(sum(same), len(same)), "config": read_config(out / CONFIG)}
+            caveats = [*caveats, f"{len(files)} of the {key} cannot be read, the first being {files[0]}."]
+    content |= {"caveats": caveats, "agreement": fraction(sum(same), len(same)), "config": read_config(out / CONFIG)}
     return write_page(out, "audit.html.jinja", **content)
 
 
