@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.classifiers import Classifier
+from augment.classifiers import Classifier, build_classifier, load_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoint import content_hash
@@ -38,7 +38,7 @@ from train.device import MixedPrecision, choose_precision
 from train.lab.laboratory import write_laboratory
 from train.lab.shots import LabSettings
 from train.loop import evaluate
-from train.networks import build_network, is_classifier, load_initial, load_run
+from train.networks import is_classifier, load_run
 from train.photographs.folder import TABLE
 from train.photographs.metrics import METRICS, OVERALL, metric_title, pool_by
 from train.photographs.predictions import PREDICTIONS, Prediction, write_predictions
@@ -144,15 +144,14 @@ def load(name: str, size: int) -> Classifier:
     """A run's network, or a classifier of others for images of a size."""
     if not is_classifier(name):
         return load_run(name)
-    facts, weights = load_initial(name, None, size)[1].values()
-    network = build_network(**facts)
-    network.load_state_dict(weights)
-    return Classifier(network, size, facts["classes"], name)
+    classifier = build_classifier(name, size)
+    classifier.load_state_dict(load_classifier(name).state_dict())
+    return classifier
 
 
-def log_looks(args: argparse.Namespace, networks: list[str], folders: list[Path]) -> None:
+def log_looks(args: argparse.Namespace, networks: dict[str, Classifier], folders: list[Path]) -> None:
     """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
-    weights = {name: content_hash(load(name, args.size).state_dict())[:12] for name in networks}
+    weights = {name: content_hash(network.state_dict())[:12] for name, network in networks.items()}
     looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
         images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
@@ -175,14 +174,15 @@ def score(args: argparse.Namespace) -> None:
     if len(folders) < len(args.part or [1]):
         raise SystemExit(f"{args.sides / side} lacks a part: --part takes its folders with {TABLE}")
     arms = {name: sorted(str(path.parent) for path in Path(name).glob("*/best.pt")) or [name] for name in args.networks}
+    networks = {run: load(run, args.size) for runs in arms.values() for run in runs}
     if side == "reporting":
-        log_looks(args, [run for runs in arms.values() for run in runs], folders)
+        log_looks(args, networks, folders)
     if args.data:
         data = load_npz(str(args.data / "cifar100.npz"))
         split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
     lines, scored, answers, blank = [], {}, {}, [""] * (len(METRICS) - 1)
     for arm, runs in arms.items():
-        models = [MixedPrecision(load(run, args.size), choose_precision("auto", torch.device("cpu"))) for run in runs]
+        models = [MixedPrecision(networks[run], choose_precision("auto", torch.device("cpu"))) for run in runs]
         for folder in folders:
             pairs = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
             group, answers[arm, folder] = zip(*pairs, strict=True)
