@@ -15,6 +15,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
@@ -242,14 +243,18 @@ def savings(view: View) -> Iterator[tuple[str, Call, Call]]:
     yield "as many coefficients and channels without gloss", by_light, light_step(view, dense, light)
     yield "building an operator without gloss", shiny.operator, view.operator
 
-    def by_vertices(mesh: Mesh, silhouettes: bool = False) -> Call:
+    def by_vertices(mesh: Mesh, **options: Any) -> Call:
         moved = vertices.clone().requires_grad_()
-        options = {"rasterizer": view.rasterizer.name, "silhouettes": silhouettes}
+        options["rasterizer"] = view.rasterizer.name
         image = partial(rendering.render, mesh, CAMERA, light, view.size, vertices=moved, **options)
         return lambda: torch.autograd.grad(image().sum(), moved)
 
     yield "a step by the vertices without gloss", by_vertices(shiny.mesh), by_vertices(view.mesh)
-    yield "a step by the vertices with fixed outlines", by_vertices(view.mesh, True), by_vertices(view.mesh)
+    for normals, samples in product(("flat", "smooth"), (8, 2)):
+        everything, needed = (
+            by_vertices(view.mesh, silhouettes=moves, normals=normals, samples=samples) for moves in (True, False)
+        )
+        yield f"a step by the vertices with fixed outlines, {normals}, {samples}² samples", everything, needed
 
 
 # ---------------------------------------------------------------------------- results

@@ -100,7 +100,8 @@ class Fragments:
 
     def select(self, samples: Tensor) -> "Fragments":
         """Some of the samples (N,), in the same pixels."""
-        chosen: dict[str, Any] = {name: getattr(self, name)[samples] for name in ("pixel", "face", "sample")}
+        names = "pixel", "face", "sample"
+        chosen: dict[str, Any] = {name: getattr(self, name).index_select(0, samples) for name in names}
         return self._like(replace(self, **chosen), samples)
 
     def _like(self, view: "Fragments", samples: Tensor | slice) -> "Fragments":

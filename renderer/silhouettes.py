@@ -32,7 +32,7 @@ from renderer.rasterizer.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-LINES = 128  # rows and as many columns of samples, at least, along which surfaces' slopes are taken; in each pixel one
+LARGE = 128  # pixels per side: surfaces' slopes are taken along one row and column of samples per pixel, otherwise two
 NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on it
 
 
@@ -103,29 +103,29 @@ def _by_surface(
     positions: Tensor, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
 ) -> Tensor:
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
-    divisors = [step for step in range(1, fragments.samples + 1) if fragments.samples % step == 0]
-    stride = max(step for step in divisors if step == 1 or len(grid) >= LINES * step)
-    forces, levels = radiance.new_zeros(2, radiance.shape[1]), fragments.image_of_samples(radiance.sum(0), torch.nan)
+    stride = fragments.samples if fragments.size >= LARGE else max(fragments.samples // 2, 1)
+    forces, levels = radiance.new_zeros(2, radiance.shape[1]), F.pad(radiance.sum(0), (0, 1), value=torch.nan)
     for axis, force in enumerate(forces):
-        images = (grid, levels) if axis == 0 else (grid.T, levels.T)
-        lines, level = (image[stride // 2 :: stride].contiguous() for image in images)
+        lines = (grid if axis == 0 else grid.T)[stride // 2 :: stride].contiguous()
+        level = levels[lines]  # where nothing is covered, of sample -1
         differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
         first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
         before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]
         goes_on = torch.ones_like(force).index_fill(0, before[(before >= 0) & (after >= 0)], 0)
         jump = radiance.index_select(1, first) - radiance.index_select(1, second)
         jump *= sum(upstream.index_select(1, fragments.pixel.index_select(0, pair)) for pair in (first, second))
-        moved = jump.sum(0) * goes_on[first] * (stride / 2 if axis == 0 else -stride / 2)  # rows run down
+        jump = jump.sum(0) * goes_on.index_select(0, first)
+        moved = jump * (stride / 2 if axis == 0 else -stride / 2)  # rows run down
         force.index_add_(0, first, moved).index_add_(0, second, moved)
-    moving = torch.nonzero(forces.abs().sum(0)).squeeze(1)
-    part, forces = fragments.select(moving), forces.T[moving]
+    moving = torch.nonzero((forces[0] != 0) | (forces[1] != 0)).squeeze(1)
+    part, forces = fragments.select(moving), forces.index_select(1, moving).T
     if fragments.depths is not None:
         depth = part.interpolate(positions[:, 2:][part.corners])
         forces = _homogeneous(forces, part.positions(), depth)
-    by_corners = part.distribute(forces).flatten(0, 1).double()
-    gradient = torch.zeros_like(positions)
-    gradient[:, : forces.shape[1]].index_add_(0, part.corners.flatten(), by_corners)
-    return gradient
+    by_corners = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
+    gradient = positions.new_zeros(positions.shape[::-1])
+    gradient[: forces.shape[1]].index_add_(1, part.corners.T.flatten(), by_corners)
+    return gradient.T
 
 
 def _by_silhouettes(
@@ -240,7 +240,7 @@ def _silhouettes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
     (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
     turn = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
     sides = np.bincount(edge, (turn[:, None] * forth).ravel(), len(count))
-    return ends[:, np.abs(sides) > count - 2]  # of two faces, one may be seen edge-on
+    return ends.take(np.flatnonzero(np.abs(sides) > count - 2), axis=1)  # of two faces, one may be seen edge-on
 
 
 @lru_cache(maxsize=4)
