@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,17 @@ import pytest
 import torch
 from PIL import Image
 
+import renderer
+from renderer.camera import OrthographicCamera
+from renderer.io.images import read_image
 from renderer.light.environment import to_map
 from renderer.light.harmonics import project
 from renderer.light.presets import load_light, save_light
+from train.attack import AttackExperimentSettings
 from train.checkpoint import BEST, save
 from train.networks import WideResNet, describe, load_run
 from train.run_folder import LOCK, sole_writer
+from train.settings import compose, read_settings
 
 USER_ERROR = 2
 CLASSES = ["fig", "lime", "orange"]
@@ -120,3 +126,33 @@ def test_a_light_is_not_written_over_itself(call, here, capsys):
     assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
     assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
     assert (here / "a.npy").read_bytes() == whole
+
+
+def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
+    """A pear in front of noise, at another place than the image's middle: rendered and scored as photographed."""
+    camera, light = OrthographicCamera(1.0, 0.5, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
+    mesh, size = renderer.normalize(renderer.solid("mushroom")), 96
+    behind = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)).double()
+    image = renderer.render(mesh, camera, light, size, behind, samples=4, encoding="srgb")[0]
+    share = 1 - renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0, 0]
+    for name, values in (("photo.png", image), ("mask.png", share.expand(3, -1, -1))):
+        Image.fromarray((255 * values.permute(1, 2, 0)).round().byte().numpy()).save(here / name)
+    fit = ["fit", "photograph=photo.png", "mesh=solid:mushroom", "out=fitted", "size=32"]
+    Image.new("L", (9, 9), 255).save(here / "small.png")
+    Image.new("L", (size, size)).save(here / "black.png")
+    for arguments, message in (
+        (["mask=small.png"], "mask=small.png has 9 × 9 pixels: give one of the photograph's size, 96 × 96"),
+        (["mask=black.png"], "the mask is black everywhere"),
+        (["mask=none.png"], "none.png cannot be read"),
+        ([], "give mask=FILE or box=[left,top,right,bottom], one of them"),
+    ):
+        assert call(*fit, *arguments) == USER_ERROR
+        assert message in capsys.readouterr().err and not (here / "fitted").exists()
+    assert call(*fit, "mask=mask.png") == 0
+    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    settings = read_settings(AttackExperimentSettings, compose("attack", command[1:]))
+    scene, angles = settings.scene, [math.radians(angle) for angle in (settings.scene.polar, settings.scene.azimuth)]
+    [found], background = renderer.orbit_cameras(1, scene.width, *angles), read_image(scene.backgrounds[0], 64)
+    shown = renderer.render(mesh, found, load_light(scene.light), 64, background, samples=4, encoding="srgb")[0]
+    differ = (shown - background).abs().amax(0)
+    assert (differ > 0).double().mean() > 0.2 and float(differ[differ > 0].mean()) < 0.06  # all else is photographed

@@ -44,7 +44,7 @@ def test_help_shows_each_setting_with_its_comment_and_the_choices_that_apply(nam
     assert ("experiment=best" in printed, "\n  attack=lighting" in printed) == (name == "train", name == "attack")
 
 
-@pytest.mark.parametrize("name", ["audit", "compare", "evaluate", "lab", "light", "publish", "report"])
+@pytest.mark.parametrize("name", ["audit", "compare", "evaluate", "fit", "lab", "light", "publish", "report"])
 def test_help_of_a_command_without_a_file_shows_its_settings_with_their_comments(name):
     schemas = {"audit": AuditSettings, "lab": LabSettings}
     schema = schemas.get(name) or import_module(f"scripts.{name}").Settings

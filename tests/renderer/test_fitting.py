@@ -1,0 +1,77 @@
+"""Cameras and lights that photographs were made with are found again: of path-traced images, and of our own."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+import renderer
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.errors import InputError
+from renderer.fitting import fit_scene
+from renderer.image import ImageSettings
+from renderer.io.mitsuba import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
+from renderer.light.environment import write_map
+from renderer.light.presets import load_light
+
+FAR = OrthographicCamera(0.9, 2.0, 3.0, 0.2, -0.1)
+NEAR = PerspectiveCamera(1.1, 1.0, 3.0, 0.2, -0.1, distance=6.0)
+
+
+def positive_light(name: str) -> torch.Tensor:
+    """(49, 3) with no negative radiance, dim enough for an image without clipped values."""
+    light = 0.2 * load_light(name).double()
+    light[0] -= mitsuba_map(light, 96).amin((0, 1)).clamp(max=0) * math.sqrt(4 * math.pi)
+    return light
+
+
+def check(found, mesh: renderer.Mesh, camera, light: torch.Tensor, irradiance: float) -> None:
+    """Camera within 1° and 1 % of the image; light by the irradiance of the visible surface."""
+    turned = (found.camera.axes() * camera.axes()).sum(1)  # cosines
+    assert min(turned) > math.cos(math.radians(1))
+    assert found.camera.width == pytest.approx(camera.width, rel=0.01)
+    assert (found.camera.right, found.camera.up) == pytest.approx((camera.right, camera.up), abs=0.01 * camera.width)
+    white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
+    [operator] = renderer.precompute_transfer(white, camera, 64)
+    found, expected = operator.radiance(found.light), operator.radiance(light)
+    assert float((found - expected).norm() / expected.norm()) < irradiance
+
+
+def test_a_renders_camera_and_light_are_found_before_any_background():
+    mesh, light = renderer.normalize(renderer.solid("mushroom")), positive_light("eucalyptus")
+    behind = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(0)).double()
+    image = renderer.render(mesh, FAR, light, 48, behind, samples=8)[0]
+    mask = 1 - renderer.render(mesh, FAR, 0 * light, 48, 1.0, samples=8)[0, 0]
+    check(fit_scene(image, mask, mesh), mesh, FAR, light, 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "camera", "light"),
+    [
+        ("mushroom", FAR, "eucalyptus"),
+        ("cup", FAR, "st_peters"),
+        ("apple_scan.glb", NEAR, "grace"),
+        ("banana.glb", NEAR, "grace"),
+    ],
+)
+def test_a_path_traced_images_camera_and_light_are_found(tmp_path, name, camera, light):
+    pytest.importorskip("mitsuba")
+    file = Path(__file__).parents[3] / "shared" / "data" / "meshes" / name
+    if file.suffix and not file.exists():
+        pytest.skip(f"{name} is not there")
+    mesh = renderer.normalize(renderer.load_mesh(file) if file.suffix else renderer.solid(name))
+    light = positive_light(light)
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 192))
+    write_mitsuba_scene(tmp_path, mesh, 1.0, [camera], ImageSettings(64, bounces=3), "light.exr")
+    image = render_mitsuba_scene(tmp_path / SCENE, 1)[0].double()
+    fov = camera.angle if camera is NEAR else None
+    found = fit_scene(image[:3].clamp(0, 1), image[3].clamp(0, 1), mesh, fov=fov, bounces=3)
+    check(found, mesh, camera, light, 0.07 if name == "cup" else 0.05)  # inside which light bounces
+
+
+def test_a_mask_of_nothing_is_refused():
+    mesh = renderer.normalize(renderer.solid("apple"))
+    with pytest.raises(InputError, match="the mask covers 0 pixels"):
+        fit_scene(torch.zeros(3, 32, 32), torch.zeros(32, 32), mesh)
