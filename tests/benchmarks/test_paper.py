@@ -162,7 +162,6 @@ def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts():
         ("transfer", ["15 % [9, 24] of 91", "62 % [48, 75] of 48"]),
         ("unseen_views", ["27 % [24, 31] of 500"]),
         ("survival", ["72 % [49, 88] of 18"]),
-        ("shaped_light", ["85 % [66, 94] of 26"]),
         ("rendering_quality", ["0.924 [0.918, 0.931]"]),
         ("run_time", ["5 steps, 0.33 s; 90 % within 0.83 s", "88 % [74, 95] of 40"]),
     ],

@@ -129,15 +129,15 @@ def test_a_light_is_not_written_over_itself(call, here, capsys):
 
 
 def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
-    """A pear in front of noise, at another place than the image's middle: rendered and scored as photographed."""
+    """A cup in front of noise, at another place than the image's middle: rendered and scored as photographed."""
     camera, light = OrthographicCamera(1.0, 0.5, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
-    mesh, size = renderer.normalize(renderer.solid("mushroom")), 96
+    mesh, size = renderer.normalize(renderer.solid("cup")), 96
     behind = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)).double()
     image = renderer.render(mesh, camera, light, size, behind, samples=4, encoding="srgb")[0]
     share = 1 - renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0, 0]
     for name, values in (("photo.png", image), ("mask.png", share.expand(3, -1, -1))):
         Image.fromarray((255 * values.permute(1, 2, 0)).round().byte().numpy()).save(here / name)
-    fit = ["fit", "photograph=photo.png", "mesh=solid:mushroom", "out=fitted", "size=32"]
+    fit = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48"]
     Image.new("L", (9, 9), 255).save(here / "small.png")
     Image.new("L", (size, size)).save(here / "black.png")
     for arguments, message in (
