@@ -134,11 +134,13 @@ def test_a_folders_images_are_all_shown_before_any_is_shown_again_and_the_round_
     assert rounds[4].diagnostics["attack_success"] == pytest.approx(float((rounds[4].labels > 0).float().mean()))
 
 
-def test_random_light_has_its_norm_and_diagnostics_of_its_images(serve, model):
+@pytest.mark.parametrize(("classified", "rows"), [(250, range(100)), (4, [0, 33, 66, 99])])
+def test_random_light_has_its_norm_and_diagnostics_of_its_images(serve, model, monkeypatch, classified, rows):
+    monkeypatch.setattr("augment.service.CLASSIFIED", classified)
     renders = serve(arm="random").regenerate(model, 0)
-    logits = logits_of(model, renders.images)
-    assert renders.diagnostics["attack_success"] == pytest.approx((logits.argmax(1) != renders.labels).double().mean())
-    loss = nn.functional.cross_entropy(logits.double(), renders.labels)
+    logits, labels = logits_of(model, renders.images[rows]), renders.labels[rows]
+    assert renders.diagnostics["attack_success"] == pytest.approx((logits.argmax(1) != labels).double().mean())
+    loss = nn.functional.cross_entropy(logits.double(), labels)
     assert renders.diagnostics["loss"] == pytest.approx(float(loss), rel=100 * EPS32)
     # ±0.5 on 147 coefficients: a norm of 3.5, with a standard deviation of 0.13 that 100 examples bring to 0.013.
     assert renders.diagnostics["light_change"] == pytest.approx(math.sqrt(147 / 12), abs=5 * 0.013)
