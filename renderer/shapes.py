@@ -263,8 +263,8 @@ Maker = Callable[[np.random.Generator], Mesh]
 SOLIDS: dict[str, Maker] = {
     make.__name__: make for make in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
-# Hard negatives of an orange, beside the fruit above: not in CIFAR-100. `fruit` is for training, the others are for
-# evaluation.
+# Hard negatives of an orange, beside the fruit above: not in CIFAR-100. experiment=best trains on `fruit` alone, and is
+# evaluated on the others.
 HARD_NEGATIVES: dict[str, Maker] = {make.__name__: make for make in (lemon, peach, ball, fruit)}
 
 

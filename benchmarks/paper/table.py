@@ -2,7 +2,8 @@
 
 python -m benchmarks.paper.table docs/paper/norm_balls.jsonl --figure norm_balls.png
 
-Brackets hold 95 % Wilson intervals. A figure is drawn of norm_balls alone.
+Brackets hold 95 % intervals: Wilson's, and of views, which share lights, a bootstrap over those of each mesh. A figure
+is drawn of norm_balls alone.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import bootstrap
 
 from benchmarks.common import Row
 from benchmarks.paper.common import last_run
@@ -82,8 +84,21 @@ def views(rows: Rows) -> Table:
     states = {"first": "as found", "further": "10 steps on", "random": "random, as large"}
     yield ["attack", "views attacked", *states.values()]
     for (kind, count), group in groups(rows, "kind", "attacked").items():
-        errors = ([name != row["label"] for row in group for name in row["predictions"][state]] for state in states)
-        yield [kind, count, *map(fraction, errors)]
+        yield [kind, count, *(by_set(group, state) for state in states)]
+
+
+def by_set(group: Rows, state: str) -> str:
+    """The fraction of views that fail, of lights that were found on several sets of views of each mesh."""
+    meshes = [
+        [np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets]
+        for sets in groups(group, "mesh").values()
+    ]
+    low, high = bootstrap(meshes, pooled_mean, method="percentile", rng=0).confidence_interval
+    return f"{100 * pooled_mean(*meshes):.0f} % [{100 * low:.0f}, {100 * high:.0f}] of {len(meshes)} × {len(meshes[0])}"
+
+
+def pooled_mean(*samples: Sequence[float], axis: int = -1) -> np.ndarray:
+    return np.mean([np.mean(sample, axis=axis) for sample in samples], axis=0)
 
 
 def run_time(rows: Rows) -> Table:
