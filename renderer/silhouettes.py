@@ -72,9 +72,9 @@ def moving_outlines(
     grid = fragments.image_of_samples(numbers, -1)
     arrays = (tensor.detach().cpu().numpy() for tensor in (positions, nearness, faces, grid))
     crossings = Crossings(*(part.to(grid.device) for part in _crossings(fragments.to("cpu"), *arrays)))
-    touched = _pixels(crossings.cells, fragments).unique()
-    covered = torch.zeros(fragments.size**2, dtype=torch.bool, device=grid.device).index_fill(0, fragments.pixels, True)
-    beside = touched[~covered[touched]]
+    touched = torch.zeros(fragments.size**2, dtype=torch.bool, device=grid.device)
+    touched.index_fill_(0, _pixels(crossings.cells, fragments).flatten(), True)
+    beside = touched.index_fill_(0, fragments.pixels, False).nonzero().squeeze(1)
     zeros = _Outlines.apply(positions, fragments, crossings, grid, beside, radiance.detach(), background.detach())
     return beside, zeros
 
