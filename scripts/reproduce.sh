@@ -8,7 +8,7 @@ usage() {
 usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden|best [key=value ...]
 
 In the root of the clone. gpu: training speed, experiments paper and fast; cpu: training speed, experiment cpu; harden:
-experiment harden from a network, four arms; best: experiment best, alone, with TrivialAugment, and five arms without
+experiment harden from a network, four arms; best: experiment best, alone, with TrivialAugment, and six arms without
 renders; three seeds each.
 Further settings of conf/train.yaml go to every training run. From the environment:
   DATA      CIFAR-100 as data=npz reads it
@@ -65,11 +65,12 @@ gpu | cpu)
 best)
     sweep best "${from_network[@]}" "$@"
     sweep best train.augmentation=trivial_augment "${from_network[@]}" "$@"
-    # The rivals, without renders: the same network, images, soup and seeds; PGD, which takes three more passes for each
-    # image, with a quarter of the images.
+    # The rivals, without renders: the same network, images, soup and seeds. For about best's minutes, no augmentation
+    # has twice the images, and PGD, which takes three more passes for each, half of them.
     sweep best augment=none train.ranking=0 train.augmentation=none,color_jitter,trivial_augment,augmix \
         "${from_network[@]}" "$@"
-    sweep best augment=none train.ranking=0 train.augmentation=pgd train.images_per_epoch=6000 "${from_network[@]}" "$@"
+    sweep best augment=none train.ranking=0 train.augmentation=none train.images_per_epoch=48000 "${from_network[@]}" "$@"
+    sweep best augment=none train.ranking=0 train.augmentation=pgd train.images_per_epoch=12000 "${from_network[@]}" "$@"
     ;;
 harden)
     sweep harden augment=none,random,adversarial "${from_network[@]}" "$@"

@@ -47,7 +47,7 @@ def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, en
         ("cpu", ["cpu"], ["photographs"]),
         ("gpu", ["paper", "fast"], ["photographs", "photographs"]),
         ("harden", ["harden"] * 2, ["laboratory", "photographs"]),
-        ("best", ["best"] * 4, ["laboratory", "photographs"]),
+        ("best", ["best"] * 5, ["laboratory", "photographs"]),
     ],
 )
 def test_every_training_is_valid_and_ends_in_tables_of_all_its_runs(tmp_path, command, trainings, scores):
