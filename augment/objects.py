@@ -197,7 +197,13 @@ def _prop(item: PropSettings) -> Mesh:
 
 def _load(item: MeshSettings) -> Mesh:
     mesh = _colored(item)
-    return mesh if item.gloss in (None, "file") else Gloss(*map(float, item.gloss)).on(mesh)
+    if item.gloss is None:
+        return mesh
+    mesh = mesh if item.gloss == "file" else Gloss(*map(float, item.gloss)).on(mesh)
+    metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
+    if metal and item.color is None and not mesh.textures and (mesh.corner_colors == 1).all():
+        raise InputError(f"{item.mesh} is a metal without a color: give color=[red,green,blue], or a metallic of 0")
+    return mesh
 
 
 def _colored(item: MeshSettings) -> Mesh:

@@ -10,7 +10,7 @@ Light and albedo appear as their product: an albedo twice as large halves the li
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
-COARSE, KEPT, STEPS = 32, 4, 40  # pixels of the first search, its best cameras, and steps of descent from each
+COARSE, KEPT, STEPS = 32, 3, 40  # pixels of the first search, its best cameras, and steps of descent from each
 SAMPLES = 8  # per side of a pixel
 SMOOTH = 1e-5  # weight of the light's squared Laplacian; what no surface shows of the light stays small
 WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
@@ -81,9 +81,12 @@ def fit_scene(
         for polar in POLAR
         for camera in orbit_cameras(AZIMUTHS, 2.0, math.radians(polar), fov=fov)
     ]
-    framed = sorted((_framed(camera, mesh, mask) for camera in cameras), key=lambda camera: coarse.fitted(camera)[0])
-    best = min((coarse.descended(camera) for camera in framed[:KEPT]), key=lambda camera: coarse.fitted(camera)[0])
-    camera = fine.descended(best)
+    framed = coarse.ranked(_framed(camera, mesh, mask) for camera in cameras)
+    # Of a round object, all azimuths fit alike: so the best of each polar angle, too.
+    of_polar = {camera.polar: camera for camera in reversed(framed)}
+    starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
+    descended = coarse.ranked(coarse.descended(camera) for camera in starts)
+    camera = fine.ranked(fine.descended(camera) for camera in descended[:KEPT])[0]
     return fine._replace(options={**options, "bounces": bounces}).scene(camera)
 
 
@@ -123,6 +126,10 @@ class _Target(NamedTuple):
         predicted[:, operator.pixels] += (light.T[:, None] @ shown)[:, 0]
         error = (predicted - self.image).square().sum() + (self.penalty[:, None] * light.square()).sum()
         return float(error), light, coverage
+
+    def ranked(self, cameras: Iterable[Camera]) -> list[Camera]:
+        """The cameras, those first whose best light fits best."""
+        return sorted(cameras, key=lambda camera: self.fitted(camera)[0])
 
     @property
     def penalty(self) -> Tensor:

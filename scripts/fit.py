@@ -20,7 +20,7 @@ from augment.objects import ObjectSettings, load_object
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError, require_range
 from renderer.fitting import fit_scene
-from renderer.image import decode
+from renderer.image import MOST_BOUNCES, decode
 from renderer.io.images import read_rgb
 from renderer.light.presets import save_light
 from renderer.rendering import render
@@ -28,7 +28,7 @@ from train.errors import writable_folder
 
 MARGIN = 1.6  # the image's side, in those of the object's box
 DETAIL = 448  # pixels per side of the background that is written
-DOUBTFUL = 0.9  # overlap of the outlines
+DOUBTFUL, WRONG = 0.9, 0.3  # overlap of the outlines, error of the pixels
 
 
 @dataclass
@@ -39,11 +39,14 @@ class Settings:
     box: list[int] = field(default_factory=list)  # or [left, top, right, bottom] in pixels, for OpenCV's GrabCut
     fov: float | None = None  # degrees between the image's sides, about the object; null: orthographic
     albedo_scale: float = 1.0  # of the mesh; twice as much halves the light
+    bounces: int = 3  # of the light between the mesh's surfaces; 0: without shadows, too
+    label: str = "orange"  # the class of the printed attack
     size: int = 64  # pixels per side that are compared
     out: str = "runs/fit"  # the folder of background.png, light.json and comparison.png
 
     def __post_init__(self) -> None:
         require_range("size", self.size, 16, 512)
+        require_range("bounces", self.bounces, 0, MOST_BOUNCES)
         require_range("albedo_scale", self.albedo_scale, 1e-3, 1e3)
         if self.fov is not None:
             require_range("fov", self.fov, 0.1, 120)
@@ -58,13 +61,14 @@ def main(settings: Settings) -> None:
     mesh = load_object(ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)).mesh
     rows, columns = np.flatnonzero((mask > 127).any(1)), np.flatnonzero((mask > 127).any(0))
     if not len(rows):
-        raise InputError("the mask is black everywhere: give one that is white where the object is")
+        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     fov = None if settings.fov is None else math.radians(settings.fov)
     photograph, share = (as_tensor(cropped(array, center, side, settings.size)) for array in (image, mask))
     linear = decode(photograph, "srgb")
-    found = fit_scene(linear, share[0], mesh, fov=fov, albedo_scale=settings.albedo_scale)
+    shared: dict[str, Any] = {"albedo_scale": settings.albedo_scale, "bounces": settings.bounces}
+    found = fit_scene(linear, share[0], mesh, fov=fov, **shared)
     camera = found.camera
     # The scene's cameras look at the mesh's middle, so the background is cut out around it.
     center = center + np.array([camera.right, -camera.up]) / camera.width * side
@@ -73,19 +77,20 @@ def main(settings: Settings) -> None:
     Image.fromarray(background).save(out / "background.png")
     save_light(out / "light.json", found.light)
     centered = replace(camera, right=0.0, up=0.0)
-    options: dict[str, Any] = {"albedo_scale": settings.albedo_scale, "samples": 4, "encoding": "srgb"}
-    shown = render(mesh, centered, found.light, DETAIL, as_tensor(background).double(), **options)[0]
-    pair = torch.cat([as_tensor(background).double(), shown], dim=2)
+    behind = as_tensor(background).double()
+    shown = render(mesh, centered, found.light, DETAIL, behind, samples=4, encoding="srgb", **shared)[0]
+    pair = torch.cat([behind, shown], dim=2)
     Image.fromarray((pair * 255).round().byte().permute(1, 2, 0).numpy()).save(out / "comparison.png")
     print(f"outlines overlap by {found.overlap:.1%}; the object's pixels differ by {found.error:.1%}")
-    if found.overlap < DOUBTFUL:
-        print("warning: the mesh hardly fits the outline; look at comparison.png, and check mask, mesh and fov")
+    if found.overlap < DOUBTFUL or found.error > WRONG:
+        print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")
     angles = f"scene.polar={math.degrees(camera.polar):.3f}", f"scene.azimuth={math.degrees(camera.azimuth) % 360:.3f}"
     view = [f"scene.fov={math.degrees(camera.angle):.3f}"] if isinstance(camera, PerspectiveCamera) else []
     named = f"scene.meshes=[{{mesh: '{settings.mesh}', albedo_scale: {settings.albedo_scale:g}}}]"
     scene = [named, *angles, f"scene.width={camera.width:.4f}", *view, f"scene.light={out / 'light.json'}"]
     scene += [f"scene.backgrounds=[{out / 'background.png'}]", "scene.search=0", "renderer.encoding=srgb"]
-    print(shlex.join(["pnb-attack", "attack=lighting", *scene]))
+    shadows = f"renderer.bounces={settings.bounces}" if settings.bounces else "renderer.shadows=false"
+    print(shlex.join(["pnb-attack", "attack=lighting", f"label={settings.label}", *scene, shadows]))
 
 
 def read_file(path: str) -> np.ndarray:

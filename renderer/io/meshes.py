@@ -53,7 +53,7 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
         rigged = any("skin" in node for node in tree.get("nodes", []))
         if rigged:
             content = with_skins_as_attributes(content, tree)
-        textured_parts, strengths = _textured_parts(tree, gloss), _strengths(tree)
+        textured_parts, strengths = _textured_parts(tree, gloss), _strengths(tree) if gloss else {}
         scene = _load(_utf8(content) if suffix == "obj" else content, suffix, files)
         named = [(name, part) for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)]
         parts = {name: _part(part, linear) for name, part in named if len(part.faces)}
@@ -128,10 +128,13 @@ def _gltf_tree(content: bytes) -> dict[str, Any]:
 
 
 def _strengths(tree: dict[str, Any]) -> dict[str | None, float]:
-    """The specularFactor of a glTF file's materials, by name; ValueError where a name has two."""
+    """The specularFactor of a glTF file's materials, by name; ValueError where a name has two, or a texture."""
     strengths: dict[str | None, float] = {}
     for material in tree.get("materials", []):
-        factor = material.get("extensions", {}).get("KHR_materials_specular", {}).get("specularFactor", 1.0)
+        specular = material.get("extensions", {}).get("KHR_materials_specular", {})
+        if "specularTexture" in specular:
+            raise ValueError(f"its material {material.get('name')} has a specularTexture, which is not supported")
+        factor = specular.get("specularFactor", 1.0)
         if strengths.setdefault(material.get("name"), factor) != factor:
             raise ValueError(f"materials of the name {material.get('name')} differ in specularFactor")
     return strengths

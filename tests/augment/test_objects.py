@@ -75,3 +75,11 @@ def test_an_object_has_the_gloss_that_it_is_given_and_its_props_stay_matte():
     for bad in ([2.0], [0.5, 0, 1, 1], "shiny", 0.3):
         with pytest.raises(InputError, match="gloss"):
             ObjectSettings("solid:pear", label="pear", gloss=bad)
+
+
+def test_a_metal_needs_a_color(tmp_path):
+    plain = str(tmp_path / "plain.stl")
+    trimesh.creation.icosphere(1).export(plain)
+    load_object(ObjectSettings(plain, "orange", color=[0.9, 0.5, 0.1], gloss=[0.3, 1, 1]))
+    with pytest.raises(InputError, match="is a metal without a color: give color="):
+        load_object(ObjectSettings(plain, "orange", gloss=[0.3, 1, 1]))

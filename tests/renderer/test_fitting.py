@@ -71,6 +71,17 @@ def test_a_path_traced_images_camera_and_light_are_found(tmp_path, name, camera,
     check(found, mesh, camera, light, 0.07 if name == "cup" else 0.05)  # inside which light bounces
 
 
+@pytest.mark.slow
+def test_how_high_the_camera_stands_is_found_of_a_round_object():
+    """All azimuths fit it alike, so that all of the best cameras of the first search may share a wrong polar angle."""
+    mesh, light = renderer.normalize(renderer.solid("bottle", 3)), positive_light("st_peters")
+    camera = PerspectiveCamera(0.55, 5.0, 2.6, 0.1, 0.1, distance=4.0)
+    image = renderer.render(mesh, camera, light, 64, 0.0, samples=8)[0]
+    mask = 1 - renderer.render(mesh, camera, 0 * light, 64, 1.0, samples=8)[0, 0]
+    found = fit_scene(image.clamp(0, 1), mask, mesh, fov=camera.angle)
+    assert found.camera.polar == pytest.approx(camera.polar, abs=math.radians(1))
+
+
 def test_a_mask_of_nothing_is_refused():
     mesh = renderer.normalize(renderer.solid("apple"))
     with pytest.raises(InputError, match="the mask covers 0 pixels"):

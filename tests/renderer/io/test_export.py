@@ -206,14 +206,17 @@ def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
     assert_array_equal(mesh.gloss_textures[0], texels[..., 1:])
 
 
-def test_materials_of_one_name_and_two_strengths_are_refused(tmp_path):
+@pytest.mark.parametrize("fault", ["differ in specularFactor", "has a specularTexture"])
+def test_strengths_that_cannot_be_told_or_read_are_refused(tmp_path, fault):
     export_mesh(glossy(box()), tmp_path / "mesh.glb")
     content = (tmp_path / "mesh.glb").read_bytes()
     (length,) = struct.unpack_from("<I", content, 12)
     tree = json.loads(content[20 : 20 + length])
     for material in tree["materials"]:
         material["name"] = ""
+        if "Texture" in fault:
+            material["extensions"]["KHR_materials_specular"] = {"specularTexture": {}}
     text = json.dumps(tree, separators=(",", ":")).encode().ljust(length)
     (tmp_path / "mesh.glb").write_bytes(content[:20] + text + content[20 + length :])
-    with pytest.raises(InputError, match="differ in specularFactor"):
+    with pytest.raises(InputError, match=fault):
         load_mesh(tmp_path / "mesh.glb", gloss=True)

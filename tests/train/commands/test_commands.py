@@ -137,12 +137,12 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     share = 1 - renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0, 0]
     for name, values in (("photo.png", image), ("mask.png", share.expand(3, -1, -1))):
         Image.fromarray((255 * values.permute(1, 2, 0)).round().byte().numpy()).save(here / name)
-    fit = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48"]
+    fit = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48", "bounces=0"]
     Image.new("L", (9, 9), 255).save(here / "small.png")
     Image.new("L", (size, size)).save(here / "black.png")
     for arguments, message in (
         (["mask=small.png"], "mask=small.png has 9 × 9 pixels: give one of the photograph's size, 96 × 96"),
-        (["mask=black.png"], "the mask is black everywhere"),
+        (["mask=black.png"], "no object is found"),
         (["mask=none.png"], "none.png cannot be read"),
         ([], "give mask=FILE or box=[left,top,right,bottom], one of them"),
     ):
@@ -151,6 +151,7 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     assert call(*fit, "mask=mask.png") == 0
     command = shlex.split(capsys.readouterr().out.splitlines()[-1])
     settings = read_settings(AttackExperimentSettings, compose("attack", command[1:]))
+    assert not settings.renderer.shadows and settings.label == "orange"  # as it was fitted
     scene, angles = settings.scene, [math.radians(angle) for angle in (settings.scene.polar, settings.scene.azimuth)]
     [found], background = renderer.orbit_cameras(1, scene.width, *angles), read_image(scene.backgrounds[0], 64)
     shown = renderer.render(mesh, found, load_light(scene.light), 64, background, samples=4, encoding="srgb")[0]
