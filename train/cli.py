@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -68,14 +69,15 @@ def _await_imports() -> None:
 def handled_errors() -> Iterator[None]:
     """Print what the user can fix as one line, without a traceback, and exit with status 2.
 
-    Ctrl-C ends in one line and status 130. A reader of the output who has gone ends the command in silence with
-    status 141. Characters that the terminal lacks are printed as escapes.
+    Warnings are one line, too. Ctrl-C ends in one line and status 130. A reader of the output who has gone ends the
+    command in silence with status 141. Characters that the terminal lacks are printed as escapes.
     """
     global _started, _interrupted
     _started, _interrupted = True, False
     if Path(sys.argv[0]).stem.startswith(PREFIX):  # in further processes, train is no train.py of the current folder
         os.environ["PYTHONSAFEPATH"] = "1"
     _loaded.set()
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -180,6 +180,12 @@ def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, ca
     assert {path: path.stat().st_mtime_ns for path in stopped.rglob("*")} == files
 
 
+def test_a_librarys_warning_is_one_line_of_a_command():
+    code = "from train import cli\nimport warnings\nwith cli.handled_errors(): warnings.warn('the gloss is clamped')"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert (ended.returncode, ended.stderr) == (0, "warning: the gloss is clamped\n")
+
+
 def test_an_error_of_the_program_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError), cli.handled_errors():
         raise ZeroDivisionError
