@@ -16,6 +16,7 @@ from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import progress, rotation_matrices
+from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError, require_range
 from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
@@ -260,7 +261,12 @@ def pose(scene: Scene, settings: PoseSettings) -> Parameter:
         after = [placed(*row) for row in zip(objects.tolist(), before, parts, strict=True)]
         return replace(conditions, vertices=torch.stack(after) if after else before, cameras=parts[:, 6:9])
 
+    # However an object grows and a camera with perspective comes closer, they do not meet.
+    cameras = [camera for views in scene.cameras for camera in views if isinstance(camera, PerspectiveCamera)]
+    reach = float(scene.vertices.norm(dim=-1).max()) + settings.shift
+    room = max(0.45 * math.log(min((camera.distance for camera in cameras), default=math.inf) / reach), 0.0)
     limit = unit.new_tensor([math.inf] * 9 + [1.0] * (unit.shape[1] - 9))
+    limit[[5, 8]] = room / limit.new_tensor(units)[[5, 8]].clamp(min=1e-9)
     domain = partial(nearest_in_box, low=-limit, high=limit)
     used = (unit > 0)[scene.object_of]
     return Parameter("pose", settings, unit.new_zeros(used.shape), apply, domain, None if used.all() else used)

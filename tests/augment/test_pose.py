@@ -53,6 +53,14 @@ def test_the_camera_moves_as_another_scenes_camera_stands(fov):
     torch.testing.assert_close(problem_of(scene).render(values, ONE), expected, rtol=0, atol=1e-9)
 
 
+def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
+    scene = scene_of(fov=85.0, width=2.0)
+    parameter, far = pose(scene, augment.PoseSettings()), torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
+    with pytest.raises(InputError, match="reaches to a camera"):
+        AttackProblem(scene, [parameter]).render(far, ONE)
+    AttackProblem(scene, [parameter]).render(parameter.domain(far), ONE)
+
+
 @pytest.mark.parametrize("ground", [None, pytest.param([0.5, 0.5, 0.5], marks=pytest.mark.slow)])
 def test_gradients_by_the_pose_are_differences_of_images_rendered_anew(ground):
     fine = {"size": 32, "ground": ground, "rasterizer": "auto"}
