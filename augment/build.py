@@ -2,6 +2,7 @@
 
 import math
 import reprlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,13 +16,17 @@ from augment.scene import Scene
 from augment.utils import progress
 from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
+from renderer.gloss import smoothest
 from renderer.image import ImageSettings
 from renderer.io.images import read_image
 from renderer.light.basis import with_local_lights
+from renderer.light.harmonics import MAX_DEGREE
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light, read_light
 from renderer.mesh import MOST_VERTICES, Mesh, normalize, subdivide
+from renderer.microfacets import degree_for
 from renderer.rasterizer import NAMES, choose
+from renderer.transfer import DEGREE
 
 
 @dataclass
@@ -83,8 +88,9 @@ class SceneSettings:
     image files. views: cameras on a circle around each mesh; None where something else tells. polar: degrees off +z.
     azimuth: of the first view, degrees off +x towards +y. width: of the image in world units; a mesh spans [-1, 1].
     fov: degrees between the image's sides, as of a camera at that distance; None for parallel rays. vertices: subdivide
-    meshes until they have more. light: what `renderer.load_light` takes or, in Python, coefficients (49, 3). exposure:
-    multiplies it. projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
+    meshes until they have more. light: what `renderer.load_light` takes or, in Python, coefficients. degree: of such a
+    light; None for 6 or, where gloss is smoother than that shows, for what it needs. exposure: multiplies it.
+    projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
     """
 
     meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
@@ -96,6 +102,7 @@ class SceneSettings:
     fov: float | None = None
     vertices: int = 0
     light: str = "grace"
+    degree: int | None = None
     exposure: float = 1.0
     projector: ProjectorSettings | None = None
     lamps: LampsSettings | None = None
@@ -103,6 +110,7 @@ class SceneSettings:
 
     def __post_init__(self) -> None:
         require_range("exposure", self.exposure, 0, FACTOR)
+        require_range("degree", self.degree, 0, MAX_DEGREE)
         require_range("views", self.views, 1, MOST_VIEWS)
         require_range("vertices", self.vertices, 0, MOST_VERTICES)
         require_range("polar", self.polar, 0, 180)
@@ -166,12 +174,16 @@ def build_scene(
     of_scene = {name: options.pop(name) for name in SCENE & options.keys()}
     shown = replace(scene or SceneSettings(), views=views, **of_scene)
     drawn = replace(renderer or RendererSettings(), **options)
-    environment: Any = load_light(shown.light) if isinstance(shown.light, str) else shown.light
+    read = (_object(member, shown.vertices) for member in progress(meshes, "reading meshes"))
+    objects = [on_ground(item, shown.ground) for item in read]
+    environment: Any = shown.light
+    if isinstance(environment, str):
+        environment = load_light(environment, _degree(objects) if shown.degree is None else shown.degree)
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
     fov = None if shown.fov is None else math.radians(shown.fov)
     return Scene.grid(
-        [on_ground(_object(member, shown.vertices), shown.ground) for member in progress(meshes, "reading meshes")],
+        objects,
         orbit_cameras(views, shown.width, math.radians(shown.polar), math.radians(shown.azimuth), fov),
         load_backgrounds(shown.backgrounds, size),
         lights.to(as_device(device)),
@@ -189,6 +201,16 @@ def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObj
     if isinstance(mesh, Mesh):
         return SceneObject(label, normalize(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)
+
+
+def _degree(objects: Sequence[SceneObject]) -> int:
+    """Of the light that shows their gloss, at least 6; a higher one is told."""
+    roughness, name = min(((smoothest(item.mesh), item.name) for item in objects), default=(1.0, ""))
+    degree = max(DEGREE, degree_for(roughness))
+    if degree > DEGREE:
+        told = f"{name} has gloss of roughness {roughness:.2g}, in light of degree {degree}"
+        warnings.warn(f"{told}: degree={DEGREE} takes less time, with rings around highlights", stacklevel=3)
+    return degree
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:

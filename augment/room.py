@@ -16,8 +16,8 @@ from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.image import ImageSettings
-from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
-from renderer.light.harmonics import bands, per_degree
+from renderer.light.basis import Harmonics, LocalBasis
+from renderer.light.harmonics import bands, degree_of, per_degree
 from renderer.mesh import Mesh
 from renderer.transport.local import unoccluded
 from renderer.transport.rays import Rays, sphere
@@ -40,12 +40,13 @@ def _upper(degree: int) -> tuple[Tensor, Tensor]:
 
 
 def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
-    """Lights (E, 49, 3) on infinite tables of albedo (E, 3): that from above, and what the tables reflect of it and of
+    """Lights (E, K, 3) on infinite tables of albedo (E, 3): that from above, and what the tables reflect of it and of
     white lamps of irradiance 1 in directions (E, 3), or zero for none."""
-    upper, below = _upper(HARMONICS.degree)
+    harmonics = Harmonics(math.isqrt(lights.shape[1]) - 1)
+    upper, below = _upper(harmonics.degree)
     above, albedo = upper @ lights.cpu().double(), albedo.cpu()
-    normal, nonzero = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), HARMONICS.nonzero
-    arriving = (HARMONICS.irradiance(normal)[0] @ above[:, nonzero]).clamp(min=0) + lamps[:, 2:].clamp(min=0)
+    normal, nonzero = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), harmonics.nonzero
+    arriving = (harmonics.irradiance(normal)[0] @ above[:, nonzero]).clamp(min=0) + lamps[:, 2:].clamp(min=0)
     return (above + below[:, None] * (albedo * arriving / math.pi)[:, None]).to(lights)
 
 
@@ -63,13 +64,13 @@ def irradiance(
     """(3, size, size) of the surfaces that a camera sees, averaged over each pixel's samples.
 
     rays: among the faces of the object, which lies within `radius` of the origin. height: of the table. wall: the
-    distance of the wall behind the origin; it faces the camera's azimuth. sky: coefficients (49, 3). lamp: the
+    distance of the wall behind the origin; it faces the camera's azimuth. sky: coefficients (K, 3). lamp: the
     direction (3,) of white light of irradiance 1, or zero for none. lights: local ones, and the coefficients
     (size, 3) of each. InputError: Embree is not installed.
     """
     sine, cosine = math.sin(camera.azimuth), math.cos(camera.azimuth)
     turn = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    directions, radiance, irradiance = _directions(HARMONICS.degree)
+    directions, radiance, irradiance = _directions(degree_of(sky))
     directions, sky = directions @ turn, _turned(sky, camera.azimuth)
     normals = torch.stack([turn[2], turn[0]])
     fine = image if lamp.any() or lights else replace(image, samples=1)  # a lamp's shadow has edges
@@ -142,7 +143,7 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def _turned(sky: Tensor, azimuth: float) -> Tensor:
     """The coefficients (size, 3) of a sky turned back by an azimuth: Y_lm and Y_l-m are as cos mφ and sin mφ."""
-    l = bands(HARMONICS.degree)
+    l = bands(degree_of(sky))
     order = torch.arange(len(l)) - l * (l + 1)
     angle = (order * azimuth).double()[:, None]
     return angle.cos() * sky + angle.sin() * sky[l * (l + 1) - order]

@@ -21,7 +21,7 @@ from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.gloss import Gloss
 from renderer.image import clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
-from renderer.light.basis import HARMONICS, LocalBasis, parts_of
+from renderer.light.basis import LocalBasis, harmonics_of, parts_of
 from renderer.light.presets import directional, load_light
 from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
@@ -164,7 +164,9 @@ def _with_moved_rows(
         changed["objects"] = objects
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
-    has_rays = scene.basis != HARMONICS or scene.settings.global_illumination  # which take longer than an operator
+    has_rays = (
+        len(parts_of(scene.basis)) > 1 or scene.settings.global_illumination
+    )  # which take longer than an operator
     return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
@@ -172,11 +174,12 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
     exposures = _log_uniform(settings.exposure, len(scene), draws)
     rows = [replace(row, exposure=row.exposure * factor) for row, factor in zip(scene.examples, exposures, strict=True)]
     changed: dict[str, Any] = {}
-    sky, local = scene.lights.tensor_split([HARMONICS.size], dim=1)  # projector and lamps stay as they are
+    harmonics = harmonics_of(scene.basis)
+    sky, local = scene.lights.tensor_split([harmonics.size], dim=1)  # projector and lamps stay as they are
     lamps = torch.zeros(len(rows), 3, dtype=torch.float64)
     if settings.environments:
         chosen = torch.randint(len(settings.environments), (len(rows),), generator=draws)
-        lights = torch.stack([load_light(light) for light in settings.environments])
+        lights = torch.stack([load_light(light, harmonics.degree) for light in settings.environments])
         sky = lights[chosen].to(scene.lights)
     if settings.directional_fraction > 0:
         sky, lamps = _with_lamps(sky, scene, settings, draws, on_table)
@@ -248,7 +251,7 @@ def _in_perspective(camera: Camera, fov: float) -> Camera:
 def _with_lamps(
     sky: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator, on_table: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The lights (E, 49, 3), a fraction of them dimmed, and the directions (E, 3) of white light beside those, or zero.
+    """The lights (E, K, 3), a fraction of them dimmed, and the directions (E, 3) of white light beside those, or zero.
 
     An object on a table has no light from below: a direction that is drawn there is mirrored.
     """
@@ -265,19 +268,21 @@ def _with_lamps(
 
 
 def _with_directional(sky: Tensor, lamps: Tensor) -> Tensor:
-    """The lights (E, 49, 3) and those of irradiance 1 from directions (E, 3), where these are not zero."""
+    """The lights (E, K, 3) and those of irradiance 1 from directions (E, 3), where these are not zero."""
     lit = lamps.any(1)
     if not lit.any():
         return sky
-    return torch.where(lit[:, None, None].to(sky.device), directional(lamps, torch.ones(3)).to(sky) + sky, sky)
+    added = directional(lamps, torch.ones(3), math.isqrt(sky.shape[1]) - 1).to(sky)
+    return torch.where(lit[:, None, None].to(sky.device), added + sky, sky)
 
 
 def _facing(scene: Scene) -> Tensor:
     """(E, 3, 1, 1) irradiance of a surface that faces the row's first camera, in the backgrounds' type."""
     towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
-    coefficients = scene.lights.cpu().double()[:, HARMONICS.nonzero]
-    irradiance = torch.einsum("ek,ekc->ec", HARMONICS.irradiance(towards), coefficients) * exposures
+    harmonics = harmonics_of(scene.basis)
+    coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
+    irradiance = torch.einsum("ek,ekc->ec", harmonics.irradiance(towards), coefficients) * exposures
     return irradiance.to(scene.backgrounds)[:, :, None, None]
 
 

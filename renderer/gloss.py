@@ -16,15 +16,16 @@ import warnings
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import unit
+from renderer.light.harmonics import MAX_DEGREE, unit
 from renderer.mesh import Mesh
-from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
+from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance, shown_by
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -104,6 +105,13 @@ class SampleGloss(NamedTuple):
         _, coat = self._replace(metallic=torch.zeros_like(self.metallic)).even(normals, toward)
         return (1 - self.metallic) * (1 - coat)
 
+    def warn_of_rings(self, degree: int) -> None:
+        """Warn where light of a degree does not show the roughness."""
+        least, glossy = shown_by(degree), (self.metallic > 0) | (self.strength > 0)
+        if ((self.roughness < least) & glossy).any():
+            message = f"light of degree {degree} shows rings around highlights of a roughness below {least:.2g}"
+            warnings.warn(f"{message}: choose a higher degree, {MAX_DEGREE} at most", stacklevel=2)
+
     def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, Tensor]:
         """(colored, white, world): radiance (K, S) per unit coefficient of environment light of K = (degree + 1)², in
         the axes of the view, and the matrix (K, K) to those of the world; differentiable. None for no color."""
@@ -115,6 +123,15 @@ class SampleGloss(NamedTuple):
         """(colored, white) radiance (...) per irradiance from directions (..., 3); all unit vectors. Differentiable."""
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
         return self.metallic * schlick, self.metallic * edge + (1 - self.metallic) * self.strength * dielectric
+
+
+def smoothest(mesh: Mesh) -> float:
+    """The least roughness of faces that have gloss, of textures all but a hundredth included; 1 where none has."""
+    if mesh.gloss is None:
+        return 1.0
+    factors = [*(np.percentile(texture[..., 0], 1) / 255 for texture in mesh.gloss_textures), 1.0]  # -1: no texture
+    by_face = mesh.gloss[:, 0] * np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
+    return float(by_face.min(initial=1, where=mesh.gloss[:, 1:].any(1)))
 
 
 def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:

@@ -30,7 +30,7 @@ def main(settings: Settings) -> None:
     out = Path(settings.out)
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
-    radiance = to_map(load_light(settings.light), settings.height)
+    radiance = to_map(load_light(settings.light, degree=None), settings.height)
     with keyed("out"):
         write_map(out, radiance.clamp(min=0))  # negative light is refused where maps are read
     print(

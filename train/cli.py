@@ -78,6 +78,7 @@ def handled_errors() -> Iterator[None]:
         os.environ["PYTHONSAFEPATH"] = "1"
     _loaded.set()
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    warnings.simplefilter("once", UserWarning, append=True)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -178,7 +178,7 @@ def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     require_range("albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
     require_range("own_faces", own, 1, len(mesh.faces))
     local = [read_light(folder / f"{Path(name).name}.json", Projector, Lamps) for name in description["local_lights"]]
-    basis, light = with_local_lights(load_light(str(folder / LIGHT)), local)
+    basis, light = with_local_lights(load_light(str(folder / LIGHT), degree=None), local)
     background, shape = description["background"], (len(cameras), 3, settings.size, settings.size)
     background = folder / BACKGROUND if isinstance(background, str) else background
     return Adversary(

@@ -201,13 +201,14 @@ def skylight(scene: Scene, settings: SkylightSettings) -> Parameter:
     begin = math.radians(settings.zenith), math.radians(settings.azimuth), settings.turbidity
     start = torch.tensor([*begin[:2], begin[2] / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
     luminance = mean_luminance(coefficients(*begin))
-    where, _ = parts_of(scene.basis)[0]
+    where, harmonics = parts_of(scene.basis)[0]
     scales = [mean_luminance(light) / luminance for light in scene.lights[:, where]]
     scale = torch.tensor(scales, dtype=torch.float64, device=start.device)[:, None, None]
 
     def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         zenith, azimuth, turbidity = values.unbind(1)
         sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * scale[examples]
+        sky = F.pad(sky, (0, 0, 0, harmonics.size - sky.shape[-2]))
         return _relit(conditions, where, sky.to(conditions.light))
 
     def possible(values: Tensor, within: Ball | None = None) -> Tensor:

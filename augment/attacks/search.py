@@ -14,6 +14,7 @@ from augment.build import SceneSettings
 from augment.classifiers import Classifier
 from augment.scene import Scene
 from augment.utils import progress
+from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
 POLAR, WIDTH = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
@@ -68,7 +69,8 @@ def _best_light(
     """The highest confidence, and the settings with the light and exposure that reach it."""
     lights = list(product(dict.fromkeys([settings.light, *PROBES, UNIFORM]), EXPOSURES))
     exposures = [settings.exposure * factor for _, factor in lights]
-    coefficients = [load_light(name) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
+    degree = harmonics_of(scene.basis).degree
+    coefficients = [load_light(name, degree) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
     sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(scene.lights.device)
     lit = torch.cat([sky, scene.lights.repeat(len(lights), 1, 1)[:, sky.shape[1] :]], dim=1)  # projector and lamps stay
     rows = replace(scene, examples=[*scene.examples] * len(lights), lights=lit)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import require_range
-from renderer.light.harmonics import MAX_DEGREE, basis, lambertian_factors, nonzero_coefficients
+from renderer.light.harmonics import MAX_DEGREE, basis, degree_of, lambertian_factors, nonzero_coefficients
 
 _STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
 
@@ -134,12 +134,20 @@ def parts_of(basis: Basis) -> list[tuple[slice, Harmonics | LocalBasis]]:
     return parts
 
 
+def harmonics_of(basis: Basis) -> Harmonics:
+    """Those of the environment light, which come first."""
+    first = parts_of(basis)[0][1]
+    assert isinstance(first, Harmonics)
+    return first
+
+
 def with_local_lights(sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:
     """(basis, coefficients (size, 3)) of the sky in harmonics and of lights in the scene, each with its own."""
+    harmonics = Harmonics(degree_of(sky))
     if not lights:
-        return HARMONICS, sky
+        return harmonics, sky
     coefficients = [values.to(sky) for _, values in lights]
-    return SumBasis((HARMONICS, *(basis for basis, _ in lights))), torch.cat([sky, *coefficients])
+    return SumBasis((harmonics, *(basis for basis, _ in lights))), torch.cat([sky, *coefficients])
 
 
 @dataclass(frozen=True)

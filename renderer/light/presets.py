@@ -1,6 +1,7 @@
 """Lights: named probes, files and random perturbations. Linear RGB radiance.
 
-Distant light has coefficients (49, 3) in world axes (z up), in the order of `renderer.light.harmonics`.
+Distant light has coefficients (49, 3), or of another degree, in world axes (z up), in the order of
+`renderer.light.harmonics`.
 """
 
 import json
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -16,7 +18,7 @@ from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.image import to_bytes
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.environment import SUFFIXES, read_panorama
-from renderer.light.harmonics import basis, nonzero_coefficients, project, rotate
+from renderer.light.harmonics import basis, degree_of, nonzero_coefficients, project, rotate
 from renderer.light.local import Projector
 from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -40,31 +42,34 @@ _PUBLISHED_PROBES = {
 PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 
 
-def load_light(light: str) -> Tensor:
-    """Coefficients (49, 3) float32 of a named probe, of `uniform` light, in which a surface shows its albedo, of an
-    environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `renderer.save_light` writes it).
+def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
+    """Coefficients ((degree + 1)², 3) float32 of a named probe, of `uniform` light, in which a surface shows its
+    albedo, of an environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as
+    `renderer.save_light` writes it).
 
     A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
-    places, as series are that were written as a map; coefficients stay as they are.
-    InputError for an unknown name, a missing file or one that holds no light.
+    places, as series are that were written as a map; coefficients stay as they are. degree: None for that of a file of
+    coefficients, or 6. InputError for an unknown name, a missing file, one that holds no light, or a higher degree.
 
     >>> load_light("grace").shape
     torch.Size([49, 3])
     >>> bool((load_light("uniform")[1:] == 0).all())  # the same radiance from everywhere
     True
     """
-    suffix = Path(light).suffix.lower()
+    suffix, size = Path(light).suffix.lower(), Harmonics(DEGREE if degree is None else degree).size
     if light in _PUBLISHED_PROBES:
-        return probe(light)
+        return F.pad(probe(light), (0, 0, 0, size - COEFFICIENTS))
     if light == UNIFORM:
-        return ambient(torch.full((3,), 1 / math.pi))
+        return F.pad(ambient(torch.full((3,), 1 / math.pi)), (0, 0, 0, size - COEFFICIENTS))
     if suffix == ".json":
         basis_read, coefficients = read_light(Path(light), Harmonics)
-        if basis_read != HARMONICS:
-            raise InputError(f"light {light} is of {basis_read}: give one of {HARMONICS}")
-        return coefficients
+        if degree is None:
+            return coefficients
+        if basis_read.degree > degree:
+            raise InputError(f"light {light} is of {basis_read}, beyond degree={degree}: give a higher degree")
+        return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
     if suffix in SUFFIXES:
-        return _read_light_map(Path(light))
+        return _read_light_map(Path(light), DEGREE if degree is None else degree)
     files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
     raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
 
@@ -134,15 +139,15 @@ def ambient(color: Tensor) -> Tensor:
     return coefficients
 
 
-def directional(direction: Tensor, color: Tensor) -> Tensor:
-    """Coefficients (..., 49, 3) of parallel light from a unit direction (..., 3), of irradiance color (3,) where it
-    meets a surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
+def directional(direction: Tensor, color: Tensor, degree: int = DEGREE) -> Tensor:
+    """Coefficients (..., (degree + 1)², 3) of parallel light from a unit direction (..., 3), of irradiance color (3,)
+    where it meets a surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
     require_bounded(color=color)
-    return basis(direction, DEGREE)[..., None] * color
+    return basis(direction, degree)[..., None] * color
 
 
 def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:
-    """Random lights (count, 49, 3) around one light (49, 3).
+    """Random lights (count, K, 3) around one light (K, 3), K = (degree + 1)².
 
     Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the perturbation of
     the coefficients that reach a pixel is scaled to that L2 norm, and the others stay.
@@ -150,7 +155,7 @@ def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, g
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        offsets = offsets * torch.zeros(COEFFICIENTS, 1).index_fill_(0, nonzero_coefficients(DEGREE), 1.0)
+        offsets = offsets * torch.zeros(len(light), 1).index_fill_(0, nonzero_coefficients(degree_of(light)), 1.0)
         offsets = offsets * (radius / offsets.flatten(1).norm(dim=1).clamp(min=1e-12))[:, None, None]
     return light + offsets.to(light)
 
@@ -159,9 +164,9 @@ def mean_luminance(coefficients: Tensor) -> float:
     return float(coefficients[0].cpu().double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
 
 
-def _read_light_map(path: Path) -> Tensor:
-    """Coefficients (49, 3) float32 of a map, at the grace probe's mean luminance."""
-    coefficients = project(read_panorama(path), DEGREE)
+def _read_light_map(path: Path, degree: int) -> Tensor:
+    """Coefficients ((degree + 1)², 3) float32 of a map, at the grace probe's mean luminance."""
+    coefficients = project(read_panorama(path), degree)
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} is black: give a map with light in it")

@@ -9,8 +9,9 @@ from PIL import Image
 
 import renderer
 from augment import relighting
+from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS
+from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
 from augment.build import build_scene, count_views, load_background, load_backgrounds
 from augment.objects import ObjectSettings, load_object
 from augment.reshading import NEAR
@@ -18,7 +19,10 @@ from augment.scene import Conditions, Example, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings
+from renderer.light.basis import Harmonics
+from renderer.light.environment import to_map, write_map
 from renderer.light.presets import ambient, probe
+from renderer.microfacets import degree_for
 from renderer.rasterizer import choose
 from renderer.transfer import build_operators
 
@@ -45,7 +49,7 @@ def test_views_follow_from_examples_meshes_and_backgrounds():
     [
         ({"meshes": []}, "examples is empty"),
         ({"backgrounds": ()}, "backgrounds is empty"),
-        ({"light": torch.zeros(9, 3)}, r"lights has shape \(9, 3\): give 49 rows"),
+        ({"light": torch.zeros(7, 3)}, r"light has shape \(7, 3\): give \(\(degree \+ 1\)², 3\)"),
         ({"ground": [0.5, 2.0, 0.5]}, "ground=.* must be red, green and blue"),
         ({"exposure": math.nan}, "exposure=.* must be at least"),
     ],
@@ -53,6 +57,32 @@ def test_views_follow_from_examples_meshes_and_backgrounds():
 def test_an_impossible_scene_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | wrong)
+
+
+def test_light_has_the_degree_that_gloss_needs_and_attacks_change_all_of_it(tmp_path):
+    """An attack on a scene of this degree is written, and read back to the same image; of degree 6, rings are said."""
+    write_map(tmp_path / "map.exr", to_map(probe("grace"), 64).clamp(min=0))
+    shiny, matte, options = ObjectSettings("solid:pear", "pear", gloss=[0.25]), ("solid:orange", "pear"), {"samples": 1}
+    options |= {"light": str(tmp_path / "map.exr"), "rasterizer": "numpy"}
+    with pytest.warns(UserWarning, match="solid:pear has gloss of roughness 0.25, in light of degree 12"):
+        scene = build_scene([matte, shiny], 16, **options)
+    assert scene.basis == Harmonics(degree_for(0.25)) == Harmonics(12)
+    light = renderer.load_light(options["light"], 12)
+    ours = scene.render(scene.conditions(torch.tensor([1])), torch.tensor([1]))[0, 0]
+    theirs = renderer.render(scene.objects[1].mesh, scene.cameras[1][0], light, 16, samples=1, rasterizer="numpy")
+    torch.testing.assert_close(ours, theirs[0], rtol=0, atol=1e-5)
+    assert build_scene([matte], 16, **options).basis == Harmonics(6)
+    low = build_scene([shiny], 16, degree=6, **options)
+    with pytest.warns(UserWarning, match="degree 6 shows rings"):
+        low.render(low.conditions(torch.tensor([0])), torch.tensor([0]))
+    sky = PARAMETERS["skylight"](scene, SkylightSettings())
+    of_sky = sky.apply(sky.start[1:], scene.conditions(torch.tensor([1])), torch.tensor([1])).light
+    assert of_sky.shape == (1, 169, 3) and not of_sky[:, 49:].any()
+    problem, rows = AttackProblem(scene, [PARAMETERS["lighting"](scene, StepSettings(radius=0.3))]), torch.arange(2)
+    values = problem.sample(torch.Generator().manual_seed(0))
+    after, images = problem.conditions(values, rows), problem.images(values)
+    write_adversary(Adversary.of(scene, 1, after, images[1], images[1]), tmp_path / "adversary")
+    torch.testing.assert_close(reload(tmp_path / "adversary").render(RASTERIZER), images[1], rtol=0, atol=1e-5)
 
 
 def test_a_background_is_gray_or_an_images_center_square(tmp_path):

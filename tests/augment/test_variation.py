@@ -22,7 +22,7 @@ from augment.variation import VariationSettings, VarnishSettings, vary
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode
 from renderer.light.basis import HARMONICS
-from renderer.light.presets import ambient, probe
+from renderer.light.presets import ambient, load_light, probe, save_light
 from renderer.mesh import Mesh
 
 SIZE = 48
@@ -101,6 +101,25 @@ def test_each_view_of_an_object_is_turned_about_an_axis_of_its_own_and_its_props
     assert len(rows.objects) == 6 and len(set(angles)) == 6 and 20 < max(angles) <= 40
 
 
+def test_in_light_of_a_higher_degree_everything_varies_as_in_degree_6(tmp_path):
+    """Of probes, whose higher bands are zero; white lamps, which have all bands, are left out."""
+    choices = {"environments": ["eucalyptus", "uniform"], "lit_background": True, "exposure": [0.5, 2.0]}
+    scenes = [
+        augment.build_scene([("solid:pear", "pear")], 8, 4, degree=degree, rasterizer="numpy") for degree in (6, 9)
+    ]
+    six, nine = (drawn(scene, **choices, background_saturation=1.0) for scene in scenes)
+    assert nine.basis.degree == 9
+    torch.testing.assert_close(images(nine), images(six), rtol=0, atol=1e-5)
+    for settings in ({"directional_fraction": 1.0}, {"tables": 1.0}):  # which lights of degree 6 truncate
+        changed = [images(drawn(scene, **settings)) for scene in scenes]
+        assert 0 < (changed[1] - changed[0]).abs().max() < 0.05
+    save_light(tmp_path / "light.json", scenes[1].lights[0], scenes[1].basis)
+    assert torch.equal(load_light(str(tmp_path / "light.json"), 9), scenes[1].lights[0])
+    with pytest.raises(InputError, match=r"harmonics of degree 9, beyond degree=6"):
+        drawn(scenes[0], environments=[str(tmp_path / "light.json")])
+
+
+@pytest.mark.filterwarnings("ignore:light of degree")
 def test_each_view_of_an_object_has_a_gloss_of_its_own_and_its_props_keep_theirs():
     prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
     scene = augment.build_scene([ObjectSettings("solid:pear", "pear", props=[prop])], 8, 6, rasterizer="numpy")
