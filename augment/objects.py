@@ -31,9 +31,12 @@ class MeshSettings:
     gloss: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        if self.gloss == "file" and self.mesh.startswith("solid:"):
+            raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
         if self.gloss not in (None, "file"):
             try:
-                Gloss(*map(float, self.gloss)).checked(1)
+                roughness, *others = map(float, self.gloss)
+                Gloss(roughness, *others).checked(1)
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"gloss={self.gloss}: give [roughness, metallic, strength] in [0, 1], or file"

@@ -250,6 +250,14 @@ def savings(view: View) -> Iterator[tuple[str, Call, Call]]:
         return lambda: torch.autograd.grad(image().sum(), moved)
 
     yield "a step by the vertices without gloss", by_vertices(shiny.mesh), by_vertices(view.mesh)
+    gloss = [torch.tensor(value, device=view.device, requires_grad=True) for value in (0.4, 0.0, 1.0)]
+    given: dict[str, Any] = {"gloss": Gloss(*gloss), "rasterizer": view.rasterizer.name}
+    image = partial(rendering.render, view.mesh, CAMERA, light, view.size, **given)
+    yield (
+        "a step by the vertices, not by the material",
+        lambda: torch.autograd.grad(image().sum(), gloss),
+        by_vertices(view.mesh),
+    )
     for normals, samples in product(("flat", "smooth"), (8, 2)):
         everything, needed = (
             by_vertices(view.mesh, silhouettes=moves, normals=normals, samples=samples) for moves in (True, False)

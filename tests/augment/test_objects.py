@@ -72,7 +72,7 @@ def test_an_object_has_the_gloss_that_it_is_given_and_its_props_stay_matte():
         own = shown.own_faces
         np.testing.assert_allclose(shown.mesh.gloss[own], np.tile([0.3, 0, 0.5], (own.sum(), 1)), rtol=1e-6)
         assert (shown.mesh.gloss[~own, 2] == 0).all() and len(own) > own.sum()
-    for bad in ([2.0], [0.5, 0, 1, 1], "shiny", 0.3):
+    for bad in ([2.0], [0.5, 0, 1, 1], "shiny", 0.3, [], "file"):
         with pytest.raises(InputError, match="gloss"):
             ObjectSettings("solid:pear", label="pear", gloss=bad)
 

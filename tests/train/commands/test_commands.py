@@ -13,10 +13,12 @@ from PIL import Image
 
 import renderer
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.io.images import read_image
 from renderer.light.environment import to_map
 from renderer.light.harmonics import project
 from renderer.light.presets import load_light, save_light
+from scripts.fit import grab_cut
 from train.attack import AttackExperimentSettings
 from train.checkpoint import BEST, save
 from train.networks import WideResNet, describe, load_run
@@ -126,6 +128,19 @@ def test_a_light_is_not_written_over_itself(call, here, capsys):
     assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
     assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
     assert (here / "a.npy").read_bytes() == whole
+
+
+def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
+    [camera], light = renderer.orbit_cameras(1, 4.0), renderer.load_light("uniform")
+    shown = renderer.solid("orange"), camera, light, 96
+    behind = 0.2 + 0.1 * torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(0))
+    image = renderer.render(*shown, behind, encoding="srgb")[0]
+    mask = grab_cut((255 * image.permute(1, 2, 0)).byte().numpy(), [10, 10, 86, 86]) > 0
+    exact = (renderer.render(*shown, 0.0)[0].amax(0) > 0).numpy()
+    assert (mask & exact).sum() > 0.95 * (mask | exact).sum()
+    for box in ([10, 10, 10, 86], [0, 0, 97, 96], [1, 2, 3]):
+        with pytest.raises(InputError, match=r"is not \[left, top, right, bottom\] within 96 × 96 pixels"):
+            grab_cut(np.zeros((96, 96, 3), np.uint8), box)
 
 
 def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
