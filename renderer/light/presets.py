@@ -56,22 +56,22 @@ def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
     >>> bool((load_light("uniform")[1:] == 0).all())  # the same radiance from everywhere
     True
     """
-    suffix, size = Path(light).suffix.lower(), Harmonics(DEGREE if degree is None else degree).size
+    suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
-        return F.pad(probe(light), (0, 0, 0, size - COEFFICIENTS))
-    if light == UNIFORM:
-        return F.pad(ambient(torch.full((3,), 1 / math.pi)), (0, 0, 0, size - COEFFICIENTS))
-    if suffix == ".json":
-        basis_read, coefficients = read_light(Path(light), Harmonics)
-        if degree is None:
-            return coefficients
-        if basis_read.degree > degree:
-            raise InputError(f"light {light} is of {basis_read}, beyond degree={degree}: give a higher degree")
-        return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
-    if suffix in SUFFIXES:
-        return _read_light_map(Path(light), DEGREE if degree is None else degree)
-    files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
-    raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
+        coefficients = probe(light)
+    elif light == UNIFORM:
+        coefficients = ambient(torch.full((3,), 1 / math.pi))
+    elif suffix == ".json":
+        coefficients = read_light(Path(light), Harmonics)[1]
+    elif suffix in SUFFIXES:
+        coefficients = _read_light_map(Path(light), DEGREE if degree is None else degree)
+    else:
+        files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
+        raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
+    size = len(coefficients) if degree is None else Harmonics(degree).size
+    if coefficients[size:].any():
+        raise InputError(f"light {light} has harmonics beyond degree={degree}: give a higher degree")
+    return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
 
 
 def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
