@@ -178,7 +178,7 @@ def build_scene(
     objects = [on_ground(item, shown.ground) for item in read]
     environment: Any = shown.light
     if isinstance(environment, str):
-        environment = load_light(environment, _degree(objects) if shown.degree is None else shown.degree)
+        environment = load_light(environment, _degree(objects, shown.degree))
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
     fov = None if shown.fov is None else math.radians(shown.fov)
@@ -203,14 +203,15 @@ def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObj
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
-def _degree(objects: Sequence[SceneObject]) -> int:
-    """Of the light that shows their gloss, at least 6; a higher one is told."""
+def _degree(objects: Sequence[SceneObject], given: int | None) -> int:
+    """Of the light: the given one, or what shows the objects' gloss, at least 6. It is told where gloss takes more."""
     roughness, name = min(((smoothest(item.mesh), item.name) for item in objects), default=(1.0, ""))
-    degree = max(DEGREE, degree_for(roughness))
-    if degree > DEGREE:
-        told = f"{name} has gloss of roughness {roughness:.2g}, in light of degree {degree}"
-        warnings.warn(f"{told}: degree={DEGREE} takes less time, with rings around highlights", stacklevel=3)
-    return degree
+    needed = max(DEGREE, degree_for(roughness))
+    if needed > (given or DEGREE):
+        choice = f"degree={DEGREE} takes less time, but" if given is None else f"degree={given}"
+        told = f"{name} has gloss of roughness {roughness:.2g}, which takes light of degree {needed}"
+        warnings.warn(f"{told}: {choice} shows rings around highlights", stacklevel=3)
+    return needed if given is None else given
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:

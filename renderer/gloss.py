@@ -23,9 +23,9 @@ from torch import Tensor
 from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import MAX_DEGREE, unit
+from renderer.light.harmonics import unit
 from renderer.mesh import Mesh
-from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance, shown_by
+from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -104,13 +104,6 @@ class SampleGloss(NamedTuple):
         """(S,) the fraction of the albedo that is left below the coat: of a dielectric, what that does not reflect."""
         _, coat = self._replace(metallic=torch.zeros_like(self.metallic)).even(normals, toward)
         return (1 - self.metallic) * (1 - coat)
-
-    def warn_of_rings(self, degree: int) -> None:
-        """Warn where light of a degree does not show the roughness."""
-        least, glossy = shown_by(degree), (self.metallic > 0) | (self.strength > 0)
-        if ((self.roughness < least) & glossy).any():
-            message = f"light of degree {degree} shows rings around highlights of a roughness below {least:.2g}"
-            warnings.warn(f"{message}: choose a higher degree, {MAX_DEGREE} at most", stacklevel=2)
 
     def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, Tensor]:
         """(colored, white, world): radiance (K, S) per unit coefficient of environment light of K = (degree + 1)², in

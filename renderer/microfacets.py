@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -135,24 +134,14 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
 
 def degree_for(roughness: float) -> int:
     """The least degree that holds KEPT of a lobe's power, seen head-on; at most 20, which roughness LEAST needs."""
-    return min(int((_held(max(roughness, LEAST)) < KEPT).sum()), MAX_DEGREE)
-
-
-@cache
-def shown_by(degree: int) -> float:
-    """The least roughness, in hundredths, of whose lobe light of a degree holds KEPT; 1 where there is none."""
-    return next((percent / 100 for percent in range(round(100 * LEAST), 100) if degree_for(percent / 100) <= degree), 1)
-
-
-def _held(roughness: float) -> Tensor:
-    """(21,) the fraction of a lobe's power in light of degrees 0 to 20."""
     up = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
     node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(2**9))
     cosine, weight = (node + 1) / 2, weight / 2
     light = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], 1)
-    lobe = reflectance(up, up, light, torch.tensor(roughness))[SCHLICK] * cosine
+    lobe = reflectance(up, up, light, torch.tensor(max(roughness, LEAST)))[SCHLICK] * cosine
     zonal = torch.stack(select_rows(light.T, [l * (l + 1) for l in range(MAX_DEGREE + 1)])) @ (weight * lobe)
-    return 2 * math.pi * zonal.square().cumsum(0) / (weight * lobe**2).sum()
+    held = 2 * math.pi * zonal.square().cumsum(0) / (weight * lobe**2).sum()
+    return min(int((held < KEPT).sum()), MAX_DEGREE)
 
 
 def _in_view(vectors: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:

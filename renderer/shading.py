@@ -81,12 +81,11 @@ def glossy_radiance(
         shaded = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
     toward = toward_camera(fragments, vertices.to(wide))
     albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(shaded)
-    degree, blocks = harmonics.degree_of(light), []
-    gloss.warn_of_rings(degree)
+    blocks = []
     for first in range(0, len(shaded), BLOCK):
         some = slice(first, first + BLOCK)
         seen = shaded[some], at_samples(toward, some)
-        colored, white, world = gloss.at(some).transfer(*seen, degree)
+        colored, white, world = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
         in_view = (world.T @ light).T
         blocks.append(in_view @ white if colored is None else in_view @ white + albedo[some].T * (in_view @ colored))
     shine = torch.cat([light.new_zeros(3, 0), *blocks], dim=1) / fragments.samples**2

@@ -277,7 +277,6 @@ def _glossy_box_filter(
     fragments, colors = surface.fragments, albedo.shape[1]
     filtered = torch.zeros(colors + (colors == 1), basis.size, len(fragments.pixels), dtype=dtype)
     weights = albedo / fragments.samples**2
-    gloss.warn_of_rings(basis.degree)
     for some, at, block in _blocks(fragments.pixel, filtered, max(1, GLOSSY // fragments.samples**2)):
         seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
         part = gloss.at(some)

@@ -22,7 +22,6 @@ from renderer.mesh import Mesh
 from renderer.microfacets import LEAST
 from renderer.shapes import sphere
 
-pytestmark = pytest.mark.filterwarnings("ignore:light of degree")  # from 0.34 down, where attacks lead
 ONE = torch.zeros(1, dtype=torch.int64)
 UNITS = torch.tensor([0.3, 0.2, 0.5, np.deg2rad(40)])
 
@@ -93,6 +92,7 @@ def test_a_material_starts_as_the_scene_shows_it_and_changes_the_object_alone():
     assert (scene.objects[1].mesh.gloss == before).all()
 
 
+@pytest.mark.filterwarnings("ignore:the mesh has gloss")
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 @pytest.mark.parametrize("radius", [0.5, 4.0, None])
 def test_a_material_stays_within_its_norm_ball_and_what_exists(norm, radius):

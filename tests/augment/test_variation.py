@@ -120,7 +120,6 @@ def test_in_light_of_a_higher_degree_everything_varies_as_in_degree_6(tmp_path):
         drawn(scenes[0], environments=[str(tmp_path / "light.json")])
 
 
-@pytest.mark.filterwarnings("ignore:light of degree")
 def test_each_view_of_an_object_has_a_gloss_of_its_own_and_its_props_keep_theirs():
     prop = PropSettings(mesh="solid:ball", at=[2.0, 0.0], gloss=[0.9])
     scene = augment.build_scene([ObjectSettings("solid:pear", "pear", props=[prop])], 8, 6, rasterizer="numpy")

@@ -77,7 +77,6 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
 
 
-@pytest.mark.filterwarnings("ignore:light of degree")
 @pytest.mark.parametrize("kind", ["lighting", "geometry", "albedo"])
 def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(tmp_path, kind):
     """Beside a matte table. The texture of gloss is painted anew from the nearest texels, so it is even with albedo."""

@@ -79,7 +79,6 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, encoding, norm
         assert off[:3, inside].mean().abs() < 0.5 / 255 and off[:3, inside].square().mean().sqrt() < 0.005
 
 
-@pytest.mark.filterwarnings("ignore:light of degree")
 def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     """Factors and textures: metals to 5 %, dielectrics to 10 %, since the diffuse part of `principled` is Disney's."""
     textured, light = normalize(ball()), load_light("st_peters")
