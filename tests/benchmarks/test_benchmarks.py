@@ -29,7 +29,7 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     assert all(float(row["time_ms"]) > 0 for row in rows)
     measured = [row for row in rows if not row["panel"].startswith("skipped")]
     assert all(math.isfinite(float(row[name])) for row in measured for name in ("image_error", "gradient_error"))
-    assert len(rows) - len(measured) == 12 and all(float(row["saved"]) > 0 for row in rows if row not in measured)
+    assert len(rows) - len(measured) == 13 and all(float(row["saved"]) > 0 for row in rows if row not in measured)
     panels = {row["panel"] for row in measured}
     assert len(panels) == 4
     for panel in panels:
