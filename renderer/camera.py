@@ -109,9 +109,8 @@ class Camera(ABC):
         )
         right, up, back = torch.stack([torch.stack(row) for row in rows]) @ points.T
         w, nearness = self._w(back)
-        return torch.stack(
-            [(right + self.right) * (2 / self.width), (up + self.up) * (2 / self.width), w], dim=1
-        ), nearness
+        scale = 2 / self.width
+        return torch.stack([(right + self.right) * scale, (up + self.up) * scale, w]).T, nearness
 
     @abstractmethod
     def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:

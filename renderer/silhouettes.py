@@ -104,14 +104,13 @@ def _by_surface(
 ) -> Tensor:
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
     stride = fragments.samples if fragments.size >= LARGE else max(fragments.samples // 2, 1)
-    forces, levels = radiance.new_zeros(2, radiance.shape[1]), F.pad(radiance.sum(0), (0, 1), value=torch.nan)
-    for axis, force in enumerate(forces):
-        lines = (grid if axis == 0 else grid.T)[stride // 2 :: stride].contiguous()
-        level = levels[lines]  # where nothing is covered, of sample -1
+    forces, levels = radiance.new_zeros(2, radiance.shape[1]), fragments.image_of_samples(radiance.sum(0), torch.nan)
+    for axis, (force, *images) in enumerate(((forces[0], grid, levels), (forces[1], grid.T, levels.T))):
+        lines, level = (image[stride // 2 :: stride].contiguous() for image in images)
         differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
         first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
         before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]
-        goes_on = torch.ones_like(force).index_fill(0, before[(before >= 0) & (after >= 0)], 0)
+        goes_on = torch.ones_like(force, dtype=torch.bool).index_fill_(0, before[(before >= 0) & (after >= 0)], False)
         jump = radiance.index_select(1, first) - radiance.index_select(1, second)
         jump *= sum(upstream.index_select(1, fragments.pixel.index_select(0, pair)) for pair in (first, second))
         jump = jump.sum(0) * goes_on.index_select(0, first)
@@ -173,8 +172,8 @@ def _crossings(
 ) -> Crossings:
     """Where silhouettes are seen; they hide where both samples beside them are of nearer surfaces."""
     resolution = len(grid)
-    points = np.column_stack([positions[:, :2] / positions[:, 2:], nearness])
-    places = to_fixed_point(points, resolution)[0] / SUBSAMPLES
+    x, y, w = positions.T
+    places = to_fixed_point(np.stack([x / w, y / w, nearness]).T, resolution)[0] / SUBSAMPLES
     ends = _silhouettes(places, faces)[:, : None if len(fragments.face) else 0]  # a mesh outside the image has none
     start, end = places[:, ends[0]], places[:, ends[1]]
     normal = np.stack([end[1] - start[1], end[0] - start[0]])  # in an image whose y runs up
@@ -236,20 +235,21 @@ def _plane_nearness(
 
 def _silhouettes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(2, N) the vertices of the edges whose faces all lie on one side of them; places: (2, V)."""
-    ends, edge, forth, count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
-    (ax, bx, cx), (ay, by, cy) = places.take(faces.T, axis=1)
+    corners, ends, edge, forth, count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
+    (ax, bx, cx), (ay, by, cy) = places.take(corners, axis=1)
     turn = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    sides = np.bincount(edge, (turn[:, None] * forth).ravel(), len(count))
+    sides = np.bincount(edge, (turn * forth).ravel(), len(count))
     return ends.take(np.flatnonzero(np.abs(sides) > count - 2), axis=1)  # of two faces, one may be seen edge-on
 
 
 @lru_cache(maxsize=4)
 def _edges(faces: bytes) -> tuple[np.ndarray, ...]:
-    """Of faces (F, 3) of int64: the ends (2, N) of their edges, the edge of each side (3 F,), ±1 by its direction
-    (F, 3), and how many faces an edge has (N,)."""
-    sides = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)[:, EDGES]
-    low, high = sides.min(axis=2).ravel(), sides.max(axis=2).ravel()
+    """Of faces (F, 3) of int64: their corners (3, F), the ends (2, N) of their edges, the edge of each side (3 F,), ±1
+    by its direction (3, F), and how many faces an edge has (N,)."""
+    corners = np.ascontiguousarray(np.frombuffer(faces, dtype=np.int64).reshape(-1, 3).T)
+    first, second = corners.take(EDGES, axis=0).swapaxes(0, 1)
+    low, high = np.minimum(first, second).ravel(), np.maximum(first, second).ravel()
     vertices = int(high.max()) + 1
     keys, edge, count = np.unique(low * vertices + high, return_inverse=True, return_counts=True)
-    forth = np.where(sides[..., 0] < sides[..., 1], 1.0, -1.0)
-    return np.stack(np.divmod(keys, vertices)), edge.ravel(), forth, count
+    forth = np.where(first < second, 1.0, -1.0)
+    return corners, np.stack(np.divmod(keys, vertices)), edge.ravel(), forth, count
