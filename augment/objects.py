@@ -35,8 +35,7 @@ class MeshSettings:
             raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
         if self.gloss not in (None, "file"):
             try:
-                roughness, *others = map(float, self.gloss)
-                Gloss(roughness, *others).checked(1)
+                _gloss(self.gloss).checked(1)
             except (TypeError, ValueError) as error:
                 raise InputError(
                     f"gloss={self.gloss}: give [roughness, metallic, strength] in [0, 1], or file"
@@ -202,11 +201,17 @@ def _load(item: MeshSettings) -> Mesh:
     mesh = _colored(item)
     if item.gloss is None:
         return mesh
-    mesh = mesh if item.gloss == "file" else Gloss(*map(float, item.gloss)).on(mesh)
+    mesh = mesh if item.gloss == "file" else _gloss(item.gloss).on(mesh)
     metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
     if metal and item.color is None and not mesh.textures and (mesh.corner_colors == 1).all():
         raise InputError(f"{item.mesh} is a metal without a color: give color=[red,green,blue], or a metallic of 0")
     return mesh
+
+
+def _gloss(values: Sequence[float]) -> Gloss:
+    """Of [roughness, metallic, strength], or the first of them."""
+    roughness, *others = map(float, values)
+    return Gloss(roughness, *others)
 
 
 def _colored(item: MeshSettings) -> Mesh:

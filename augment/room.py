@@ -42,7 +42,7 @@ def _upper(degree: int) -> tuple[Tensor, Tensor]:
 def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
     """Lights (E, K, 3) on infinite tables of albedo (E, 3): that from above, and what the tables reflect of it and of
     white lamps of irradiance 1 in directions (E, 3), or zero for none."""
-    harmonics = Harmonics(math.isqrt(lights.shape[1]) - 1)
+    harmonics = Harmonics(degree_of(lights[0]))
     upper, below = _upper(harmonics.degree)
     above, albedo = upper @ lights.cpu().double(), albedo.cpu()
     normal, nonzero = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), harmonics.nonzero

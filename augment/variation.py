@@ -21,7 +21,8 @@ from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.gloss import Gloss
 from renderer.image import clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
-from renderer.light.basis import LocalBasis, harmonics_of, parts_of
+from renderer.light.basis import Harmonics, LocalBasis, harmonics_of, parts_of
+from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
 from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
@@ -36,7 +37,7 @@ DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, ar
 @dataclass
 class VarnishSettings:
     """[least, most] roughness and strength of a varnish on each object, as of `renderer.Gloss`, each uniform; of
-    strength 0, which is the default, none. Below a roughness of 0.35, light of degree 6 shows rings of its series."""
+    strength 0, which is the default, none. Below a roughness of 0.34, light of degree 6 shows rings of its series."""
 
     roughness: list[float] = field(default_factory=lambda: [0.4, 0.8])
     strength: list[float] = field(default_factory=lambda: list(NONE))
@@ -164,9 +165,8 @@ def _with_moved_rows(
         changed["objects"] = objects
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
-    has_rays = (
-        len(parts_of(scene.basis)) > 1 or scene.settings.global_illumination
-    )  # which take longer than an operator
+    # Rays take longer than an operator.
+    has_rays = not isinstance(scene.basis, Harmonics) or scene.settings.global_illumination
     return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
@@ -272,7 +272,7 @@ def _with_directional(sky: Tensor, lamps: Tensor) -> Tensor:
     lit = lamps.any(1)
     if not lit.any():
         return sky
-    added = directional(lamps, torch.ones(3), math.isqrt(sky.shape[1]) - 1).to(sky)
+    added = directional(lamps, torch.ones(3), degree_of(sky[0])).to(sky)
     return torch.where(lit[:, None, None].to(sky.device), added + sky, sky)
 
 

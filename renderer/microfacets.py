@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -132,6 +133,7 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
     return table.flatten(2) @ (along[:, None] * across).flatten(0, 1)
 
 
+@cache
 def degree_for(roughness: float) -> int:
     """The least degree that holds KEPT of a lobe's power, seen head-on; at most 20, which roughness LEAST needs."""
     up = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)

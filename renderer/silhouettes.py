@@ -105,8 +105,8 @@ def _by_surface(
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
     stride = fragments.samples if fragments.size >= LARGE else max(fragments.samples // 2, 1)
     forces, levels = radiance.new_zeros(2, radiance.shape[1]), fragments.image_of_samples(radiance.sum(0), torch.nan)
-    for axis, (force, *images) in enumerate(((forces[0], grid, levels), (forces[1], grid.T, levels.T))):
-        lines, level = (image[stride // 2 :: stride].contiguous() for image in images)
+    for axis, force in enumerate(forces):
+        lines, level = ((image.T if axis else image)[stride // 2 :: stride].contiguous() for image in (grid, levels))
         differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
         first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
         before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]

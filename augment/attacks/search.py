@@ -67,10 +67,10 @@ def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
     """The highest confidence, and the settings with the light and exposure that reach it."""
-    lights = list(product(dict.fromkeys([settings.light, *PROBES, UNIFORM]), EXPOSURES))
+    names, degree = dict.fromkeys([settings.light, *PROBES, UNIFORM]), harmonics_of(scene.basis).degree
+    loaded, lights = {name: load_light(name, degree) for name in names}, list(product(names, EXPOSURES))
     exposures = [settings.exposure * factor for _, factor in lights]
-    degree = harmonics_of(scene.basis).degree
-    coefficients = [load_light(name, degree) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
+    coefficients = [loaded[name] * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
     sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(scene.lights.device)
     lit = torch.cat([sky, scene.lights.repeat(len(lights), 1, 1)[:, sky.shape[1] :]], dim=1)  # projector and lamps stay
     rows = replace(scene, examples=[*scene.examples] * len(lights), lights=lit)
