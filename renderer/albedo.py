@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,8 +32,7 @@ class Texture:
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner color × texture, each decoded before it is interpolated.
     textures: in place of the mesh's: linear albedo (H, W, 3), float; differentiable in them. InputError: NaN."""
-    faces = fragments.faces.cpu().numpy()
-    albedo = _colors(mesh, faces, fragments, encoding)
+    albedo = _colors(mesh, fragments, encoding)
     if textures is None:
         sources = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
     else:
@@ -91,7 +89,7 @@ def painted_albedo(
     albedo = fragments.interpolate(changed_albedo(corners, of_corners, added.index_select(0, fragments.faces)[:, None]))
     if not mesh.textures:
         return albedo
-    colors = (_colors(mesh, faces, fragments, encoding) * albedo_scale).to(added)
+    colors = (_colors(mesh, fragments, encoding) * albedo_scale).to(added)
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(fragments.coverage)).T
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)[fragments.face]
     for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
@@ -115,14 +113,39 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
     return clamp(changed + added, albedo.clamp(min=1))
 
 
-def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
-    """(S, 3) the corners' colors, as authored for display, as linear albedo, float64 on the fragments' device."""
-    corner_colors = torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(fragments.coverage)
-    require_bounded(corner_colors=corner_colors)
-    corner_colors = decode(corner_colors, encoding)
+def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | None:
+    """Return the linear albedo (3,), float64, if all visible faces share one, else None.
+
+    Args:
+        mesh: Its corner colors are as authored for display.
+        fragments: The visible faces of the mesh.
+        encoding: By which colors are decoded, "linear" or "srgb".
+
+    Raises:
+        InputError: A color is NaN.
+    """
+    if mesh.packed_textures:
+        return None
+    colors = _corner_colors(mesh, fragments, encoding).flatten(0, 1)
+    if not len(colors) or not (colors == colors[0]).all():
+        return None
+    return colors[0]
+
+
+def _colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
+    """(S, 3) linear albedo of the corners' colors at the samples, float64 on the fragments' device."""
+    corner_colors = _corner_colors(mesh, fragments, encoding)
     if mesh.one_color_per_face:
         return _of_faces(corner_colors[:, 0], fragments)
     return fragments.interpolate(corner_colors)
+
+
+def _corner_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
+    """(G, 3, 3) linear albedo at the corners of the visible faces."""
+    faces = fragments.faces.cpu().numpy()
+    corner_colors = torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(fragments.coverage)
+    require_bounded(corner_colors=corner_colors)
+    return decode(corner_colors, encoding)
 
 
 def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:

@@ -6,7 +6,7 @@ Rasterized once and then fixed, while light, albedo or the positions of the vert
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,20 @@ from renderer.image import ImageSettings
 from renderer.rasterizer import Rasterizer
 
 BLOCK = 2**14  # samples at a time
+
+
+class Runs(NamedTuple):
+    """R runs of neighboring samples that see one face in one pixel, in the samples' order.
+
+    Attributes:
+        pixel: Index into `Fragments.pixels`, ascending, (R,) int64.
+        face: Index into `Fragments.faces`, (R,) int64.
+        count: The number of samples, (R,) int64.
+    """
+
+    pixel: Tensor
+    face: Tensor
+    count: Tensor
 
 
 @dataclass(frozen=True)
@@ -131,20 +145,19 @@ class Fragments:
         share a normal, with the sum of their albedos (S, C) over samples². Differentiable in them."""
         if self.samples == 1 or not len(self.pixel):
             return self.pixel, self.face, albedo
-        pixel, face, run = self._runs
-        summed = albedo.new_zeros(albedo.shape[1], len(pixel)).index_add(1, run, albedo.T / self.samples**2)
-        return pixel, face, summed.T
+        runs = self.runs
+        run_of_sample = torch.arange(len(runs.count), device=albedo.device).repeat_interleave(runs.count)
+        scaled = albedo.T / self.samples**2
+        summed = albedo.new_zeros(albedo.shape[1], len(runs.count)).index_add(1, run_of_sample, scaled)
+        return runs.pixel, runs.face, summed.T
 
     @cached_property
-    def _runs(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixel (R,), face (R,), run (S,)), where neighboring samples of one face in one pixel are a run."""
-        starts = torch.ones_like(self.pixel, dtype=torch.bool)
-        starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
-        run = starts.cumsum(0) - 1
-        count = int(run[-1]) + 1
-        # Writing each run's common value several times takes a fifth of the time of nonzero.
-        pixel, face = (index.new_empty(count).scatter_(0, run, index) for index in (self.pixel, self.face))
-        return pixel, face, run
+    def runs(self) -> "Runs":
+        """The runs of samples that lie next to each other in memory and see one face in one pixel."""
+        face_count = max(len(self.faces), 1)
+        key, count = (self.pixel * face_count + self.face).unique_consecutive(return_counts=True)
+        pixel = torch.div(key, face_count, rounding_mode="floor")
+        return Runs(pixel, key - pixel * face_count, count)
 
     def to(self, device: torch.device | str) -> "Fragments":
         """The same on another device."""
@@ -242,9 +255,11 @@ def _fragments(
 
 def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(the distinct values below `count`, ascending, and where in them each value is): np.unique without a sort."""
+    values = values.astype(np.intp)  # once, instead of in each of the two lookups
     present = np.zeros(count, dtype=bool)
     present[values] = True
-    return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
+    position = np.cumsum(present) - 1
+    return np.flatnonzero(present), position.take(values)
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:

@@ -13,11 +13,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from renderer.albedo import surface_albedo
+from renderer.albedo import shared_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
-BLOCK = 2**16  # pixels filtered at a time: bounds the memory
+BLOCK = 2**12  # pixels filtered at a time: their sums stay in the processor's cache
 GLOSSY = 2**14  # samples with gloss, of which more numbers are computed
 
 
@@ -203,15 +204,20 @@ def build_operators(
 
     def build(fragments: Fragments) -> TransferOperator:
         surface, pixels = Surface(mesh, fragments, settings, given_gloss=gloss), len(fragments.pixels)
-        albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
         by_channel = (transport and transport.colors) or (surface.gloss is not None and (transport or local))
-        factor = None if by_channel else _pixel_albedo(fragments, albedo, dtype)
+        color = None if by_channel else shared_albedo(mesh, fragments, settings.encoding)
+        if color is None:
+            albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
+            factor = None if by_channel else _pixel_albedo(fragments, albedo, dtype)
+        else:
+            factor = (color * albedo_scale).expand(pixels, 3)
+        one_channel = factor is not None  # The albedo multiplies whole pixels, so that the samples have 1.
         if factor is None:
             factor = torch.ones(pixels, 3)
         else:
-            albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-        channels = 2 if albedo.shape[1] == 1 and surface.gloss is not None else albedo.shape[1]
-        transfers, nonzero = [torch.empty(channels, 0, pixels, dtype=dtype)], [torch.arange(0)]
+            albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
+        channels = 2 if one_channel and surface.gloss is not None else albedo.shape[1]
+        transfers, nonzero = [], [torch.arange(0)]
         sparse = []
         for rows, part in parts_of(basis):
             if isinstance(part, LocalBasis):
@@ -223,7 +229,8 @@ def build_operators(
                 transfer, indices = entries.dense(pixels)
             else:
                 if surface.gloss is None:
-                    transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
+                    weights = None if one_channel else albedo
+                    transfer, indices = _box_filter(surface, weights, part, dtype), part.nonzero
                 else:
                     transfer = _glossy_box_filter(surface, surface.gloss, albedo, part, dtype)
                     indices = torch.arange(part.size)
@@ -232,8 +239,12 @@ def build_operators(
                     transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
             transfers.append(transfer.to(dtype))
             nonzero.append(rows.start + indices)
+        if len(transfers) == 1:  # nothing to join, and so nothing to copy
+            [joined_transfer] = transfers
+        else:
+            joined_transfer = torch.cat([torch.empty(channels, 0, pixels, dtype=dtype), *transfers], dim=1)
         return TransferOperator(
-            transfer=torch.cat(transfers, dim=1),
+            transfer=joined_transfer,
             albedo=factor.T.to(dtype).contiguous(),
             coverage=fragments.coverage.to(dtype),
             pixels=fragments.pixels,
@@ -247,27 +258,67 @@ def build_operators(
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """(P, 3) the albedo of each pixel, if all of its samples have the same to the dtype's rounding."""
-    by_pixel = albedo.new_zeros(len(fragments.pixels), 3).index_copy(0, fragments.pixel, albedo)
-    spread = (albedo - by_pixel[fragments.pixel]).abs()
-    return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
+    """Return the albedo (P, 3) of each pixel if its samples' (S, 3) agree to the dtype's rounding, else None."""
+    by_channel = albedo.T  # rows of one channel, which are contiguous
+    by_pixel = by_channel.new_zeros(3, len(fragments.pixels)).index_copy(1, fragments.pixel, by_channel)
+    spread = (by_channel - by_pixel.index_select(1, fragments.pixel)).abs_()
+    agrees = spread <= torch.finfo(dtype).eps * by_channel
+    return by_pixel.T if agrees.all() else None
 
 
-def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
-    """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64.
-    K: the nonzero coefficients."""
-    fragments, by_face = surface.fragments, surface.settings.normals == "flat"
+def _box_filter(surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype) -> Tensor:
+    """Sum albedo × A_l Y_lm(n) over each pixel's samples, in float64.
+
+    Args:
+        surface: Normals at the S samples of a view, in P pixels.
+        albedo: Linear (S, C) at the samples. None stands for 1 in a single channel.
+        basis: The K nonzero functions A_l Y_lm.
+        dtype: Of the result.
+
+    Returns:
+        (C, K, P).
+    """
+    fragments = surface.fragments
+    by_face = surface.settings.normals == "flat"
     if by_face:
-        pixel, face, weights = fragments.merge(albedo)
-        shading = basis.irradiance(surface.face_planes)
+        face_harmonics = basis.irradiance(surface.face_planes).numpy()
+        pixel, face, weights = _face_weights(fragments, albedo)
     else:
-        pixel, weights = fragments.pixel, albedo / fragments.samples**2
-    filtered = torch.empty(albedo.shape[1], len(basis.nonzero), len(fragments.pixels), dtype=dtype)
-    for some, at, block in _blocks(pixel, filtered, BLOCK):
-        rows = shading.index_select(0, face[some]) if by_face else basis.irradiance(surface.normals[some])
-        for channel, weight in zip(block, weights[some].T, strict=False):
-            channel.copy_(_over_pixels(rows * weight[:, None], at, block.shape[2]))
+        pixel, weights = fragments.pixel, _sample_weights(fragments, albedo)
+    pixel_count = len(fragments.pixels)
+    filtered = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
+    # The weights are a sparse matrix in compressed rows: those of a pixel begin where those before it end.
+    ends = torch.bincount(pixel, minlength=pixel_count).cumsum(0)
+    row_starts = torch.cat([ends.new_zeros(1), ends])
+    for first in range(0, pixel_count, BLOCK):
+        rows = row_starts[first : first + BLOCK + 1]
+        entries = slice(int(rows[0]), int(rows[-1]))
+        if by_face:
+            column, harmonics = face[entries], face_harmonics
+        else:
+            harmonics = basis.irradiance(surface.normals[entries]).numpy()
+            column = torch.arange(len(harmonics))
+        indices = column.int().numpy(), (rows - rows[0]).int().numpy()
+        shape = (len(rows) - 1, len(harmonics))
+        for channel, weight in zip(filtered, weights[entries].T, strict=True):
+            sums = csr_array((weight.numpy(), *indices), shape=shape) @ harmonics
+            channel[:, first : first + BLOCK] = torch.from_numpy(sums).to(dtype).T
     return filtered
+
+
+def _face_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pixel (R,), the face (R,) and the summed weight (R, C) of each run of samples of one face."""
+    if albedo is not None:
+        return fragments.merge(albedo)
+    runs = fragments.runs
+    return runs.pixel, runs.face, (runs.count.double() / fragments.samples**2)[:, None]
+
+
+def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
+    """Return the weight (S, C) of each sample in its pixel."""
+    if albedo is None:
+        albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
+    return albedo / fragments.samples**2
 
 
 def _glossy_box_filter(

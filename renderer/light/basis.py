@@ -15,8 +15,16 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from renderer.errors import require_range
-from renderer.light.harmonics import MAX_DEGREE, basis, degree_of, lambertian_factors, nonzero_coefficients
+from renderer.errors import require_finite, require_range
+from renderer.light.harmonics import (
+    MAX_DEGREE,
+    basis,
+    degree_of,
+    lambertian_factors,
+    nonzero_coefficients,
+    select_rows,
+    unit,
+)
 
 _STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
 
@@ -52,8 +60,11 @@ class Harmonics:
 
     def irradiance(self, normals: Tensor) -> Tensor:
         """(N, K) at unit normals (N, 3), per unit of each nonzero coefficient."""
-        factors = lambertian_factors(self.degree)[self.nonzero]
-        return basis(normals, self.degree)[..., self.nonzero.to(normals.device)] * factors.to(normals)
+        require_finite(normals=normals)
+        factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
+        rows = select_rows(unit(normals.double().T), self.nonzero.tolist())
+        by_function = torch.stack(rows).to(normals.dtype) * factors[:, None]
+        return by_function.T.contiguous()  # Transposed last, since rows are what a processor fills fastest.
 
     def radiance(self, directions: Tensor) -> Tensor:
         """(N, size) from unit directions (N, 3), per unit of each coefficient."""

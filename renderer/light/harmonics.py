@@ -103,15 +103,20 @@ def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
     return [rows[index] for index in indices]
 
 
-def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
-    """Orthonormal associated Legendre functions over sin^m θ, for l = m..degree, as polynomials in z."""
-    start = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4 * math.pi))
-    before, value = torch.zeros_like(z), torch.full_like(z, start)
-    yield value
+def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
+    """Yield the orthonormal associated Legendre functions over sin^m θ, for l = m..degree, as polynomials in z.
+
+    The first is a constant. It is yielded as a number, which is faster than a tensor of equal entries.
+    """
+    constant = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4 * math.pi))
+    yield constant
+    before = z.new_tensor(constant)
+    value = z * math.sqrt(2 * m + 3) * constant
     for l in range(m + 1, degree + 1):
-        a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
-        b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
-        before, value = value, torch.addcmul(before * (-a * b), z, value, value=a)
+        if l > m + 1:
+            a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
+            b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
+            before, value = value, torch.addcmul(before * (-a * b), z, value, value=a)
         yield value
 
 
