@@ -9,7 +9,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +24,14 @@ LIMIT = 20.0  # seconds by the comparison's clock, after which a comparison stop
 
 
 def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[Key, float]:
-    """Median milliseconds of each call, on one thread.
+    """Return the median milliseconds of each call over the rounds of `times_in_turn`."""
+    return {key: statistics.median(times) for key, times in times_in_turn(calls, rounds, device).items()}
+
+
+def times_in_turn(
+    calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu"
+) -> dict[Key, list[float]]:
+    """Measure the milliseconds of each call in every round, on one thread.
 
     All calls take turns in every round, so that noise hits all alike. On a CPU the clock is the process's own time,
     which leaves out other processes on a shared machine; elsewhere it is wall time after synchronization.
@@ -40,7 +47,16 @@ def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str 
             break
         for key, timer in timers.items():
             times[key].append(1e3 * timer.timeit(repeats[key]).median)  # warms up first
-    return {key: statistics.median(values) for key, values in times.items()}
+    return times
+
+
+def quartiles_of_ratio(times: Sequence[float], others: Sequence[float]) -> tuple[float, float, float]:
+    """Return the first quartile, the median and the third quartile of the rounds' ratios of two calls' times."""
+    ratios = [time / other for time, other in zip(times, others, strict=True)]
+    if len(ratios) == 1:
+        return ratios[0], ratios[0], ratios[0]
+    low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive")
+    return low, middle, high
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

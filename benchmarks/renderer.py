@@ -6,6 +6,12 @@ writes renderer_pareto.csv and renderer_pareto.png in some minutes on one CPU th
 color under a light probe and a sun, whose bands never end, so that cutting the light off after a degree is an error,
 too. Errors are root mean squares of the difference to a converged float64 reference, over the reference's: of the
 radiance before clamping, and of the gradient of Σ image × normal random numbers, with visibility fixed.
+
+Whole light steps (an image with background and clamp, a loss, and the loss's gradient by the light) are timed beside
+autograd code that keeps all it can (`benchmarks.peer`), for two meshes. Their images and gradients are equal, or the
+run stops. This table alone takes a few minutes:
+
+    python -m benchmarks.renderer --whole-steps-only --rasterizer numba --out whole_steps
 """
 
 import argparse
@@ -15,6 +21,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -22,7 +29,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks import reference, scene
-from benchmarks.common import Row, machine, medians, write_csv
+from benchmarks.common import Row, machine, medians, quartiles_of_ratio, times_in_turn, write_csv
+from benchmarks.peer import Peer
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
 from renderer import rendering, shading
 from renderer.fragments import Fragments
@@ -36,6 +44,7 @@ BACKGROUND = 0.5
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 DEGREES = (2, 4, 6, 8, 10, 12)  # of the harmonics
 PER_SIDE = (1, 2, 4, 8, 16)  # samples per side of a pixel
+STEP_SAMPLES = (2, 8)  # samples per side of a pixel in the whole light steps
 
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 Call = Callable[[], object]
@@ -134,7 +143,7 @@ def light_gradients(view: View) -> Iterator[Contender]:
 def lit_by_autograd(view: View, vertices: Tensor, samples: int) -> Iterator[tuple[str, Lit]]:
     """What is kept from step to step, and a function of the light to the covered pixels and their radiance."""
     operator, (fragments, albedo, _) = view.operator(samples), view.rasterized(samples, vertices)
-    pixels, faces = fragments.pixels, len(fragments.faces)
+    pixels = fragments.pixels
     if samples == 1:  # with more, both take as many times as long
 
         def drawn(light: Tensor) -> tuple[Tensor, Tensor]:
@@ -143,18 +152,9 @@ def lit_by_autograd(view: View, vertices: Tensor, samples: int) -> Iterator[tupl
 
         yield "nothing", drawn
         yield "visibility", lambda light: (pixels, shade_by_face(fragments, vertices, light, albedo))
-    normals = reference.face_normals(vertices[fragments.corners]) * fragments.facing.to(vertices)
-    matrix, rows, factors = reference.reaching_harmonics(normals, DEGREE)
-    key, pair = (fragments.pixel * faces + fragments.face).unique(return_inverse=True)
-    pixel, face = key // faces, key % faces
-    weight = albedo.new_zeros(3, len(key)).index_add(1, pair, albedo.T / samples**2)
-    at_faces, at_pixels = (matrix * factors.T).T.contiguous(), operator.transfer[0]
-
-    def by_face(light: Tensor) -> tuple[Tensor, Tensor]:
-        shade = (light[rows].T @ at_faces).index_select(1, face) * weight
-        return pixels, shade.new_zeros(3, len(pixels)).index_add(1, pixel, shade)
-
-    yield "harmonics of the seen faces", by_face
+    peer = Peer(view.mesh, CAMERA, view.size, samples, DEGREE, view.rasterizer, BACKGROUND, view.device)
+    yield "harmonics of the seen faces", lambda light: (pixels, peer.radiance(light))
+    at_pixels = operator.transfer[0]
     pixel_major, pixel_albedo = at_pixels.T.contiguous(), operator.albedo.T.contiguous()
     yield "operator, pixels first", lambda light: (pixels, (pixel_major @ light[operator.nonzero] * pixel_albedo).T)
     yield "operator", lambda light: (pixels, light[operator.nonzero].T @ at_pixels * operator.albedo)
@@ -210,6 +210,59 @@ def measure(panel: str, view: View, options: argparse.Namespace) -> list[Row]:
 def error_of(row: Row) -> float:
     """The larger of the two, to the three digits that the reference is good for."""
     return float(f"{max(row['image_error'], row['gradient_error']):.3g}")
+
+
+# ---------------------------------------------------------------------------- whole light steps
+
+
+OPERATOR, KEPT = "operator", "plain autograd that keeps all it can"
+
+
+def whole_step(view: View, light: Tensor, image: Callable[[Tensor], Tensor]) -> Callable[[], tuple[Tensor, Tensor]]:
+    """Return a step from the light to its image (3, size, size) and to the gradient of a loss by the light."""
+    weights = view.image_gradient.to(light.dtype).view(3, view.size, view.size)
+
+    def step() -> tuple[Tensor, Tensor]:
+        variable = light.clone().requires_grad_()
+        shown = image(variable)
+        [gradient] = torch.autograd.grad((shown * weights).sum(), variable)
+        return shown.detach(), gradient
+
+    return step
+
+
+def whole_steps(view: View, samples: int, options: argparse.Namespace) -> list[Row]:
+    """Measure a whole light step and its preparation by the operator and by `Peer`, which agree to rounding.
+
+    The columns ratio, ratio_low and ratio_high hold the median and the quartiles over the rounds of each time over the
+    operator's.
+    """
+    light = coefficients(DEGREE, torch.float32, view.device)
+    build_operator = partial(view.operator, samples)
+    peer_of_view = partial(Peer, view.mesh, CAMERA, view.size, samples, DEGREE, view.rasterizer)
+    build_peer = partial(peer_of_view, BACKGROUND, view.device)
+    by_operator = whole_step(view, light, partial(build_operator().image, background=BACKGROUND))
+    by_peer = whole_step(view, light, build_peer().image)
+    require_equal(by_operator(), by_peer())
+
+    steps = {OPERATOR: by_operator, KEPT: by_peer}
+    builds = {OPERATOR: build_operator, KEPT: build_peer}
+    rows = []
+    for panel, calls in (("whole light step", steps), ("building for whole light steps", builds)):
+        times = times_in_turn(calls, options.rounds, view.device)
+        for setting in calls:
+            low, middle, high = quartiles_of_ratio(times[setting], times[OPERATOR])
+            row = {"panel": f"{panel}, {view.size}²", "setting": setting, "time_ms": median(times[setting])}
+            row |= {"degree": DEGREE, "samples": samples**2, "size": view.size, "faces": len(view.mesh.faces)}
+            rows.append(row | {"ratio": middle, "ratio_low": low, "ratio_high": high})
+            print(rows[-1], flush=True)
+    return rows
+
+
+def require_equal(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
+    """Stop the run unless the tensors are equal up to the rounding of sums in float32."""
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, other, rtol=0, atol=2e-5 * float(other.abs().max()))
 
 
 # ---------------------------------------------------------------------------- what a scene does not need
@@ -297,18 +350,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 224], help="of images, in pixels")
     parser.add_argument("--subdivisions", type=int, default=5, help="of the icosahedron; 5 make 10,242 vertices")
     parser.add_argument("--rounds", type=int, default=21, help="in which all settings take turns")
+    parser.add_argument("--step-sizes", type=int, nargs="+", default=[32, 64, 224], help="of whole light steps")
+    parser.add_argument("--coarse", type=int, default=3, help="subdivisions of the second mesh of whole light steps")
+    parser.add_argument("--whole-steps-only", action="store_true", help="write whole_steps.csv alone")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL on the one thread, too
     print(machine(options.device))
-    mesh, panels, skipped = scene.ellipsoid(options.subdivisions), [], []
+    rasterizer = choose(options.rasterizer)
+    mesh = scene.ellipsoid(options.subdivisions)
+    steps = []
+    for shown, size, samples in product((scene.ellipsoid(options.coarse), mesh), options.step_sizes, STEP_SAMPLES):
+        steps += whole_steps(View(shown, size, rasterizer, options.device), samples, options)
+    if options.whole_steps_only:
+        write_csv(options.out / "whole_steps.csv", steps)
+        return
+    panels, skipped = [], []
     for size in options.sizes:
-        view = View(mesh, size, choose(options.rasterizer), options.device)
+        view = View(mesh, size, rasterizer, options.device)
         panels += [measure(panel, view, options) for panel in PANELS]
         for name, everything, needed in savings(view):
             slow, fast = medians({0: everything, 1: needed}, options.rounds, options.device).values()
             skipped += [{"panel": f"skipped, {size}²", "setting": name, "time_ms": fast, "saved": slow / fast}]
-    write_csv(options.out / "renderer_pareto.csv", [*chain.from_iterable(panels), *skipped])
+    write_csv(options.out / "renderer_pareto.csv", [*chain.from_iterable(panels), *skipped, *steps])
     draw(options.out / "renderer_pareto.png", panels)
 
 

@@ -24,9 +24,13 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     for name, value in {"DEGREES": (2, 6), "PER_SIDE": (1, 8)}.items():
         monkeypatch.setattr(renderer, name, value)
     tiny = ["--sizes", "8", "--subdivisions", "1", "--rounds", "1", "--rasterizer", "numpy"]
-    renderer.main(["--out", str(tmp_path), *tiny])
+    renderer.main(["--out", str(tmp_path), *tiny, "--step-sizes", "8", "--coarse", "1"])
     rows = read(tmp_path / "renderer_pareto.csv")
     assert all(float(row["time_ms"]) > 0 for row in rows)
+    steps = [row for row in rows if row["ratio"]]
+    assert len(steps) == 2 * 2 * 2 * 2  # meshes × samples × panels × contenders
+    assert all(0 < float(row["ratio_low"]) <= float(row["ratio"]) <= float(row["ratio_high"]) for row in steps)
+    rows = [row for row in rows if row not in steps]
     measured = [row for row in rows if not row["panel"].startswith("skipped")]
     assert all(math.isfinite(float(row[name])) for row in measured for name in ("image_error", "gradient_error"))
     assert len(rows) - len(measured) == 13 and all(float(row["saved"]) > 0 for row in rows if row not in measured)
