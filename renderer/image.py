@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
 
 ENCODINGS = ("linear", "srgb")
+SRGB_KNEE = 0.0031308  # linear value at which the curve of sRGB changes from a line to a power
 NORMALS = ("flat", "smooth")
 MOST_BOUNCES = 100
 LARGEST_SIZE = 4096  # pixels per side
@@ -80,7 +81,7 @@ def composite(
     """Whole images: `tonemap` at the covered pixels, the background elsewhere. pixels: row-major."""
     behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
     covered = tonemap(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
-    return behind_all.index_copy(-1, pixels, covered).unflatten(-1, background.shape[-2:])
+    return behind_all.scatter(-1, pixels.expand(covered.shape), covered).unflatten(-1, background.shape[-2:])
 
 
 def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
@@ -134,8 +135,19 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     if encoding == "linear":
         return linear
     # The power's derivative is infinite at 0, in the branch that is not taken; the floor keeps it finite.
-    curve = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+    curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
+
+
+def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
+    """Compute the gradient by the linear values from that by the encoded values, without a graph.
+
+    The operations and their order are those of the gradient of `encode` by autograd, so the bits are equal, too.
+    """
+    if encoding == "linear":
+        return upstream
+    power_slope = (1 / 2.4) * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4 - 1)
+    return torch.where(linear <= SRGB_KNEE, upstream * 12.92, upstream * 1.055 * power_slope)
 
 
 def decode(image: Tensor, encoding: str) -> Tensor:
