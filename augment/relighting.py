@@ -4,21 +4,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from augment.objects import SceneObject
 from augment.utils import progress, require_memory
 from renderer.camera import Camera
 from renderer.image import ImageSettings, background_term
-from renderer.transfer import TransferOperator, apply_transfer
-from renderer.transport.local import SparseTransfer, joined
-
-Rows = slice | Tensor
+from renderer.transfer import TransferOperator
+from renderer.views import STACKED, OperatorStack, Rows
 
 
 class Layer(NamedTuple):
@@ -30,96 +26,6 @@ class Layer(NamedTuple):
     rows: Rows
     pixels: Tensor
     composite: Tensor
-
-
-class InPlace(torch.autograd.Function):
-    """Canvases (N, 3, size²), overwritten where layers are by their values (B, 3, P); differentiable in these."""
-
-    @staticmethod
-    def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
-        ctx.targets = targets
-        for (rows, pixels), values in zip(targets, covered, strict=True):
-            images = canvas[rows].index_copy_(2, pixels, values)
-            if isinstance(rows, Tensor):  # of which canvas[rows] is a copy
-                canvas.index_copy_(0, rows, images)
-        return canvas
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        # Of two axes, torch selects ten times as fast as of three.
-        covered = (upstream[rows].flatten(0, 1).index_select(1, pixels) for rows, pixels in ctx.targets)
-        return None, None, *(values.unflatten(0, (-1, 3)) for values in covered)
-
-
-class OperatorStack:
-    """O transfer operators over a common set of pixels, and N images that show one of them each, in their own light.
-
-    pixels: (P,) int64, covered by any of the operators. transfer: (O, 1 to 3, K, P), of the K coefficients that are
-    nonzero in any of them, with a row of zeros if K is odd: with 32 rows instead of 31 the gradient's product is twice
-    as fast. albedo: (O, 3, P). coverage: (O, 1, P). Which image shows which operator is known to the host.
-    """
-
-    def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
-        """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
-        pixels = torch.cat([operator.pixels for operator in operators]).unique()
-        nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
-        coefficients = F.pad(nonzero, (0, len(nonzero) % 2))  # with any coefficient
-        channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
-        transfer = like.new_zeros(len(operators), channels, len(coefficients), len(pixels))
-        albedo = like.new_ones(len(operators), 3, len(pixels))
-        coverage = like.new_zeros(len(operators), 1, len(pixels))
-        first, parts = [0], list[SparseTransfer]()
-        for index, operator in enumerate(operators):
-            rows, columns = torch.searchsorted(nonzero, operator.nonzero), torch.searchsorted(pixels, operator.pixels)
-            if channels < 3:
-                transfer[index][: len(operator.transfer), rows[:, None], columns] = operator.transfer
-                albedo[index][:, columns] = operator.albedo
-            else:
-                transfer[index][:, rows[:, None], columns] = operator.by_channel
-            coverage[index, 0, columns] = operator.coverage
-            if operator.sparse is not None:
-                parts.append(operator.sparse._replace(pixel=columns[operator.sparse.pixel]))
-            first.append(sum(len(part.function) for part in parts))
-        sparse = joined(parts)
-        self._sparse = sparse and sparse.to(device)
-        self.shown, self._first = shown, torch.tensor(first)
-        tensors = (tensor.to(device) for tensor in (pixels, transfer, albedo, coverage, coefficients))
-        self.pixels, self.transfer, self.albedo, self.coverage, self._coefficients = tensors
-
-    def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Linear radiance (A, 3, P), differentiable in the lights (A, size, 3), of images (A,), which are on the host.
-
-        Lights are laid out on a grid of operators × their images, with gaps where an operator has fewer than another.
-        Operators that none of the images shows are left out.
-        """
-        used, row, counts = torch.unique(self.shown[images], return_inverse=True, return_counts=True)
-        slots, order = max(counts.tolist(), default=0), row.argsort(stable=True)
-        rank = torch.arange(len(row)) - (counts.cumsum(0) - counts)[row[order]]
-        cell = row * slots + torch.empty_like(row).index_copy_(0, order, rank)
-        no_gaps = len(cell) == len(used) * slots and bool((cell.diff() == 1).all())
-        used, cell = (indices.to(lights.device, non_blocking=True) for indices in (used, cell))
-        nonzero = lights.index_select(1, self._coefficients)
-        grid = nonzero.new_zeros(len(used) * slots, *nonzero.shape[1:]).index_copy(0, cell, nonzero)
-        everything = len(used) == len(self.transfer)
-        transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
-        radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)
-        radiance = radiance if no_gaps else radiance.index_select(0, cell)
-        if self._sparse is None:
-            return radiance
-        entries, image = self._entries(self._sparse, self.shown[images])
-        return radiance + entries.radiance(lights, image, len(self.pixels))
-
-    def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
-        """(the sparse entries of operators (A,), one after the other; (N,) the row in A of each entry)."""
-        first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
-        image = torch.arange(len(shown)).repeat_interleave(count)
-        entry = torch.arange(len(image)) + (first - count.cumsum(0) + count)[image]
-        entry, image = (indices.to(self.pixels.device, non_blocking=True) for indices in (entry, image))
-        return SparseTransfer(*(field[entry] for field in sparse)), image
-
-
-STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster
 
 
 @dataclass(eq=False, repr=False)

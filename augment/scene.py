@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from augment.objects import SceneObject
-from augment.relighting import InPlace, Layer, OperatorStack, Relighting
+from augment.relighting import Layer, Relighting
 from augment.reshading import Reshading
 from augment.utils import progress, require_memory
 from renderer.camera import Camera
@@ -23,6 +23,7 @@ from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transfer import build_operators
+from renderer.views import InPlace, OperatorStack
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

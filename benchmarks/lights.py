@@ -20,6 +20,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from timeit import repeat
 from typing import Any
@@ -30,7 +31,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from benchmarks.common import Row, medians, record, relative_error
+from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
@@ -82,10 +83,11 @@ def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int]
     lights = {name: torch.rand(basis.size, 3) for name, (basis, _) in cases.items()}
     lights |= {name: load_light("grace") for name, (basis, _) in cases.items() if basis == HARMONICS}
     steps = {key: partial(light_step, operator, lights[key[0]].requires_grad_()) for key, operator in built.items()}
-    times = medians(steps, rounds)
+    times = times_in_turn(steps, rounds)
     for (name, size), operator in built.items():
-        row: Row = {"table": table, "light": name, "size": size, "step_ms": times[name, size]}
-        row["of_direct"] = times[name, size] / times[next(iter(cases)), size]
+        row: Row = {"table": table, "light": name, "size": size, "step_ms": median(times[name, size])}
+        ratios = quartiles_of_ratio(times[name, size], times[next(iter(cases)), size])
+        row["of_direct_low"], row["of_direct"], row["of_direct_high"] = ratios
         row["megabytes"] = sum(part.nbytes for part in (operator.transfer, *(operator.sparse or ()))) / 1e6
         build = partial(operators, cup, size, samples, cases[name], orbit_cameras(VIEWS, 2.2))
         row["build_s"] = min(repeat(build, timer=time.process_time, number=1, repeat=2)) / VIEWS

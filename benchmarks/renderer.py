@@ -8,16 +8,17 @@ too. Errors are root mean squares of the difference to a converged float64 refer
 radiance before clamping, and of the gradient of Σ image × normal random numbers, with visibility fixed.
 
 Whole light steps (an image with background and clamp, a loss, and the loss's gradient by the light) are timed beside
-autograd code that keeps all it can (`benchmarks.peer`), for two meshes. Their images and gradients are equal, or the
-run stops. This table alone takes a few minutes:
+autograd code that keeps all it can (`benchmarks.peer`) and beside the operator's step written out by hand, for two
+meshes. Their images and gradients are equal, or the run stops. Ratios are to the first row of each group, the peer or
+the loop. This table alone takes a few minutes:
 
     python -m benchmarks.renderer --whole-steps-only --rasterizer numba --out whole_steps
 """
 
 import argparse
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -33,18 +34,21 @@ from benchmarks.common import Row, machine, medians, quartiles_of_ratio, times_i
 from benchmarks.peer import Peer
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
 from renderer import rendering, shading
+from renderer.camera import orbit_cameras
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss
-from renderer.image import tonemap
+from renderer.image import ImageSettings, tonemap
 from renderer.mesh import Mesh
-from renderer.rasterizer import NAMES, choose
-from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator
+from renderer.rasterizer import NAMES, Rasterizer, choose
+from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator, build_operators
+from renderer.views import TransferOperators
 
 BACKGROUND = 0.5
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
 DEGREES = (2, 4, 6, 8, 10, 12)  # of the harmonics
 PER_SIDE = (1, 2, 4, 8, 16)  # samples per side of a pixel
 STEP_SAMPLES = (2, 8)  # samples per side of a pixel in the whole light steps
+MANY_VIEWS = (32, 100)  # pixels per side and number of views that are rendered in one call
 
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 Call = Callable[[], object]
@@ -215,48 +219,134 @@ def error_of(row: Row) -> float:
 # ---------------------------------------------------------------------------- whole light steps
 
 
-OPERATOR, KEPT = "operator", "plain autograd that keeps all it can"
+AUTOGRAD_STEP = "image and autograd.grad"
+DIRECT_STEP = "image_and_gradient"
+HAND_STEP = "by hand"
+PEER_STEP = "plain autograd that keeps all it can"
+LOOP = "loop over operators"
+
+WholeStep = Callable[[], tuple[Tensor, Tensor]]  # the image, and the gradient of the loss by the light
 
 
-def whole_step(view: View, light: Tensor, image: Callable[[Tensor], Tensor]) -> Callable[[], tuple[Tensor, Tensor]]:
-    """Return a step from the light to its image (3, size, size) and to the gradient of a loss by the light."""
-    weights = view.image_gradient.to(light.dtype).view(3, view.size, view.size)
+@dataclass(frozen=True)
+class Loss:
+    """Σ image × weights, with weights (3, size, size), as code would compute it with autograd and without."""
 
-    def step() -> tuple[Tensor, Tensor]:
-        variable = light.clone().requires_grad_()
-        shown = image(variable)
-        [gradient] = torch.autograd.grad((shown * weights).sum(), variable)
-        return shown.detach(), gradient
+    weights: Tensor
 
-    return step
+    def step(self, image: Callable[[Tensor], Tensor], light: Tensor) -> WholeStep:
+        """Return a step that renders a light and differentiates the loss by it with autograd."""
+
+        def step() -> tuple[Tensor, Tensor]:
+            variable = light.clone().requires_grad_()
+            shown = image(variable)
+            [gradient] = torch.autograd.grad((shown * self.weights).sum(), variable)
+            return shown.detach(), gradient
+
+        return step
+
+    def gradient(self, image: Tensor) -> Tensor:
+        """Compute the loss, and return its gradient by the image."""
+        _ = (image * self.weights).sum()
+        return self.weights
+
+
+class ByHand:
+    """The practical limit of a whole light step: an operator's products, background, clamp mask and gradient, written
+    out for one light of its dtype, a gray background and linear values, without checks and without autograd."""
+
+    def __init__(self, operator: TransferOperator, background: float):
+        self.shape = 3, operator.settings.size, operator.settings.size
+        self.pixels, self.coefficients = operator.pixels, operator.nonzero
+        self.rows = operator.pixels.expand(3, -1)
+        self.transfer, self.albedo = operator.transfer[0], operator.albedo
+        self.behind = (1 - operator.coverage) * background
+        self.canvas = operator.coverage.new_full((3, self.shape[1] ** 2), background)
+
+    def step(self, light: Tensor, loss: Loss) -> tuple[Tensor, Tensor]:
+        """Compute the image (3, size, size) and the gradient of the loss by the light."""
+        reaching = light.index_select(0, self.coefficients).mT
+        values = (reaching @ self.transfer).mul_(self.albedo).add_(self.behind)
+        clamped = values.clamp(0, 1)
+        passing = values.eq_(clamped)
+        image = self.canvas.clone().scatter_(1, self.rows, clamped).view(self.shape)
+        covered = loss.gradient(image).reshape(3, -1).index_select(1, self.pixels)
+        product = torch.nn.functional.linear(covered.mul_(passing).mul_(self.albedo), self.transfer)
+        return image, torch.zeros_like(light).index_copy_(0, self.coefficients, product.mT)
 
 
 def whole_steps(view: View, samples: int, options: argparse.Namespace) -> list[Row]:
-    """Measure a whole light step and its preparation by the operator and by `Peer`, which agree to rounding.
+    """Measure a whole light step and its preparation by the operator, by hand and by `Peer`, which agree to rounding.
 
-    The columns ratio, ratio_low and ratio_high hold the median and the quartiles over the rounds of each time over the
-    operator's.
+    The columns ratio, ratio_low and ratio_high hold the median and the quartiles over the rounds of each time over that
+    of the table's first row.
     """
     light = coefficients(DEGREE, torch.float32, view.device)
+    loss = Loss(view.image_gradient.to(light.dtype).view(3, view.size, view.size))
     build_operator = partial(view.operator, samples)
-    peer_of_view = partial(Peer, view.mesh, CAMERA, view.size, samples, DEGREE, view.rasterizer)
-    build_peer = partial(peer_of_view, BACKGROUND, view.device)
-    by_operator = whole_step(view, light, partial(build_operator().image, background=BACKGROUND))
-    by_peer = whole_step(view, light, build_peer().image)
-    require_equal(by_operator(), by_peer())
+    build_peer = partial(Peer, view.mesh, CAMERA, view.size, samples, DEGREE, view.rasterizer, BACKGROUND, view.device)
+    operator, peer = build_operator(), build_peer()
+    steps: dict[str, WholeStep] = {
+        PEER_STEP: loss.step(peer.image, light),
+        AUTOGRAD_STEP: loss.step(partial(operator.image, background=BACKGROUND), light),
+        DIRECT_STEP: partial(operator.image_and_gradient, light, loss.gradient, BACKGROUND),
+        HAND_STEP: partial(ByHand(operator, BACKGROUND).step, light, loss),
+    }
+    for setting in (AUTOGRAD_STEP, DIRECT_STEP):
+        require_equal(steps[setting](), steps[PEER_STEP]())
+        require_bits(steps[setting](), steps[HAND_STEP]())
+    builds = {PEER_STEP: build_peer, "operator": build_operator}
+    common = {"degree": DEGREE, "samples": samples**2, "size": view.size, "faces": len(view.mesh.faces)}
+    rows = timed_in_turn(f"whole light step, {view.size}²", steps, common, options)
+    return rows + timed_in_turn(f"building for whole light steps, {view.size}²", builds, common, options)
 
-    steps = {OPERATOR: by_operator, KEPT: by_peer}
-    builds = {OPERATOR: build_operator, KEPT: build_peer}
+
+def many_views(mesh: Mesh, rasterizer: Rasterizer, options: argparse.Namespace) -> list[Row]:
+    """Measure whole light steps of many views in a loop over the operators, and in one call of all."""
+    size, count = MANY_VIEWS
+    settings, cameras = ImageSettings(size, 2), orbit_cameras(count, CAMERA.width)
+    operators = TransferOperators(build_operators(mesh, cameras, settings, rasterizer)).to(options.device)
+    light = coefficients(DEGREE, torch.float32, options.device)
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(count, 3, size, size, generator=generator).to(options.device)
+
+    def stacked_images(variable: Tensor) -> Tensor:
+        return torch.stack([operator.image(variable, BACKGROUND) for operator in operators])
+
+    def one_by_one() -> tuple[Tensor, Tensor]:
+        single = [Loss(weight).step(op.image, light)() for op, weight in zip(operators, weights, strict=True)]
+        return torch.stack([image for image, _ in single]), torch.stack([gradient for _, gradient in single]).sum(0)
+
+    loss = Loss(weights)
+    steps: dict[str, WholeStep] = {
+        LOOP: one_by_one,
+        "loop over operators, one gradient": loss.step(stacked_images, light),
+        "image of all, and autograd.grad": loss.step(partial(operators.image, background=BACKGROUND), light),
+        "image_and_gradient of all": partial(operators.image_and_gradient, light, loss.gradient, BACKGROUND),
+    }
+    for step in steps.values():
+        require_equal(step(), steps[LOOP]())
+    common = {"degree": DEGREE, "samples": settings.samples**2, "size": size, "faces": len(mesh.faces)}
+    return timed_in_turn(f"{count} views, {size}²", steps, common, options)
+
+
+def timed_in_turn(panel: str, calls: Mapping[str, Call], common: Row, options: argparse.Namespace) -> list[Row]:
+    """Time calls in turn, and return a row for each, with the quartiles of the ratios to the first call."""
+    times = times_in_turn(calls, options.rounds, options.device)
+    first = next(iter(times.values()))
     rows = []
-    for panel, calls in (("whole light step", steps), ("building for whole light steps", builds)):
-        times = times_in_turn(calls, options.rounds, view.device)
-        for setting in calls:
-            low, middle, high = quartiles_of_ratio(times[setting], times[OPERATOR])
-            row = {"panel": f"{panel}, {view.size}²", "setting": setting, "time_ms": median(times[setting])}
-            row |= {"degree": DEGREE, "samples": samples**2, "size": view.size, "faces": len(view.mesh.faces)}
-            rows.append(row | {"ratio": middle, "ratio_low": low, "ratio_high": high})
-            print(rows[-1], flush=True)
+    for setting, milliseconds in times.items():
+        low, middle, high = quartiles_of_ratio(milliseconds, first)
+        row = {"panel": panel, "setting": setting, "time_ms": median(milliseconds), **common}
+        rows.append(row | {"ratio": middle, "ratio_low": low, "ratio_high": high})
+        print(f"{panel}, {common}: {setting} {rows[-1]['time_ms']:.3f} ms, {middle:.2f} [{low:.2f}, {high:.2f}]")
     return rows
+
+
+def require_bits(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
+    """Stop the run unless the tensors are equal to the bit."""
+    for value, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, other, rtol=0, atol=0)
 
 
 def require_equal(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
@@ -360,8 +450,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rasterizer = choose(options.rasterizer)
     mesh = scene.ellipsoid(options.subdivisions)
     steps = []
-    for shown, size, samples in product((scene.ellipsoid(options.coarse), mesh), options.step_sizes, STEP_SAMPLES):
-        steps += whole_steps(View(shown, size, rasterizer, options.device), samples, options)
+    for shown in (scene.ellipsoid(options.coarse), mesh):
+        for size, samples in product(options.step_sizes, STEP_SAMPLES):
+            steps += whole_steps(View(shown, size, rasterizer, options.device), samples, options)
+        steps += many_views(shown, rasterizer, options)
     if options.whole_steps_only:
         write_csv(options.out / "whole_steps.csv", steps)
         return

@@ -17,5 +17,6 @@ __getattr__, __dir__, __all__ = attach(
         "rendering": ["precompute_transfer", "render"],
         "shapes": ["solid"],
         "transfer": ["TransferOperator"],
+        "views": ["TransferOperators"],
     },
 )

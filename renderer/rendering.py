@@ -25,10 +25,11 @@ from renderer.rasterizer import choose
 from renderer.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.shapes import sphere
 from renderer.silhouettes import moving_outlines
-from renderer.transfer import TransferOperator, build_operators
+from renderer.transfer import build_operators
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
+from renderer.views import TransferOperators
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -197,19 +198,21 @@ def precompute_transfer(
     shadows: bool = False,
     bounces: int = 0,
     rasterizer: str = "auto",
-) -> list[TransferOperator]:
+) -> TransferOperators:
     """One operator per camera: images and gradients under any number of lights, without rasterizing again.
 
-    `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there.
+    `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there. The operators are
+    a sequence whose own method `image` renders all views in one call.
 
     >>> operators = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(2, 2.2), size=16)
     >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
-    >>> operators[0].image(lights).shape
-    torch.Size([2, 3, 16, 16])
+    >>> operators[0].image(lights).shape, operators.image(lights).shape
+    (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
-    return build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
+    operators = build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
+    return TransferOperators(operators)
 
 
 def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:

@@ -94,7 +94,7 @@ class TransferOperator:
         Raises:
             InputError: If the lights hold NaN or are of another basis, or the background has another shape.
         """
-        self._require_lights(lights)
+        self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
             behind = as_background(background, self.settings.size, lights)
             coverage = self.coverage.to(lights)
@@ -130,15 +130,13 @@ class TransferOperator:
         >>> image.shape, gradient.shape
         (torch.Size([3, 16, 16]), torch.Size([49, 3]))
         """
-        self._require_lights(lights)
+        self.require_lights(lights)
         lights = lights.detach()
         if isinstance(background, Tensor):
             background = background.detach()
         images, passing, clamped = self._images(lights, self._behind(background, lights))
         image_gradient = loss_gradient(images)
-        if image_gradient.shape != images.shape:
-            shapes = f"{tuple(image_gradient.shape)}: give {tuple(images.shape)}"
-            raise InputError(f"loss_gradient returned values of shape {shapes}, one for each value of the images")
+        require_image_gradient(image_gradient, images)
         return images, self._gradient_of_images(image_gradient.detach(), passing, clamped)
 
     def radiance(self, lights: Float[Tensor, "*lights coefficients 3"]) -> Float[Tensor, "*lights 3 P"]:
@@ -146,7 +144,7 @@ class TransferOperator:
 
         Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another basis' size.
         """
-        self._require_lights(lights)
+        self.require_lights(lights)
         return _Radiance.apply(lights, self)
 
     def light_gradient(
@@ -193,7 +191,7 @@ class TransferOperator:
             require_bounded(image_gradient=covered)
         return gradient
 
-    def _require_lights(self, lights: Tensor) -> None:
+    def require_lights(self, lights: Tensor) -> None:
         """Raise InputError if the lights hold NaN or are of another basis."""
         if not isinstance(lights, Tensor) or not lights.is_floating_point():
             require_bounded(lights=lights)
@@ -335,7 +333,7 @@ class _Radiance(torch.autograd.Function):
 
 
 class _Image(torch.autograd.Function):
-    """Lights (*B, coefficients, 3) to images (*B, 3, size, size), in one step of autograd, since each step costs time."""
+    """Lights (*B, coefficients, 3) to images (*B, 3, size, size), in one node of autograd, since each costs time."""
 
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator, behind: _Behind) -> Tensor:
@@ -347,6 +345,13 @@ class _Image(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         return ctx.operator._gradient_of_images(upstream, ctx.passing, ctx.clamped), None, None
+
+
+def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
+    """Raise InputError unless the gradient of a loss by images has their shape."""
+    if not isinstance(image_gradient, Tensor) or image_gradient.shape != images.shape:
+        given = tuple(image_gradient.shape) if isinstance(image_gradient, Tensor) else type(image_gradient).__name__
+        raise InputError(f"loss_gradient returned {given}: return a tensor of the images' shape {tuple(images.shape)}")
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:

@@ -21,14 +21,14 @@ def read(path: Path) -> list[dict[str, str]]:
 
 def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     monkeypatch.setattr(common, "BURST", 0.0)
-    for name, value in {"DEGREES": (2, 6), "PER_SIDE": (1, 8)}.items():
+    for name, value in {"DEGREES": (2, 6), "PER_SIDE": (1, 8), "MANY_VIEWS": (8, 9)}.items():
         monkeypatch.setattr(renderer, name, value)
     tiny = ["--sizes", "8", "--subdivisions", "1", "--rounds", "1", "--rasterizer", "numpy"]
     renderer.main(["--out", str(tmp_path), *tiny, "--step-sizes", "8", "--coarse", "1"])
     rows = read(tmp_path / "renderer_pareto.csv")
     assert all(float(row["time_ms"]) > 0 for row in rows)
     steps = [row for row in rows if row["ratio"]]
-    assert len(steps) == 2 * 2 * 2 * 2  # meshes × samples × panels × contenders
+    assert len(steps) == 2 * (2 * (4 + 2) + 4)  # meshes × (samples × (steps + builds) + many views)
     assert all(0 < float(row["ratio_low"]) <= float(row["ratio"]) <= float(row["ratio_high"]) for row in steps)
     rows = [row for row in rows if row not in steps]
     measured = [row for row in rows if not row["panel"].startswith("skipped")]
