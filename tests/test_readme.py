@@ -38,13 +38,19 @@ def run(heading: str, **names) -> dict[str, object]:
 
 
 def test_every_block_of_python_is_run_here():
-    assert BLOCKS.keys() == {"Attack a classifier", "Render", "Your own training loop", "Load"}
+    assert BLOCKS.keys() == {"Attack a classifier", "Render", "Your own training loop", "Many lights and views", "Load"}
 
 
 def test_render_block_has_a_gradient_by_light():
     names = run("Render")
     assert names["images"].shape == (10, 3, 224, 224)
     assert names["light"].grad.any()
+
+
+def test_many_views_block_renders_each_view_and_light():
+    names = run("Many lights and views")
+    assert names["images"].shape == (100, 2, 3, 32, 32) and names["own_images"].shape == (100, 3, 32, 32)
+    assert names["lights"].grad.any() and names["gradient"].any()
 
 
 def test_load_block_recognizes_an_orange(folder):
