@@ -76,8 +76,14 @@ def converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperat
         return operators(mesh, size, samples, case)[0]
 
 
-def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    """A row per case and size; errors are at the first size."""
+def costs(
+    table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int], rounds: int, steps_only: bool
+) -> Iterator[Row]:
+    """Yield a row per case and size. Errors are at the first size.
+
+    The columns of_direct, of_direct_low and of_direct_high hold the median and the quartiles over the rounds of the
+    light step's time over that of the first case.
+    """
     samples, finest = SAMPLES[table]
     built = {(name, size): operators(cup, size, samples, cases[name])[0] for name, size in product(cases, sizes)}
     lights = {name: torch.rand(basis.size, 3) for name, (basis, _) in cases.items()}
@@ -88,6 +94,9 @@ def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int]
         row: Row = {"table": table, "light": name, "size": size, "step_ms": median(times[name, size])}
         ratios = quartiles_of_ratio(times[name, size], times[next(iter(cases)), size])
         row["of_direct_low"], row["of_direct"], row["of_direct_high"] = ratios
+        if steps_only:
+            yield row
+            continue
         row["megabytes"] = sum(part.nbytes for part in (operator.transfer, *(operator.sparse or ()))) / 1e6
         build = partial(operators, cup, size, samples, cases[name], orbit_cameras(VIEWS, 2.2))
         row["build_s"] = min(repeat(build, timer=time.process_time, number=1, repeat=2)) / VIEWS
@@ -171,11 +180,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 224], help="of images, in pixels")
     parser.add_argument("--vertices", type=int, default=4000, help="of the cup, at least")
     parser.add_argument("--rounds", type=int, default=21, help="in which all settings take turns")
+    parser.add_argument("--steps-only", action="store_true", help="time light steps; measure no building and no errors")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cup, sizes = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes
-    tables = [costs("cost", LIGHT_PATHS, cup, sizes, options.rounds)]
-    tables += [costs("local lights", LOCAL_LIGHTS, cup, sizes, options.rounds)]
+    tables = [costs("cost", LIGHT_PATHS, cup, sizes, options.rounds, options.steps_only)]
+    tables += [costs("local lights", LOCAL_LIGHTS, cup, sizes, options.rounds, options.steps_only)]
     tables += [beside_mitsuba(sizes[0])] if options.mitsuba else []
     record(chain.from_iterable(tables), options.csv)
 
