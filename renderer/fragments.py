@@ -27,12 +27,12 @@ class Runs(NamedTuple):
     Attributes:
         pixel: Index into `Fragments.pixels`, ascending, (R,) int64.
         face: Index into `Fragments.faces`, (R,) int64.
-        count: The number of samples, (R,) int64.
+        sample_count: The number of samples, (R,) int64.
     """
 
     pixel: Tensor
     face: Tensor
-    count: Tensor
+    sample_count: Tensor
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,9 @@ class Fragments:
         if self.samples == 1 or not len(self.pixel):
             return self.pixel, self.face, albedo
         runs = self.runs
-        run_of_sample = torch.arange(len(runs.count), device=albedo.device).repeat_interleave(runs.count)
+        run_of_sample = torch.arange(len(runs.sample_count), device=albedo.device).repeat_interleave(runs.sample_count)
         scaled = albedo.T / self.samples**2
-        summed = albedo.new_zeros(albedo.shape[1], len(runs.count)).index_add(1, run_of_sample, scaled)
+        summed = albedo.new_zeros(albedo.shape[1], len(runs.sample_count)).index_add(1, run_of_sample, scaled)
         return runs.pixel, runs.face, summed.T
 
     @cached_property

@@ -497,7 +497,7 @@ def _face_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, 
     if albedo is not None:
         return fragments.merge(albedo)
     runs = fragments.runs
-    return runs.pixel, runs.face, (runs.count.double() / fragments.samples**2)[:, None]
+    return runs.pixel, runs.face, (runs.sample_count.double() / fragments.samples**2)[:, None]
 
 
 def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
