@@ -1,6 +1,7 @@
 """The exception for errors that a user can fix, and the checks that keep NaN and values out of range out."""
 
 import os
+import reprlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -38,8 +39,10 @@ def as_device(device: torch.device | str) -> torch.device:
     """InputError where it is not a device, or not one of this machine."""
     try:
         return torch.empty(0, device=device).device
-    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
-        raise InputError(f"device={device} is not available here: use cpu, or cuda where there is a GPU") from error
+    except (RuntimeError, AssertionError, TypeError) as error:  # torch without CUDA asserts
+        raise InputError(
+            f"device={_short(device)} is not available here: use cpu, or cuda where there is a GPU"
+        ) from error
 
 
 def require_file(path: str | Path, advice: str) -> None:
@@ -49,21 +52,32 @@ def require_file(path: str | Path, advice: str) -> None:
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """InputError naming a value outside of its range, or NaN; None means not set."""
-    if value is not None and not least <= value <= most:
+    """InputError naming a value outside of its range, NaN, or what is no number; None means not set."""
+    if value is None:
+        return
+    try:
+        inside = bool(least <= value <= most)
+    except (TypeError, ValueError, RuntimeError) as error:  # strings, complex numbers, arrays of several numbers
+        raise InputError(f"{name}={_short(value)} must be a number") from error
+    if not inside:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
     """InputError naming a value that is not one of its choices."""
-    if value not in choices:
-        raise InputError(f"{name}={value}: choose one of {', '.join(choices)}")
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{name}={_short(value)}: choose one of {', '.join(choices)}")
 
 
 def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:
     """InputError naming limits that are not [low, high] with both in range."""
-    if len(limits) != 2 or not least <= limits[0] <= limits[1] <= most:
-        raise InputError(f"{name}={list(limits)}: give [least, most], both from {least:g} to {most:g}")
+    try:
+        low, high = limits
+        inside = bool(least <= low <= high <= most)
+    except (TypeError, ValueError, RuntimeError):  # no two numbers
+        inside = False
+    if not inside:
+        raise InputError(f"{name}={_short(limits)}: give [least, most], both from {least:g} to {most:g}")
 
 
 def require_finite(**tensors: Tensor) -> None:
@@ -82,6 +96,12 @@ def require_bounded(**tensors: Tensor) -> None:
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers")
         if not _largest(tensor) <= LARGEST:
             raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values")
+
+
+def _short(value: object) -> str:
+    """The value as text of one short line."""
+    text = str(value) if isinstance(value, str) else reprlib.repr(value)
+    return " ".join(text.split())
 
 
 def _largest(tensor: Tensor) -> float:
