@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_bounded, require_choice, require_range
+from renderer.validation import as_tensor, require_field_types
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
@@ -43,6 +44,7 @@ class ImageSettings:
     silhouettes: bool = False
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_range("size", self.size, 1, MOST_SAMPLES)
         require_range("samples", self.samples, 1, FINEST)
         require_range("size × samples", self.size * self.samples, 1, MOST_SAMPLES)
@@ -87,7 +89,7 @@ def composite(
 def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
     """A gray value, a color (3,) or images (..., 3, size, size), in [0, 1], as images of the dtype and device of
     `like`. InputError: another shape, values beyond [0, 1]."""
-    values = torch.as_tensor(background).to(like)
+    values = as_tensor("background", background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
     advice = f"give a gray value, a color (3,) or images (3, {size}, {size}), in [0, 1]"

@@ -38,6 +38,7 @@ from renderer.rasterizer import Rasterizer
 from renderer.transport.local import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
+from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -94,6 +95,7 @@ class TransferOperator:
         Raises:
             InputError: If the lights hold NaN or are of another basis, or the background has another shape.
         """
+        lights = as_tensor("lights", lights)
         self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
             behind = as_background(background, self.settings.size, lights)
@@ -130,6 +132,7 @@ class TransferOperator:
         >>> image.shape, gradient.shape
         (torch.Size([3, 16, 16]), torch.Size([49, 3]))
         """
+        lights = as_tensor("lights", lights)
         self.require_lights(lights)
         lights = lights.detach()
         if isinstance(background, Tensor):
@@ -144,6 +147,7 @@ class TransferOperator:
 
         Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another basis' size.
         """
+        lights = as_tensor("lights", lights)
         self.require_lights(lights)
         return _Radiance.apply(lights, self)
 
@@ -154,7 +158,11 @@ class TransferOperator:
 
         Exactly zero for the coefficients that reach no pixel. InputError: NaN.
         """
+        radiance_gradient = as_tensor("radiance_gradient", radiance_gradient)
         require_bounded(radiance_gradient=radiance_gradient)
+        if radiance_gradient.shape[-2:] != self.albedo.shape:
+            shape, expected = tuple(radiance_gradient.shape), tuple(self.albedo.shape)
+            raise InputError(f"radiance_gradient of shape {shape} is not of the operator's pixels: give {expected}")
         return self._light_gradient(radiance_gradient)
 
     def _images(self, lights: Tensor, behind: _Behind) -> tuple[Tensor, Tensor, Tensor]:
@@ -193,7 +201,7 @@ class TransferOperator:
 
     def require_lights(self, lights: Tensor) -> None:
         """Raise InputError if the lights hold NaN or are of another basis."""
-        if not isinstance(lights, Tensor) or not lights.is_floating_point():
+        if not lights.is_floating_point():
             require_bounded(lights=lights)
         if lights.shape[-2:] != self._light_shape:
             shape, size = tuple(lights.shape), self.basis.size

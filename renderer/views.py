@@ -15,6 +15,7 @@ from renderer.errors import InputError
 from renderer.image import as_background, background_term, clamp, encode
 from renderer.transfer import TransferOperator, apply_transfer, require_image_gradient
 from renderer.transport.local import SparseTransfer, joined
+from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -104,6 +105,7 @@ class TransferOperators(Sequence[TransferOperator]):
                 background has another shape.
         """
         first = self._operators[0]
+        lights = as_tensor("lights", lights)
         first.require_lights(lights)
         if light_per_view and (lights.ndim < 3 or len(lights) != len(self)):
             shape, wanted = tuple(lights.shape), f"({len(self)}, ..., {first.basis.size}, 3)"
@@ -143,6 +145,7 @@ class TransferOperators(Sequence[TransferOperator]):
         Raises:
             InputError: As `image`, or if the gradient of the loss has another shape.
         """
+        lights = as_tensor("lights", lights)
         self._operators[0].require_lights(lights)
         variable = lights.detach().requires_grad_()
         with torch.enable_grad():
