@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from renderer.errors import LARGEST, InputError, require_range
+from renderer.validation import describe, is_number, require_whole
 
 REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
 MOST_VIEWS = 10**5
+MOST_TURN = 4 * math.pi  # radians: larger angles are taken for degrees
 NEAREST = 0.01  # of its distance: a mesh that comes nearer to the camera is refused
 
 
@@ -39,9 +41,13 @@ class Camera(ABC):
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if type(value) is not float:
+                object.__setattr__(self, name, _as_scalar(name, value))
         require_range("width", self.width, 1 / LARGEST, LARGEST)
         require_range("reach", self.reach, 1 / LARGEST, LARGEST)
-        for name in ("polar", "azimuth", "right", "up"):
+        _require_radians("polar", self.polar)
+        for name in ("azimuth", "right", "up"):
             require_range(name, getattr(self, name), -LARGEST, LARGEST)
 
     @property
@@ -189,6 +195,23 @@ class PerspectiveCamera(Camera):
         return depths
 
 
+def _as_scalar(name: str, value: Any) -> Any:
+    """Convert a camera's field to one number, or to a tensor () that gradients flow to."""
+    if isinstance(value, Tensor) and value.numel() == 1:
+        value = value.reshape(())
+    elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
+        value = np.asarray(value).item()
+    if not is_number(value):
+        raise InputError(f"{name} is {describe(value)}: give one number")
+    return value.item() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def _require_radians(name: str, angle: float) -> None:
+    """Check that an angle is within two turns, which angles in degrees usually exceed."""
+    if not -MOST_TURN <= angle <= MOST_TURN:
+        raise InputError(f"{name}={float(angle):g}: give radians, such as math.radians({float(angle):g})")
+
+
 def orbit_cameras(
     views: int, width: float, polar: float = math.pi / 3, azimuth: float = 0.0, fov: float | None = None
 ) -> list[Camera]:
@@ -202,10 +225,14 @@ def orbit_cameras(
     >>> orbit_cameras(views=1, width=2.0, fov=math.radians(30))[0].distance.__round__(3)
     3.732
     """
+    require_whole("views", views)
     require_range("views", views, 1, MOST_VIEWS)
+    width, polar, azimuth = _as_scalar("width", width), _as_scalar("polar", polar), _as_scalar("azimuth", azimuth)
+    _require_radians("azimuth", azimuth)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
     if fov is None:
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
+    fov = _as_scalar("fov", fov)
     require_range("fov", fov, 1e-3, 3)
     distance = width / 2 / math.tan(fov / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

@@ -24,8 +24,9 @@ from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
 from renderer.light.harmonics import unit
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
+from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -49,6 +50,7 @@ class Gloss:
 
     def on(self, mesh: Mesh) -> Mesh:
         """The mesh with this gloss in place of its own. InputError: another shape, values beyond [0, 1], NaN."""
+        require_mesh("mesh", mesh)
         columns = [values.detach().cpu().expand(len(mesh.faces)) for values in self.checked(len(mesh.faces))]
         textures = mesh.gloss_textures if self.textured else ()
         return replace(mesh, gloss=torch.stack(columns, dim=1).float().numpy(), gloss_textures=textures)
@@ -57,8 +59,10 @@ class Gloss:
         """Roughness, metallic and strength as tensors (1,) or (F,), of so many faces. InputError: as `on`."""
         checked = []
         for name in ("roughness", "metallic", "strength"):
-            values = getattr(self, name)
-            values = values if isinstance(values, Tensor) else torch.tensor(float(values), dtype=torch.float64)
+            given = getattr(self, name)
+            values = as_tensor(f"gloss: {name}", given)
+            if isinstance(given, int | float):
+                values = torch.tensor(float(given), dtype=torch.float64)  # a plain number keeps its precision
             require_bounded(**{name: values})
             if values.shape not in ((), (1,), (faces,)) or not (values.min() >= 0 and values.max() <= 1):
                 raise InputError(f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]")

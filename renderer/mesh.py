@@ -6,6 +6,7 @@ light needs them decoded.
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -18,9 +19,18 @@ from numpy.typing import ArrayLike
 
 from renderer.errors import LARGEST, InputError, require_choice, require_range
 from renderer.skin import Skin
+from renderer.validation import as_array, as_path, describe, require_flag, require_whole
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 MOST_VERTICES = 10**7  # some 5 GB
+_KINDS = {  # NumPy's letters for the types that the arrays of a mesh may have
+    "vertices": "fiu",
+    "faces": "iu",
+    "corner_colors": "fiu",
+    "corner_uvs": "fiu",
+    "texture_ids": "iu",
+    "gloss": "fiu",
+}
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
 EDGES = ((0, 1), (1, 2), (2, 0))  # corners of a face
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
@@ -58,30 +68,43 @@ class Mesh:
     skin: Skin | None = None
 
     def __post_init__(self) -> None:
-        count, numbers = len(self.faces), "fiu"  # NumPy's letters for types
-        for name, shape, kinds in (
-            ("vertices", (len(self.vertices), 3), numbers),
-            ("faces", (count, 3), "iu"),
-            ("corner_colors", (count, 3, 3), numbers),
-            ("corner_uvs", (count, 3, 2), numbers),
-            ("texture_ids", (count,), "iu"),
-            ("gloss", (count, 3), numbers),
+        for name, kinds in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray) and not (name == "gloss" and value is None):
+                object.__setattr__(self, name, as_array(name, value, kinds))
+        count = len(self.faces) if self.faces.ndim else 0
+        vertex_count = len(self.vertices) if self.vertices.ndim else 0
+        for name, shape in (
+            ("vertices", (vertex_count, 3)),
+            ("faces", (count, 3)),
+            ("corner_colors", (count, 3, 3)),
+            ("corner_uvs", (count, 3, 2)),
+            ("texture_ids", (count,)),
+            ("gloss", (count, 3)),
         ):
             values = getattr(self, name)
             if name == "gloss" and values is None:
                 continue
-            if values.shape != shape or values.dtype.kind not in kinds:
+            if values.shape != shape or values.dtype.kind not in _KINDS[name]:
                 raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
         require_range("the number of faces", count, 1, np.inf)
-        if not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
-            raise InputError(f"faces name vertices that are not there: give indices from 0 to {len(self.vertices) - 1}")
+        if not 0 <= self.faces.min() <= self.faces.max() < vertex_count:
+            raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}")
+        for name, channels in (("textures", 3), ("gloss_textures", 2)):
+            object.__setattr__(self, name, _as_textures(name, getattr(self, name), channels))
+        if self.texture_ids.max() >= len(self.textures):
+            raise InputError(f"texture_ids name textures that are not there: give indices below {len(self.textures)}")
 
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
         """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
+        vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
+        faces = np.array(as_array("faces", faces, "iu"), dtype=np.int64)
+        color = as_array("color", color).astype(np.float32)
+        if not color.size or not (color.min() >= 0 and color.max() <= 1):
+            raise InputError(f"color={reprlib.repr(color.tolist())}: give red, green and blue from 0 to 1")
         try:
-            vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
-            vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
+            vertex_colors = np.broadcast_to(color, vertices.shape)
             corner_colors = vertex_colors.take(faces, axis=0, mode="clip")  # missing vertices are refused below
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
@@ -109,6 +132,11 @@ class Mesh:
         from renderer.normals import vertex_normals  # which imports this module
 
         return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
+
+    @cached_property
+    def displayable(self) -> bool:
+        """Whether all colors are in [0, 1]."""
+        return bool(self.corner_colors.min() >= 0 and self.corner_colors.max() <= 1)  # NaN is not
 
     @cached_property
     def one_color_per_face(self) -> bool:
@@ -155,6 +183,33 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = vertices.T.take(faces.T, axis=1)  # by components, since np.cross takes several times as long
     (ax, ay, az), (bx, by, bz) = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
+    """Convert textures to arrays (height, width, channels) of 8 bits."""
+    expected = f"a list of arrays (height, width, {channels}) of uint8"
+    if not isinstance(textures, list | tuple):
+        raise InputError(f"{name} is {describe(textures)}: give {expected}")
+    arrays = [as_array(name, texture) for texture in textures]
+    for array in arrays:
+        if array.ndim != 3 or array.shape[2] != channels or array.dtype != np.uint8:
+            raise InputError(f"{name} holds {describe(array)}: give {expected}")
+    unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
+    return textures if isinstance(textures, tuple) and unchanged else tuple(arrays)
+
+
+def require_mesh(name: str, value: object) -> None:
+    """Check that an argument is a mesh whose colors can be displayed.
+
+    Raises:
+        InputError: If it is of another type, such as a path, or a color is not in [0, 1].
+    """
+    if not isinstance(value, Mesh):
+        path = repr(value) if isinstance(value, str) else "path"
+        advice = f"give a renderer.Mesh, such as renderer.load_mesh({path}) or renderer.Mesh.plain(vertices, faces)"
+        raise InputError(f"{name} is {describe(value)}: {advice}")
+    if not value.displayable:
+        raise InputError(f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255")
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
@@ -212,8 +267,9 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     """
     from renderer.io.meshes import read_parts
 
-    path = Path(path)
+    path = as_path("path", path)
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
+    require_flag("gloss", gloss)
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     placed = [transformed(*part) for part in read_parts(path, is_gltf, gloss)]
     if not placed:
@@ -243,6 +299,7 @@ def normalize(mesh: Mesh) -> Mesh:
     >>> float(np.abs(normalize(renderer.solid("bottle")).vertices).max())
     1.0
     """
+    require_mesh("mesh", mesh)
     areas = mesh.face_areas()
     if not areas.sum() > 0:
         raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
@@ -280,6 +337,8 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
     (True, 0)
     """
+    require_mesh("mesh", mesh)
+    require_whole("vertices", vertices)
     require_range("vertices", vertices, 0, MOST_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_bounded, require_choice, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss
 from renderer.image import ImageSettings, as_background, composite, decode
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
 from renderer.light.harmonics import degree_of
-from renderer.mesh import Mesh
-from renderer.rasterizer import choose
+from renderer.mesh import Mesh, require_mesh
+from renderer.rasterizer import NAMES, choose
 from renderer.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.shapes import sphere
 from renderer.silhouettes import moving_outlines
@@ -29,12 +29,15 @@ from renderer.transfer import build_operators
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
+from renderer.validation import as_list, as_tensor, describe, require_kind, require_number
 from renderer.views import TransferOperators
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
+WHITE = 1 + 1e-4  # the largest albedo, and what rounding adds to it
+_LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
 _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `orbit_cameras`
 _choose = cache(choose)  # "opengl" checks the driver, which takes longer than an image
 _white_ball = cache(lambda: Mesh.plain(*sphere(5)))
@@ -79,15 +82,21 @@ def render(
     >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
     (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
+    require_mesh("mesh", mesh)
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces, silhouettes)
-    require_range("albedo_scale", albedo_scale, 0, FACTOR)
+    cameras = _listed(cameras)
+    _require_scale(albedo_scale)
+    _require_gloss(gloss)
+    require_choice("rasterizer", rasterizer, NAMES)
+    light = None if light is None else _as_light(light)
+    albedo = None if albedo is None else _as_albedo(albedo)
+    vertices = None if vertices is None else as_tensor("vertices", vertices)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         raise InputError(f"vertices of shape {tuple(vertices.shape)} does not fit the mesh: give {mesh.vertices.shape}")
-    local = [_with_coefficients(local) for local in lights]
+    local = [_with_coefficients(local) for local in as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)]
     like = next((values for _, values in [(None, light), *local] if values is not None), torch.zeros(0))
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
     positions = vertices.detach().cpu().double().numpy()
-    cameras = _listed(cameras)
     fixed = [camera.fixed() for camera in cameras]
     views = build_fragments(positions, mesh.faces, fixed, settings, _choose(rasterizer), closed=mesh.closed)
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
@@ -178,10 +187,15 @@ def view_with_outlines(
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     """A local light with its coefficients (size, 3); without them it shines white, at its full power."""
-    basis, values = (light, None) if isinstance(light, LocalBasis) else light
-    values = torch.full((basis.size, 3), basis.power) if values is None else values
+    if isinstance(light, LocalBasis):
+        return light, torch.full((light.size, 3), light.power)
+    if len(light) != 2 or not isinstance(light[0], LocalBasis):
+        raise InputError(f"lights holds {describe(light)}: give {_LOCAL_LIGHTS}")
+    basis = light[0]
+    values = as_tensor("lights: coefficients", light[1])
     if values.shape != (basis.size, 3):
         raise InputError(f"lights: {basis} has coefficients of shape {tuple(values.shape)}, give {(basis.size, 3)}")
+    require_bounded(lights=values)
     return basis, values
 
 
@@ -209,8 +223,11 @@ def precompute_transfer(
     >>> operators[0].image(lights).shape, operators.image(lights).shape
     (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
+    require_mesh("mesh", mesh)
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    require_range("albedo_scale", albedo_scale, 0, FACTOR)
+    _require_scale(albedo_scale)
+    _require_gloss(gloss)
+    require_choice("rasterizer", rasterizer, NAMES)
     operators = build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
     return TransferOperators(operators)
 
@@ -229,11 +246,43 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     return render(_white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
 
 
-def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:
-    listed = cameras if isinstance(cameras, Sequence) else [cameras]
+def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
+    """Return one camera or several as a list."""
+    advice = "a camera or a list of cameras, such as renderer.orbit_cameras(10, width=2.0)"
+    listed = as_list("cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice)
     if not listed:
         raise InputError("cameras is empty: give one camera or several")
     return listed
+
+
+def _require_scale(albedo_scale: float) -> None:
+    """Check the factor of the albedo."""
+    require_number("albedo_scale", albedo_scale)
+    require_range("albedo_scale", albedo_scale, 0, FACTOR)
+
+
+def _require_gloss(gloss: Gloss | None) -> None:
+    """Check that gloss is a record of its three values, not one of these."""
+    require_kind("gloss", gloss, Gloss | None, "renderer.Gloss(roughness, metallic, strength) or None")
+
+
+def _as_light(light: object) -> Tensor:
+    """Convert the coefficients of environment light."""
+    if isinstance(light, str):
+        raise InputError(f"light is {light!r}: give coefficients, such as renderer.load_light({light!r})")
+    coefficients = as_tensor("light", light)
+    degree_of(coefficients)
+    return coefficients
+
+
+def _as_albedo(albedo: object) -> Tensor:
+    """Convert linear albedo, of which nothing is negative or reflects more than it gets."""
+    values = as_tensor("albedo", albedo)
+    require_bounded(albedo=values)
+    if values.numel() and not (values.min() >= 0 and values.max() <= WHITE):
+        extremes = f"{values.min().item():g} to {values.max().item():g}"
+        raise InputError(f"albedo holds values from {extremes}: give 0 to 1, and albedo_scale for brighter surfaces")
+    return values
 
 
 def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:

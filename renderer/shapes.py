@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from renderer.errors import require_choice, require_range
 from renderer.mesh import Mesh, concatenate
+from renderer.validation import require_whole
 
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
@@ -31,6 +32,7 @@ def solid(name: str, seed: int = 0) -> Mesh:
     >>> orange.faces.shape, orange.closed
     ((5120, 3), True)
     """
+    require_whole("seed", seed)
     require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | HARD_NEGATIVES
     require_choice("name", name, known)

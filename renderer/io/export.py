@@ -10,10 +10,11 @@ import torch
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError
-from renderer.image import decode
-from renderer.mesh import Y_UP_TO_Z_UP, Mesh
+from renderer.errors import InputError, require_choice, require_range
+from renderer.image import NORMALS, decode
+from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
 from renderer.normals import corner_normals
+from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
     import trimesh  # takes half a second: imported where it is used
@@ -37,7 +38,14 @@ def export_mesh(
     >>> apple, cameras = renderer.normalize(renderer.solid("apple")), renderer.orbit_cameras(views=3, width=2.2)
     >>> export_mesh(apple, "apple.glb", cameras=cameras)
     """
-    path, shaded = Path(path), corner_normals(mesh, normals)
+    require_mesh("mesh", mesh)
+    path = as_path("path", path)
+    require_choice("normals", normals, NORMALS)
+    cameras = as_list("cameras", cameras, Camera, "a list of cameras")
+    if first is not None:
+        require_whole("first", first)
+        require_range("first", first, 0, len(mesh.faces))
+    shaded = corner_normals(mesh, normals)
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb")
     content = _glb(mesh, shaded, cameras, first)

@@ -25,6 +25,7 @@ from renderer.light.harmonics import (
     select_rows,
     unit,
 )
+from renderer.validation import require_whole
 
 _STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
 
@@ -44,6 +45,7 @@ class Harmonics:
     allow_negative: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        require_whole("degree", self.degree)
         require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
 
     def __str__(self) -> str:

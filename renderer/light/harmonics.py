@@ -21,11 +21,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_finite, require_range
+from renderer.validation import as_tensor, require_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
 MAX_DEGREE = 20
+ORTHONORMAL = 1e-3  # largest error of a product of rotation and its inverse, also of one that is written by hand
 Constant = TypeVar("Constant")
 
 
@@ -37,6 +39,7 @@ def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
 
 def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
     """The degree of a light's coefficients. InputError: no degree has that many."""
+    light = as_tensor("light", light)
     degree = math.isqrt(len(light)) - 1 if light.ndim == 2 else -1
     if degree < 0 or light.shape != ((degree + 1) ** 2, 3):
         raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
@@ -51,10 +54,19 @@ def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "
     Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
     Re and Im of (x + iy)^m.
     """
-    require_range("degree", degree, 0, MAX_DEGREE)
+    require_degree(degree)
+    directions = as_tensor("directions", directions)
+    if not directions.ndim or directions.shape[-1] != 3:
+        raise InputError(f"directions has shape {tuple(directions.shape)}: give (..., 3)")
     require_finite(directions=directions)
     rows = select_rows(unit(directions.double().movedim(-1, 0)), range((degree + 1) ** 2))
     return torch.stack(rows, dim=-1).to(directions.dtype)
+
+
+def require_degree(degree: int) -> None:
+    """InputError unless it is a whole number in the range of degrees."""
+    require_whole("degree", degree)
+    require_range("degree", degree, 0, MAX_DEGREE)
 
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,13 +257,16 @@ def project(
     radiance: a function of directions (N, 3) float64 → (N, channels), integrated by `quadrature`, exactly where it is a
     polynomial of degree `quadrature_degree - degree`; or an environment map laid out by `equirectangular`.
     """
+    require_degree(degree)
     if not callable(radiance):
-        radiance = torch.as_tensor(radiance)
+        radiance = as_tensor("radiance", radiance)
+        if radiance.ndim != 3:
+            raise InputError(f"radiance has shape {tuple(radiance.shape)}: give a map (height, width, channels)")
         require_finite(radiance=radiance)
         grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
         return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
     directions, weights = quadrature(quadrature_degree)
-    values = radiance(directions).to(torch.float64)
+    values = as_tensor("radiance", radiance(directions)).to(torch.float64)
     require_finite(radiance=values)
     return basis(directions, degree).T @ (weights[:, None] * values)
 
@@ -259,10 +274,17 @@ def project(
 def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     """Coefficients ((degree + 1)², channels) of the light turned by a rotation: u'(ω) = u(Rᵀω).
 
-    rotation: orthonormal. Exact: the integrand is a polynomial. InputError: NaN.
+    rotation: orthonormal. Exact: the integrand is a polynomial. InputError: NaN, a number of coefficients that no
+    degree has, a matrix that does not rotate.
     """
+    coefficients, rotation = as_tensor("coefficients", coefficients), as_tensor("rotation", rotation)
     require_finite(coefficients=coefficients, rotation=rotation)
-    degree = math.isqrt(len(coefficients)) - 1
+    degree = math.isqrt(len(coefficients)) - 1 if coefficients.ndim == 2 else -1
+    if degree < 0 or len(coefficients) != (degree + 1) ** 2:
+        raise InputError(f"coefficients has shape {tuple(coefficients.shape)}: give ((degree + 1)², channels)")
+    turned_back = rotation @ rotation.mT if rotation.shape == (3, 3) else rotation.new_zeros(3, 3)
+    if not torch.allclose(turned_back, torch.eye(3).to(rotation), rtol=0, atol=ORTHONORMAL):
+        raise InputError("rotation is no rotation: give an orthonormal matrix (3, 3)")
 
     def turned(directions: Tensor) -> Tensor:
         return basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions)

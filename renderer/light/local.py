@@ -12,6 +12,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
 from renderer.normals import tangent_axes
+from renderer.validation import as_array, require_field_types
 
 SETS, RAYS = 4, 8  # neighboring samples cast rays to different points of a disc: SETS of RAYS points
 LARGEST = 256  # pixels per side of a projector
@@ -34,8 +35,11 @@ class Lamps(LocalBasis):
     name = "lamps"
 
     def __post_init__(self) -> None:
-        if not self.positions or not all(len(position) == 3 and any(position) for position in self.positions):
+        positions = as_array("positions", self.positions)
+        if positions.shape[1:] != (3,) or not all(map(any, positions)):
             raise InputError(f"lamps.positions={self.positions}: give [x, y, z] of lamps, none at the origin")
+        object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
+        require_field_types(self, "positions")
         for value in chain(*self.positions):
             require_range("a coordinate of lamps.positions", value, -FACTOR, FACTOR)
         require_range("lamps.power", self.power, 1 / FACTOR, FACTOR)
@@ -108,6 +112,7 @@ class Projector(LocalBasis):
     name = "projector"
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_range("projector.pixels", self.pixels, 1, LARGEST)
         require_range("projector.distance", self.distance, 2, FACTOR)
         require_range("projector.fov", self.fov, 1e-3, 3)

@@ -18,10 +18,18 @@ from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.image import to_bytes
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.environment import SUFFIXES, read_panorama
-from renderer.light.harmonics import basis, degree_of, nonzero_coefficients, project, rotate
+from renderer.light.harmonics import (
+    basis,
+    degree_of,
+    nonzero_coefficients,
+    project,
+    require_degree,
+    rotate,
+)
 from renderer.light.local import Projector
 from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.transfer import COEFFICIENTS, DEGREE
+from renderer.validation import as_path, as_tensor, require_kind
 
 # Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
 # L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 in the probes' own axes, whose y is up.
@@ -56,6 +64,9 @@ def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
     >>> bool((load_light("uniform")[1:] == 0).all())  # the same radiance from everywhere
     True
     """
+    light = str(as_path("light", light))
+    if degree is not None:
+        require_degree(degree)
     suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
         coefficients = probe(light)
@@ -85,6 +96,9 @@ def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis =
     >>> torch.equal(renderer.load_light("light.json"), light)
     True
     """
+    path = as_path("path", path)
+    require_kind("basis", basis, Harmonics | LocalBasis, "Harmonics(degree), or lamps or a projector")
+    coefficients = as_tensor("coefficients", coefficients)
     require_bounded(coefficients=coefficients)
     if coefficients.shape != (basis.size, 3):
         raise InputError(f"coefficients {tuple(coefficients.shape)} are not of {basis}: give {(basis.size, 3)}")

@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_finite
 from renderer.light.basis import HARMONICS
+from renderer.validation import as_tensor, is_number
 
 ZENITH = (0.0, math.pi / 2)  # from overhead to the horizon, both included
 TURBIDITY = (2.0, 10.0)  # from clear to hazy; 1 would be pure air
@@ -82,7 +83,8 @@ def _committed_fit() -> Tensor:
 
 def _checked(zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float) -> list[Tensor]:
     """The parameters as tensors of the dtype and on the device of the first floating one; numbers alone as float64."""
-    values = (zenith, azimuth, turbidity)
+    given = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
+    values = [value if is_number(value) else as_tensor(name, value) for name, value in given.items()]
     floating = (value for value in values if isinstance(value, Tensor) and value.is_floating_point())
     like = next(floating, torch.zeros((), dtype=torch.float64))
     zenith, azimuth, turbidity = (torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in values)
