@@ -15,18 +15,34 @@ from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from augment.utils import progress
 from renderer.camera import MOST_VIEWS, orbit_cameras
-from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
+from renderer.errors import (
+    FACTOR,
+    InputError,
+    as_device,
+    require_bounded,
+    require_choice,
+    require_range,
+)
 from renderer.gloss import smoothest
 from renderer.image import ImageSettings
 from renderer.io.images import read_image
 from renderer.light.basis import with_local_lights
-from renderer.light.harmonics import MAX_DEGREE
+from renderer.light.harmonics import MAX_DEGREE, degree_of
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light, read_light
-from renderer.mesh import MOST_VERTICES, Mesh, normalize, subdivide
+from renderer.mesh import MOST_VERTICES, Mesh, normalize, require_mesh, subdivide
 from renderer.microfacets import degree_for
-from renderer.rasterizer import NAMES, choose
+from renderer.rasterizer import NAMES, Rasterizer, choose
 from renderer.transfer import DEGREE
+from renderer.validation import (
+    as_list,
+    as_tensor,
+    describe,
+    require_field_types,
+    require_flag,
+    require_kind,
+    require_whole,
+)
 
 
 @dataclass
@@ -43,6 +59,7 @@ class ProjectorSettings:
 
     def build(self) -> tuple[Projector, Tensor]:
         """The basis, and the pattern (pixels², 3)."""
+        require_field_types(self)
         require_range("polar", self.polar, 0, 180)
         require_range("azimuth", self.azimuth, -360, 360)
         require_range("fov", self.fov, 0.1, 170)
@@ -65,12 +82,15 @@ class LampsSettings:
 
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
+        require_field_types(self)
         if isinstance(self.start, str):
             lamps, powers = read_light(Path(self.start), Lamps)
             return lamps, lamps.project_nonnegative(powers)
         try:
             positions = tuple((float(x), float(y), float(z)) for x, y, z in self.positions)
-            start = torch.tensor(self.start, dtype=torch.float32).expand(len(positions), 3)
+            start = as_tensor("start", self.start).float().expand(len(positions), 3)
+        except InputError:
+            raise
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             remedy = "give positions [x, y, z], and a number or [r, g, b]s as start"
             raise InputError(f"lamps: {remedy} ({error})") from error
@@ -109,6 +129,7 @@ class SceneSettings:
     ground: list[float] | None = None
 
     def __post_init__(self) -> None:
+        require_field_types(self, "light")
         require_range("exposure", self.exposure, 0, FACTOR)
         require_range("degree", self.degree, 0, MAX_DEGREE)
         require_range("views", self.views, 1, MOST_VIEWS)
@@ -136,7 +157,7 @@ class RendererSettings:
 
     def __post_init__(self) -> None:
         self.image(size=1)  # which checks most
-        if isinstance(self.rasterizer, str):
+        if not isinstance(self.rasterizer, Rasterizer):
             require_choice("rasterizer", self.rasterizer, NAMES)
 
     def image(self, size: int) -> ImageSettings:
@@ -171,14 +192,27 @@ def build_scene(
     >>> len(scene), scene.labels[0]
     (12, 'orange')
     """
+    require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
+    require_kind("renderer", renderer, RendererSettings | None, "RendererSettings(...) or None")
+    require_flag("shared", shared)
+    require_whole("views", views)
+    ImageSettings(size)
+    known = SCENE | {item.name for item in fields(RendererSettings)}
+    if unknown := sorted(options.keys() - known):
+        raise InputError(f"{unknown[0]} is no option of build_scene: choose from {', '.join(sorted(known))}")
+    meshes = _as_meshes(meshes)
     of_scene = {name: options.pop(name) for name in SCENE & options.keys()}
     shown = replace(scene or SceneSettings(), views=views, **of_scene)
     drawn = replace(renderer or RendererSettings(), **options)
     read = (_object(member, shown.vertices) for member in progress(meshes, "reading meshes"))
     objects = [on_ground(item, shown.ground) for item in read]
     environment: Any = shown.light
-    if isinstance(environment, str):
-        environment = load_light(environment, _degree(objects, shown.degree))
+    if isinstance(environment, str | Path):
+        environment = load_light(str(environment), _degree(objects, shown.degree))
+    else:
+        environment = as_tensor("light", environment)
+        degree_of(environment)
+        require_bounded(light=environment)
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
     fov = None if shown.fov is None else math.radians(shown.fov)
@@ -192,6 +226,24 @@ def build_scene(
         shared=shared,
         basis=basis,
     )
+
+
+def _as_meshes(meshes: object) -> list[Any]:
+    """Convert to a list of objects, or of pairs of what is shown and the name of its class; InputError otherwise."""
+    expected = "a list of pairs such as ('solid:orange', 'orange'), or of augment.ObjectSettings"
+    members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
+    if not members:
+        raise InputError(f"meshes is empty: give {expected}")
+    for index, member in enumerate(members):
+        if isinstance(member, ObjectSettings):
+            require_kind(f"meshes[{index}].label", member.label, str, "the name of a class")
+            continue
+        if len(member) != 2:
+            raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
+        if not isinstance(member[0], str | Path):
+            require_mesh(f"meshes[{index}]", member[0])
+        require_kind(f"meshes[{index}]: its label", member[1], str, "the name of a class")
+    return members
 
 
 def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObject:
@@ -216,6 +268,7 @@ def _degree(objects: Sequence[SceneObject], given: int | None) -> int:
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
     """(B, 3, size, size) of gray values or image files, or (B, 1, size, size) where all are gray; in [0, 1]."""
+    choices = as_list("backgrounds", choices, object, "a list of gray values in [0, 1] or image files")
     if not choices:
         raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
     images = [load_background(choice, size) for choice in choices]

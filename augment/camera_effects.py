@@ -9,6 +9,7 @@ from torch import Tensor
 
 from renderer.errors import require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
+from renderer.validation import require_field_types
 
 BLUR_RADIUS = 3  # pixels to either side that a blur averages over
 
@@ -29,6 +30,7 @@ class CameraEffectSettings:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", BLUR_RADIUS / 2), ("noise", 1)):
             require_range(name, getattr(self, name), 0, most)
         require_limits("pattern_fill", self.pattern_fill, 0, 1)

@@ -14,6 +14,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.gloss import Gloss
 from renderer.mesh import Mesh, concatenate, load_mesh, normalize, select_faces, subdivide
 from renderer.shapes import solid
+from renderer.validation import require_field_types, require_kind
 
 TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
 FARTHEST = 10.0  # position and size of props, in world units
@@ -31,6 +32,7 @@ class MeshSettings:
     gloss: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         if self.gloss == "file" and self.mesh.startswith("solid:"):
             raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
         if self.gloss not in (None, "file"):
@@ -82,6 +84,8 @@ class ObjectSettings(MeshSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for prop in self.props:
+            require_kind("props", prop, PropSettings, "a list of augment.PropSettings")
         require_range("albedo_scale", self.albedo_scale, 1 / FACTOR, FACTOR)
 
 

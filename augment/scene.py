@@ -23,6 +23,7 @@ from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transfer import build_operators
+from renderer.validation import as_integers, as_list, as_tensor, require_kind
 from renderer.views import InPlace, OperatorStack
 
 if TYPE_CHECKING:
@@ -102,9 +103,17 @@ class Scene:
     one_light: bool = False
 
     def __post_init__(self) -> None:
+        require_kind("settings", self.settings, ImageSettings, "renderer.ImageSettings(size)")
+        self.objects = as_list("objects", self.objects, SceneObject, "a list of scene objects")
+        self.examples = as_list("examples", self.examples, Example, "a list of examples")
+        self.lights = as_tensor("lights", self.lights)
+        self.backgrounds = as_tensor("backgrounds", self.backgrounds)
+        require_bounded(lights=self.lights)
         size, device = self.settings.size, self.lights.device
         if not self.examples:
             raise InputError("examples is empty: give at least one mesh, one view and one background")
+        if max(example.object for example in self.examples) >= len(self.objects):
+            raise InputError(f"objects holds {len(self.objects)}: give all that the examples name")
         if self.lights.shape[-2:] != (self.basis.size, 3):
             raise InputError(f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows")
         fit = self.backgrounds.shape[1:] in ((1, size, size), (3, size, size))
@@ -195,8 +204,10 @@ class Scene:
     def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
         """Images in [0, 1] of examples from their V views, differentiable in the conditions.
 
-        InputError: NaN.
+        InputError: NaN, other examples than the conditions are of.
         """
+        require_kind("conditions", conditions, Conditions, "conditions, such as scene.conditions(examples)")
+        examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
         covered = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
@@ -205,6 +216,16 @@ class Scene:
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
         images = self.camera_effects(images, examples) if self.camera_effects else images
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
+
+    def _as_examples(self, examples: object, count: int) -> Tensor:
+        """Convert as many indices of examples; InputError for others. On a GPU, the range of a tensor goes unchecked,
+        since the host would wait for it."""
+        indices = as_integers("examples", examples)
+        if indices.shape != (count,):
+            raise InputError(f"examples has shape {tuple(indices.shape)}: give {count} indices, one for each light")
+        if indices.device.type == "cpu" and count and not 0 <= int(indices.min()) <= int(indices.max()) < len(self):
+            raise InputError(f"examples names some that are not there: give indices from 0 to {len(self) - 1}")
+        return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         require_bounded(light=conditions.light)

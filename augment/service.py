@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -17,6 +19,7 @@ from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import AttackProblem
 from augment.build import Shown, build_scene
+from augment.classifiers.adapter import NetworkCall
 from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
 from augment.utils import Phases, as_found, generator, stream_seed
@@ -25,6 +28,16 @@ from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
+from renderer.validation import (
+    as_integers,
+    as_list,
+    as_tensor,
+    describe,
+    require_field_types,
+    require_kind,
+    require_seed,
+    require_whole,
+)
 
 ARMS = {"none": "no renders", "random": "randomized renders", "adversarial": "attacked renders", "folder": "images"}
 INITS = ("scene", "random")
@@ -42,6 +55,7 @@ class RandomLightSettings:
     radius: float | None = None
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_range("amplitude", self.amplitude, 1 / FACTOR, FACTOR)
         require_range("radius", self.radius, 1 / FACTOR, FACTOR)
 
@@ -92,6 +106,10 @@ class AugmentationSettings:
 
     def __post_init__(self) -> None:
         require_choice("arm", self.arm, ARMS)
+        require_kind("attack", self.attack, AttackSettings, "the settings of an attack")
+        require_field_types(self, "attack")
+        if not self.attack.parameters:
+            raise InputError("attack changes nothing: give TrainingAttackSettings(), or name a parameter")
         require_choice("init", self.init, INITS)
         if self.arm == "folder" and not self.folder:
             raise InputError(f"folder is {self.folder}, and arm=folder shows its images: name a folder")
@@ -179,6 +197,9 @@ class AugmentationService:
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
+        require_kind("settings", self.settings, AugmentationSettings, "augment.AugmentationSettings(...)")
+        require_seed("seed", self.seed)
+        self.labels = as_integers("labels", self.labels)
         source = "images" if self.settings.arm == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(
@@ -205,7 +226,15 @@ class AugmentationService:
         >>> service.regenerate(model, number=0).images.shape
         torch.Size([10, 3, 8, 8])
         """
-        named = [(mesh, str(label)) for mesh, label in meshes]
+        require_kind("settings", settings, AugmentationSettings | None, "augment.AugmentationSettings(...) or None")
+        require_seed("seed", seed)
+        expected = "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
+        members = as_list("meshes", meshes, tuple | list, expected)
+        for index, member in enumerate(members):
+            if len(member) != 2:
+                raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
+            require_whole(f"meshes[{index}]: its label", member[1])
+        named = [(mesh, str(label)) for mesh, label in members]
         paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
         paper["backgrounds"] = [0.0, 0.25, 0.5, 0.75, 1.0]
         scene = build_scene(named, size, **paper | of_scene)
@@ -225,6 +254,9 @@ class AugmentationService:
         model: images (N, 3, size, size) in [0, 1] → logits. number: counts a run's regenerations from 0. The draw
         depends on it and on the seed alone, so a resumed run repeats it. InputError: a label that has no logit.
         """
+        require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
+        require_seed("number", number)
+        model = CheckedNetwork(model)
         if self.images is not None and self.settings.renders:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
@@ -236,17 +268,44 @@ class AugmentationService:
         return make(model, self.settings.attack.problem(scene), number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The values (E, D) that the next attack begins with, with `warm_start`; otherwise empty."""
-        return {} if self._last_values is None else {"values": self._last_values.cpu()}
+        """Return what a resumed run needs.
+
+        Returns:
+            "scene": a hash of what is shown, which `load_state_dict` compares. "values", with `warm_start` once there
+            was an attack: the values (E, D) that the next attack begins with.
+        """
+        state = {"scene": self._scene_hash}
+        return state if self._last_values is None else {**state, "values": self._last_values.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the result of `state_dict`; InputError for one of another number of examples."""
-        if not state:
-            return
-        if len(state["values"]) != len(self.labels):
-            counts = f"{len(state['values'])} examples and the scene has {len(self.labels)}"
-            raise InputError(f"the checkpoint continues {counts}; resume with the settings of the run")
-        self._last_values = state["values"].to(self.labels.device)
+        """Restore the result of `state_dict`.
+
+        Raises:
+            InputError: If the state is of a service with another scene, or is none.
+        """
+        expected = "the result of state_dict of a service with the same scene"
+        require_kind("state", state, Mapping, expected)
+        if "scene" not in state or state.keys() - {"scene", "values"}:
+            raise InputError(f"state holds {', '.join(map(str, state)) or 'nothing'}: give {expected}")
+        values = state.get("values")
+        if values is not None:
+            values = as_tensor("state", values)
+            if values.ndim != 2 or len(values) != len(self.labels):
+                counts = f"{len(values)} examples and the scene has {len(self.labels)}"
+                raise InputError(f"state: it continues {counts}; resume with the settings of the run")
+        if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
+            raise InputError("state is of another scene: resume with the same meshes, labels, views and light")
+        self._last_values = None if values is None else values.to(self.labels.device)
+
+    @cached_property
+    def _scene_hash(self) -> Tensor:
+        """Hash what is shown, to some digits, so that the same settings agree on all machines."""
+        shown: list[object] = [self.labels.tolist(), list(self.studied)]
+        if self.images is not None:
+            shown.append(tuple(self.images.shape))
+        if self.scene is not None:
+            shown.append(_describe_scene(self.scene))
+        return torch.tensor(list(hashlib.sha256(repr(shown).encode()).digest()), dtype=torch.uint8)
 
     def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
         """The images that are next in passes over the whole folder, each in an order of its own."""
@@ -330,6 +389,40 @@ class AugmentationService:
             else:
                 parts.append(parameter.sample(generator(self.seed, number, parameter.name)).to(start))
         return problem.project(torch.cat(parts, dim=1), problem.everything)
+
+
+def _describe_scene(scene: Scene) -> list[object]:
+    """Describe a scene's objects, cameras, backgrounds and lights by plain values of a few digits."""
+    described: list[object] = [scene.settings.size, scene.settings.encoding, str(scene.basis)]
+    for item in scene.objects:
+        extent = item.mesh.vertices.std(axis=0)
+        counts = len(item.mesh.vertices), len(item.mesh.faces)
+        described.append((item.label, item.name, counts, _rounded(extent), f"{item.albedo_scale:.3g}"))
+    for example in scene.examples:
+        cameras = [_rounded(list(vars(camera.fixed()).values())) for camera in example.cameras]
+        described.append((example.object, example.background, f"{example.exposure:.3g}", cameras))
+    backgrounds = scene.backgrounds.mean((2, 3)).flatten()
+    lights = scene.lights.flatten(1).unique(dim=0).double()
+    described.append(_rounded(backgrounds.tolist()))
+    described.append(_rounded([*lights.sum(1).tolist(), *lights.norm(dim=1).tolist()]))
+    return described
+
+
+def _rounded(values: Iterable[float]) -> list[str]:
+    """Write numbers with three digits, so that the rounding of a computation is not seen."""
+    return [f"{float(value):.3g}" for value in values]
+
+
+class CheckedNetwork(nn.Module):
+    """A network of the training loop, whose outputs are refused if they cannot be logits."""
+
+    def __init__(self, model: nn.Module):
+        super().__init__()
+        self.model = model
+        self._call_network = NetworkCall("model")
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self._call_network(self.model, images)
 
 
 def choose_attack_examples(

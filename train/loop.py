@@ -282,7 +282,8 @@ class Trainer:
             self.soup.load_state_dict(state["soup"])
         for network in filter(None, (self.model, self.initial, self.selected)):
             network.precision = state["precision"]
-        self.service.load_state_dict(state["service"])
+        if "values" in state["service"]:  # otherwise the next attack begins at the scene, which settings may change
+            self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
         if begun := state["under_way"]:
             images, labels = to_unit(begun["images"]).to(self.device), begun["labels"].to(self.device)

@@ -21,6 +21,7 @@ from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
+from renderer.validation import as_path, require_kind
 from train.checkpoint import BEST, VERSION, checked, load, write_whole
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
@@ -232,7 +233,8 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     """
     if weights is not None:
         raise InputError(f"weights={weights} is not for classifier=run:{run}, which has its own: leave it out")
-    path, state = load_selected(Path(run))
+    require_kind("model", model, str | None, "python:package.module:function, or None")
+    path, state = load_selected(as_path("run", run))
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:

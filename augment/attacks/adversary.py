@@ -29,6 +29,7 @@ from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light, read_light, save_light
 from renderer.mesh import load_mesh
 from renderer.rasterizer import Rasterizer, choose
+from renderer.validation import as_folder
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def reload(folder: str | Path) -> Adversary:
     >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
     True
     """
-    folder = Path(folder)
+    folder = as_folder("folder", folder)
     path = folder / DESCRIPTION
     require_file(path, "give a folder that an attack wrote, such as .../example_000")
     try:

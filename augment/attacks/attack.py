@@ -23,11 +23,19 @@ from augment.attacks.parameters import (
     SkylightSettings,
     lighting,
 )
-from augment.classifiers.adapter import Classifier
+from augment.classifiers.adapter import Classifier, class_index, require_classifier
 from augment.losses import logit_gap
 from augment.scene import Conditions, Scene
 from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
+from renderer.validation import (
+    as_list,
+    is_whole,
+    require_field_types,
+    require_flag,
+    require_kind,
+    require_seed,
+)
 
 LEAST_LIKELY = "least_likely"  # in place of a target class
 
@@ -68,6 +76,7 @@ class AttackSettings:
     batch_size: int = 32
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_range("max_steps", self.max_steps, 0, 10**6)
         require_range("restarts", self.restarts, 0, 10**6)
         require_range("margin", self.margin, 0, FACTOR)
@@ -165,6 +174,11 @@ class AttackResult:
         return self.problem.conditions(self.descent.values, self.problem.everything)
 
 
+def require_result(result: object) -> None:
+    """InputError unless it is the result of an attack."""
+    require_kind("result", result, AttackResult, "the result of augment.attack")
+
+
 def attack(
     classifier: Classifier,
     scene: Scene,
@@ -193,6 +207,11 @@ def attack(
     >>> result.success, result.images.shape
     (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
     """
+    require_classifier("classifier", classifier)
+    require_kind("scene", scene, Scene, "a scene, such as augment.build_scene(...)")
+    require_kind("settings", settings, AttackSettings | None, "augment.AttackSettings(...) or None")
+    require_seed("seed", seed)
+    require_flag("force", force)
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     problem, model = settings.problem(scene), settings.preprocessed_model(classifier)
@@ -220,14 +239,20 @@ def target_labels(
     """The target classes (E, V), given the right ones (E, V) and the logits (E, V, C) before; None for any error."""
     if target is None:
         return None
-    if target == LEAST_LIKELY:
+    if isinstance(target, str) and target == LEAST_LIKELY:
         return logits.argmin(2)
     views = logits.shape[1]
-    names = [target] * views if isinstance(target, str) else [str(name) for name in target]
+    if isinstance(target, str):
+        names = [target] * views
+    else:
+        known = is_whole(target) and 0 <= int(target) < len(classifier.classes)  # type: ignore[call-overload]
+        example = classifier.classes[target] if known else classifier.classes[0]  # type: ignore[call-overload]
+        names = as_list("target", target, str, f"the name of a class, such as {example!r}, or a name for each view")
     if len(names) != views:
         counts = f"{len(names)} classes for {views} views that share what is attacked"
         raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")
-    labels = torch.tensor([classifier.label(name) for name in names], device=logits.device).expand(len(logits), views)
+    indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
+    labels = torch.tensor(indices, device=logits.device).expand(len(logits), views)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the right class of an example: name another class")
     return labels

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
+from renderer.validation import require_field_types
 
 
 @dataclass
@@ -30,6 +31,7 @@ class EOTSettings:
     jpeg: int = 75
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_range("draws", self.draws, 0, 1000)
         for name, most in (("jitter", 0.5), ("exposure", 5), ("noise", 1)):
             require_range(name, getattr(self, name), 0, most)

@@ -12,15 +12,23 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary
-from augment.attacks.attack import AttackResult, final_images, logits_of, predictions
+from augment.attacks.attack import (
+    AttackResult,
+    final_images,
+    logits_of,
+    predictions,
+    require_result,
+)
 from augment.attacks.descent import Goal, descend
 from augment.attacks.parameters import AttackProblem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.utils import generator, progress
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.validation import as_list, require_number
 
 GROWTH = (1, 3, 10)
+CHECKED = {"success", "random_search", "cost_fell", "zero_gradient"}  # results of `check` that `warnings` reads
 OF_MESH, OF_VIEW = ("geometry", "pose", "material", "albedo", "pixels"), ("pixels",)  # that no other mesh or view has
 
 
@@ -35,6 +43,7 @@ def check(result: AttackResult) -> dict[str, Any]:
     >>> checks["success"], checks["cost"] < checks["cost_before"]
     (1.0, True)
     """
+    require_result(result)
     descent, settings, problem, clean = result.descent, result.settings, result.problem, result.clean_correct
     open_cases = ~result.success_before
     fell = (descent.cost < descent.cost_before) | result.success
@@ -113,9 +122,12 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     >>> small["radii"], small["adversarial"], large["adversarial"]
     ({'lighting': 0.001}, tensor([False]), tensor([True]))
     """
+    require_result(result)
+    scales = as_list("scales", scales, object, "a list of factors of the radii")
     if not scales:
         raise InputError("scales is empty: give factors of the radii")
     for scale in scales:
+        require_number("scales", scale)
         require_range("scales", scale, 1 / FACTOR, FACTOR)
     settings, problem, goal, clean = result.settings, result.problem, result.goal, result.clean_correct
     draws = generator(result.seed, "sweep")
@@ -167,6 +179,13 @@ def transfer(
     >>> network["predicted"], turned["azimuth"]
     ([['other']], '+20°')
     """
+    require_result(result)
+    classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
+    objects = as_list("objects", objects, SceneObject, "a list of scene objects, such as scene.objects")
+    azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
+    for azimuth in azimuths:
+        require_number("azimuths", azimuth)
+        require_range("azimuths", azimuth, -LARGEST, LARGEST)
     require_transferable([parameter.name for parameter in result.problem.parameters], azimuths, objects)
     problem, attacked, scene = result.problem, result.classifier, result.problem.scene
     ends = problem.conditions(problem.start, problem.everything), result.conditions

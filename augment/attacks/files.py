@@ -1,7 +1,7 @@
 """The files of an attack: a figure and a folder for each example, and all numbers as JSON lines."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +10,17 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.attack import AttackResult, logits_of, predictions
+from augment.attacks.attack import AttackResult, logits_of, predictions, require_result
 from augment.attacks.eot import as_jpeg
-from augment.attacks.evaluate import warnings
+from augment.attacks.evaluate import CHECKED, warnings
 from augment.utils import progress
-from renderer.errors import require_choice
+from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rasterizer import Rasterizer
 from renderer.rendering import light_sphere
+from renderer.validation import as_folder, as_list, require_kind
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 JPEG_QUALITY = 90
@@ -46,8 +47,15 @@ def save(
     >>> [*line["versions"]]
     ['float', '8 bits', 'JPEG 90', 'reload']
     """
+    require_result(result)
+    folder = as_folder("folder", folder)
+    if checks is not None:
+        require_kind("checks", checks, Mapping, "the result of augment.check")
+        if missing := CHECKED - checks.keys():
+            raise InputError(f"checks lacks {', '.join(sorted(missing))}: give the result of augment.check")
+    verify = as_list("verify", [verify] if isinstance(verify, str) else verify, str, "a list of renderers")
     require_renderers(verify)
-    folder, problem, scene = Path(folder), result.problem, result.problem.scene
+    problem, scene = result.problem, result.problem.scene
     folder.mkdir(parents=True, exist_ok=True)
     before, after, lines = problem.conditions(problem.start, problem.everything), result.conditions, []
     stems = [folder / f"example_{example:03d}" for example in range(len(result.images))]

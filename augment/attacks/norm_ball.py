@@ -10,6 +10,7 @@ from torch import Tensor
 
 from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
 from renderer.light.basis import Ball, nearest_in_box
+from renderer.validation import require_field_types
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
@@ -38,6 +39,7 @@ class StepSettings:
     step_size: float = 0.05
 
     def __post_init__(self) -> None:
+        require_field_types(self)
         require_choice("norm", self.norm, NORMS)
         require_range("radius", self.radius, 0, FACTOR)
         require_choice("step", self.step, STEPS)

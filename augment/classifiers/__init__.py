@@ -22,6 +22,7 @@ from augment.classifiers.imagenet import (
 )
 from augment.utils import announced
 from renderer.errors import InputError
+from renderer.validation import as_path, require_kind
 
 __all__ = ["SOURCES", "Classifier", "OperatingPoint", "Source", "build_classifier", "load_classifier"]
 
@@ -58,12 +59,13 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     Traceback (most recent call last):
     renderer.errors.InputError: absent.pt does not exist: give the path of a file of weights
     """
+    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    path = None if weights is None else as_path("weights", weights)
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
         choices = [f"{source}NAME" if source.endswith(":") else source for source in SOURCES]
         raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
     load = SOURCES[source + colon].load
-    path = None if weights is None else Path(weights)
     with announced(f"loading {name}"):
         return load(model, path) if colon else load(path)
 

@@ -14,18 +14,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from augment.losses import log_odds
 from renderer.errors import InputError, in_one_line, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
+from renderer.validation import as_list, as_tensor, describe, require_kind, require_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
 Label = str | Sequence[str]  # the class under study, or several
+OVERSHOOT = 0.1  # beyond [0, 1], of values that an interpolation or noise may give
+SEVERAL = 2  # images whose outputs are probabilities before a network is refused for it
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,82 @@ class OperatingPoint:
     negatives: int
 
 
+class NetworkCall:
+    """Calls a network and refuses what it returns in place of logits.
+
+    Attributes:
+        name: Start of error messages, such as classifier=NAME.
+        probability_rows: Number of outputs so far that are probabilities, or None once an output was none. From then
+            on, outputs are not compared with probabilities, which costs nothing.
+    """
+
+    def __init__(self, name: str):
+        self.name = name
+        self.probability_rows: int | None = 0
+
+    def __call__(self, network: Callable[[Tensor], Tensor], images: Tensor, classes: int | None = None) -> Tensor:
+        """Compute the logits of images.
+
+        Args:
+            network: Any callable from images to logits.
+            images: RGB in [0, 1], shape (N, 3, H, W).
+            classes: Number of classes C, None if unknown.
+
+        Returns:
+            Logits, shape (N, C).
+
+        Raises:
+            InputError: If the network fails, or returns something else than one row of logits for each image.
+        """
+        shape = tuple(images.shape)
+        try:
+            logits = network(images)
+        except Exception as error:
+            if isinstance(error, InputError) or is_out_of_memory(error):
+                raise
+            raise InputError(self._failure(network, images, error)) from error
+        expected = (len(images), "C" if classes is None else classes)
+        fits = isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
+        if not fits or classes not in (None, logits.shape[1]):
+            returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+            raise InputError(f"{self.name} returned {returned}: make it return logits {expected} of images {shape}")
+        self._require_no_probabilities(logits)
+        return logits
+
+    def _failure(self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception) -> str:
+        """Say why a network fails on images, and what to do about it."""
+        weights = network.parameters() if isinstance(network, nn.Module) else iter(())
+        dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
+        given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
+        reason = f"{self.name} fails on {given} ({type(error).__name__}: {in_one_line(error)})"
+        if dtypes and images.dtype not in dtypes:
+            of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
+            return f"{reason}: its weights are {of_weights}, convert it with network.to({images.dtype})"
+        return f"{reason}: make it take these"
+
+    def _require_no_probabilities(self, logits: Tensor) -> None:
+        """Refuse a network whose first outputs of several images are probabilities."""
+        if self.probability_rows is None or not len(logits):
+            return
+        if not are_probabilities(logits):
+            self.probability_rows = None
+            return
+        self.probability_rows += len(logits)
+        if self.probability_rows >= SEVERAL:
+            fault = "returned probabilities, which are in [0, 1] and sum to 1, in place of logits"
+            raise InputError(f"{self.name} {fault}: leave out its softmax, or return the logarithm of its result")
+
+
+def are_probabilities(outputs: Tensor) -> bool:
+    """Tell whether all rows (N, C) of several classes are in [0, 1] and sum to 1 up to rounding."""
+    if outputs.shape[1] < 2 or not outputs.is_floating_point():
+        return False
+    values = outputs.detach()
+    rounding = max(1e-5, torch.finfo(values.dtype).eps)
+    off = (values.double().sum(1) - 1).abs().max()
+    return bool((values.min() >= 0) & (off <= rounding))
+
+
 class Classifier(nn.Module):
     """A frozen classifier: images, RGB in [0, 1], to logits of C classes; differentiable in the pixels.
 
@@ -58,11 +138,15 @@ class Classifier(nn.Module):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
         mode. InputError for a class name that occurs twice, since labels are found by name, and a size beyond 4,096."""
         super().__init__()
+        require_kind("name", name, str, "a string for messages")
+        require_kind("function", function, Callable, "a torch.nn.Module, or a function from images to logits")
+        require_whole(f"classifier={name}: size", size)
         require_range(f"classifier={name}: size", size, 1, LARGEST_SIZE)
         self.function = function
         self.size = size
-        self.classes = tuple(classes)
+        self.classes = as_class_names(f"classifier={name}: classes", classes)
         self.name = name
+        self._call_network = NetworkCall(f"classifier={name}")
         if not 0 < len(set(self.classes)) == len(self.classes):
             raise InputError(f"classifier={name}: name its classes, in the order of its logits, by different names")
         self.requires_grad_(False).eval()
@@ -70,21 +154,12 @@ class Classifier(nn.Module):
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
         """InputError for images of another size, and for a callable that fails or returns something else than finite
         logits with a gradient."""
-        name, size, shape = f"classifier={self.name}", self.size, tuple(images.shape)
-        if shape[1:] != (3, size, size):
+        name, size = f"classifier={self.name}", self.size
+        images = as_images("images", images)
+        if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
-            raise InputError(f"{name} takes images (N, 3, {size}, {size}), not {shape}: {remedy}")
-        try:
-            logits = self.function(images)
-        except Exception as error:
-            if isinstance(error, InputError) or is_out_of_memory(error):
-                raise
-            reason = f"{type(error).__name__}: {in_one_line(error)}"
-            raise InputError(f"{name} fails on float32 images {shape} ({reason}): make it take these") from error
-        expected = (len(images), len(self.classes))
-        if not isinstance(logits, Tensor) or logits.shape != expected:
-            returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            raise InputError(f"{name} returned {returned}: make it return logits {expected}")
+            raise InputError(f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}")
+        logits = self._call_network(self.function, images, len(self.classes))
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
@@ -96,6 +171,8 @@ class Classifier(nn.Module):
 
         label: the class, where there are operating points of several. InputError without one, and as of `forward`.
         """
+        require_kind("label", label, str | None, "the name of a class")
+        images = as_images("images", images)
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
@@ -113,6 +190,45 @@ class Classifier(nn.Module):
     def label(self, class_name: str) -> int:
         """The index of a class; InputError with the nearest names for one that the classifier lacks."""
         return class_index(self.classes, class_name, f"classifier={self.name}")
+
+
+def as_images(name: str, images: object) -> Tensor:
+    """Convert images to a tensor of RGB in [0, 1], which values may exceed a little.
+
+    Args:
+        name: Name of the argument, for the error.
+        images: Tensor, array or nested lists of floating-point numbers.
+
+    Raises:
+        InputError: If it is anything else, or if values are far from [0, 1]: bytes, normalized images, or NaN.
+    """
+    if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
+        raise InputError(f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255")
+    values = as_tensor(name, images)
+    if values.numel():
+        low, high = (extreme.item() for extreme in torch.aminmax(values.detach()))
+        if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
+            remedy = "give RGB in [0, 1], not normalized; divide bytes by 255"
+            raise InputError(f"{name} holds values from {low:g} to {high:g}: {remedy}")
+    return values
+
+
+def as_class_names(name: str, classes: object) -> tuple[str, ...]:
+    """Convert the names of classes, in the order of the logits, to a tuple of strings.
+
+    Raises:
+        InputError: If it is no list of strings, but for example one string.
+    """
+    return tuple(as_list(name, classes, str, "a list of the names of the classes, in the order of the logits"))
+
+
+def require_classifier(name: str, value: object) -> None:
+    """Check that an argument is a `Classifier`.
+
+    Raises:
+        InputError: If it is of another type, such as a bare network.
+    """
+    require_kind(name, value, Classifier, "augment.Classifier(network, size, classes) or augment.load_classifier(...)")
 
 
 class Normalized(nn.Module):
@@ -139,7 +255,7 @@ class Normalized(nn.Module):
 
 def label_names(label: Label) -> list[str]:
     """The classes under study. InputError: none, or one twice."""
-    names = [str(name) for name in (label if isinstance(label, list | tuple) else [label])]
+    names = as_list("label", [label] if isinstance(label, str) else label, str, "the name of a class, or several")
     if not names or len(set(names)) < len(names):
         raise InputError(f"label=[{', '.join(names)}] must name a class, or several, each once")
     return names
@@ -147,6 +263,7 @@ def label_names(label: Label) -> list[str]:
 
 def class_index(classes: Sequence[str], name: str, key: str) -> int:
     """The label of a class name; InputError, naming the key that it came from, where the list lacks it."""
+    require_kind("label", name, str, "the name of a class")
     if name not in classes:
         raise InputError(f"{key}: {name!r} is not a class of the model: choose one, such as {nearest(name, classes)}")
     return classes.index(name)

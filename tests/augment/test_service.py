@@ -188,8 +188,8 @@ def test_a_warm_start_continues_the_last_attack_also_after_a_resume(serve, model
     resumed = serve(warm_start=True, init="random")
     resumed.load_state_dict(state)
     torch.testing.assert_close(resumed.regenerate(model, 1).images, second.images, rtol=0, atol=0)
-    with pytest.raises(InputError, match=r"the checkpoint continues 3 examples and the scene has"):
-        resumed.load_state_dict({"values": torch.zeros(3, 147)})
+    with pytest.raises(InputError, match=r"^state.* continues 3 examples and the scene has"):
+        resumed.load_state_dict({**state, "values": torch.zeros(3, 147)})
 
 
 @pytest.mark.parametrize("arm", ["random", "adversarial"])

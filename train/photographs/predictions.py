@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from augment.classifiers.adapter import Label, label_names
+from augment.classifiers.adapter import Label, NetworkCall, label_names
 from augment.losses import log_odds
 from augment.utils import eval_mode, progress
 from renderer.errors import InputError, in_one_line
@@ -54,7 +54,8 @@ def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str
     if classes < 2:
         raise InputError("the model has a single class, whose odds are infinite: evaluate one with other classes, too")
     with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
-        batches = [model(to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
+        call = NetworkCall("model")
+        batches = [call(model, to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
         logits = torch.cat(batches).float().cpu()
     if logits.shape != (shape := (len(images), classes)):
         advice = "evaluate a checkpoint that was trained on these classes"

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from fractions import Fraction
 from pathlib import Path
@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.classifiers.adapter import Label, OperatingPoint, label_names
+from augment.classifiers.adapter import Label, OperatingPoint, as_class_names, label_names
 from augment.utils import progress
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, require_choice, require_range
+from renderer.image import LARGEST_SIZE
+from renderer.validation import as_folder, require_kind, require_whole
 from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
 from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by, resampled, thresholds
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
@@ -41,6 +43,10 @@ def predict_folder(
 ) -> tuple[list[Prediction], torch.Tensor, list[str], str]:
     """A folder's predictions, its images (N, 3, size, size), the paths of unreadable ones, and a hash of it all.
     Arguments and InputError: see `evaluate_photographs`."""
+    require_kind("model", model, Callable, "a torch.nn.Module, or a function from images to logits")
+    folder, classes = as_folder("folder", folder), as_class_names("classes", classes)
+    require_whole("size", size)
+    require_range("size", size, 1, LARGEST_SIZE)
     found = find_photographs(folder, classes, label)
     photographs, images, unreadable = load_photographs(folder, found, size, skip)
     logits = compute_logits(model, images, len(classes), device)
@@ -88,6 +94,8 @@ def evaluate_photographs(
     names them, over objects (`bootstrap`). InputError as of `find_photographs`, `load_photographs` and
     `compute_logits`, for `out` inside `folder`, and for by="mesh" where no mesh is known.
     """
+    folder, out = as_folder("folder", folder), as_folder("out", out)
+    require_choice("by", by, ("source", "mesh"))
     require_outside(out, folder)
     labels = label_names(label)
     scored = predict_folder(model, classes, folder, labels, size, skip_unreadable, device)
