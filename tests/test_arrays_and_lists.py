@@ -1,0 +1,125 @@
+"""NumPy arrays and lists are taken wherever tensors are, and give the same result."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import augment
+import renderer
+from augment.utils import Phases
+from renderer import harmonics, skylight
+from renderer.camera import Camera
+from renderer.light.local import Lamps
+
+SIZE = 8
+MESH = renderer.Mesh.plain(
+    [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
+    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
+    color=(1.0, 0.5, 0.0),
+)
+CAMERA = renderer.OrthographicCamera(1.0, 0.5, 4.0)
+LIGHT = renderer.load_light("grace")
+LAMP = Lamps(((2.0, 2.0, 2.0),))
+[OPERATOR] = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
+COVERED = len(OPERATOR.pixels)
+SCENE = augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
+IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+LABELS = torch.tensor([1, 0])
+
+
+def bright_or_dark(images: Tensor) -> Tensor:
+    """Logits of two classes that depend on the mean of an image alone."""
+    mean = images.mean((1, 2, 3))
+    return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
+
+
+CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
+
+
+def render(**changed: Any) -> Tensor:
+    given: dict[str, Any] = {"mesh": MESH, "cameras": CAMERA, "light": LIGHT, "size": SIZE}
+    return renderer.render(**given | {"samples": 1, **changed})
+
+
+def render_scene(scene: augment.Scene) -> Tensor:
+    examples = torch.arange(len(scene))
+    return scene.render(scene.conditions(examples), examples)
+
+
+def perspective(*fields: Any) -> Tensor:
+    polar, azimuth, width, right, distance = fields
+    camera = renderer.PerspectiveCamera(polar, azimuth, width, right, distance=distance)
+    return render(cameras=camera)
+
+
+def mesh_with(**changed: Any) -> Tensor:
+    return render(mesh=replace(MESH, **changed))
+
+
+CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
+    "light": (LIGHT, lambda x: render(light=x)),
+    "light in double precision": (LIGHT.double(), lambda x: render(light=x).double()),
+    "background image": (IMAGES[0], lambda x: render(background=x)),
+    "background color": (torch.tensor([0.25, 0.5, 1.0]), lambda x: render(background=x)),
+    "background": (torch.tensor(0.25), lambda x: render(background=x)),
+    "vertices": (torch.from_numpy(MESH.vertices) * 0.75, lambda x: render(vertices=x)),
+    "albedo": (torch.rand(4, 3), lambda x: render(albedo=x)),
+    "lights": (torch.rand(1, 3), lambda x: render(lights=[(LAMP, x)], light=None)),
+    "roughness": (0.25 + 0.5 * torch.rand(4), lambda x: render(gloss=renderer.Gloss(x, 0.0, 0.5))),
+    "strength": (torch.tensor(0.5), lambda x: render(gloss=renderer.Gloss(0.3, 0.0, x))),
+    "camera": (torch.tensor([1.0, 0.5, 4.0, 0.25, 8.0]), lambda x: perspective(*x)),
+    "orbit": (torch.tensor([2.0, 1.0, 0.5]), lambda x: render(cameras=orbit_of(x))),
+    "operator's lights": (torch.stack([LIGHT, 2 * LIGHT]), OPERATOR.image),
+    "operator's radiance": (LIGHT, OPERATOR.radiance),
+    "operator's background": (IMAGES[0], lambda x: OPERATOR.image(LIGHT, x)),
+    "radiance_gradient": (torch.rand(3, COVERED), OPERATOR.light_gradient),
+    "vertices of a mesh": (torch.from_numpy(MESH.vertices) / 2, lambda x: mesh_with(vertices=x)),
+    "faces of a mesh": (torch.from_numpy(MESH.faces), lambda x: mesh_with(faces=x)),
+    "colors of a mesh": (torch.rand(4, 3, 3), lambda x: mesh_with(corner_colors=x)),
+    "a mesh": (
+        torch.from_numpy(MESH.vertices),
+        lambda x: render(mesh=renderer.Mesh.plain(x, MESH.faces.tolist(), torch.rand(3).tolist())),
+    ),
+    "directions": (torch.rand(4, 3), lambda x: harmonics.basis(x, 3)),
+    "radiance": (torch.rand(8, 16, 3), lambda x: harmonics.project(x, 2)),
+    "coefficients": (LIGHT, lambda x: harmonics.rotate(x, torch.eye(3))),
+    "rotation": (torch.eye(3).roll(1, 0), lambda x: harmonics.rotate(LIGHT, x)),
+    "zenith": (torch.tensor([0.25, 0.5]), lambda x: skylight.coefficients(x, 0.5, 3.0).float()),
+    "light of a scene": (
+        LIGHT,
+        lambda x: render_scene(augment.build_scene([(MESH, "a")], SIZE, light=x, samples=1)),
+    ),
+    "lights of a scene": (LIGHT, lambda x: render_scene(replace(SCENE, lights=x))),
+    "backgrounds of a scene": (IMAGES[:1], lambda x: render_scene(replace(SCENE, backgrounds=x))),
+    "examples": (torch.tensor([1, 0]), lambda x: SCENE.render(SCENE.conditions(LABELS), x)),
+    "images": (IMAGES, CLASSIFIER),
+    "labels": (
+        torch.tensor([3, 1]),
+        lambda x: (
+            augment.AugmentationService(
+                augment.AugmentationSettings(), SCENE, x, 0, Phases()
+            ).labels
+        ),
+    ),
+}
+
+
+def orbit_of(values: Any) -> list[Camera]:
+    width, polar, azimuth = values
+    return renderer.orbit_cameras(2, width, polar, azimuth)
+
+
+@pytest.mark.parametrize(
+    "convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"]
+)
+@pytest.mark.parametrize("name", CALLS)
+def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):
+    tensor, call = CALLS[name]
+    torch.manual_seed(0)
+    expected = call(tensor)
+    torch.manual_seed(0)
+    torch.testing.assert_close(call(convert(tensor)), expected, rtol=1e-6, atol=1e-7)

@@ -1,0 +1,1240 @@
+"""Plausible wrong calls of every public function and class: each is refused by a sentence that names the argument."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor, nn
+
+import augment
+import renderer
+from augment.attacks.attack import AttackResult
+from augment.service import RandomLightSettings
+from renderer import InputError, harmonics, skylight
+from renderer.light.local import Lamps, Projector
+from train import load_run
+from train.photographs.scoring import evaluate_photographs
+
+NAN = math.nan
+SIZE = 8
+MESH = renderer.Mesh.plain(
+    [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]],
+    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
+    color=(1.0, 0.5, 0.0),
+)
+TRIMESH = trimesh.creation.icosahedron()
+CAMERA = renderer.OrthographicCamera(1.0, 0.5, 4.0)
+LIGHT = renderer.load_light("grace")
+LAMP = Lamps(((2.0, 2.0, 2.0),))
+CLASSES = ("orange", "other")
+COMPLEX = torch.ones(49, 3) * 1j
+OBJECTS = np.full((49, 3), None)
+IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+BYTES = IMAGES * 255
+COUNT_FAULTS = (16.5, True, 0, -1, "16", None, NAN, (16, 16))  # in place of a number of pixels
+
+
+def bright_or_dark(images: Tensor) -> Tensor:
+    """Logits of two classes that depend on the mean of an image alone."""
+    mean = images.mean((1, 2, 3))
+    return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
+
+
+def probabilities(images: Tensor) -> Tensor:
+    """What a network with a softmax at its end returns."""
+    return bright_or_dark(images).softmax(1)
+
+
+CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, CLASSES)
+HALF = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2)).half()
+LINEAR = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2))
+
+
+@cache
+def small_scene() -> augment.Scene:
+    return augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
+
+
+@cache
+def small_result() -> AttackResult:
+    settings = augment.AttackSettings(lighting=augment.StepSettings("l2", 1.0), max_steps=1)
+    return augment.attack(CLASSIFIER, small_scene(), settings=settings, force=True)
+
+
+@cache
+def operator() -> renderer.TransferOperator:
+    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)[0]
+
+
+def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService:
+    settings = augment.AugmentationSettings(warm_start=True)
+    given = {"views": 1, "samples": 1, "settings": settings, **options}
+    return augment.AugmentationService.from_meshes([(MESH, label)], SIZE, **given)
+
+
+def render(**changed: Any) -> Tensor:
+    given: dict[str, Any] = {
+        "mesh": MESH,
+        "cameras": CAMERA,
+        "light": LIGHT,
+        "size": SIZE,
+        "samples": 1,
+    }
+    return renderer.render(**given | changed)
+
+
+def operators(**changed: Any) -> list[renderer.TransferOperator]:
+    given: dict[str, Any] = {"mesh": MESH, "cameras": CAMERA, "size": SIZE, "samples": 1}
+    return renderer.precompute_transfer(**given | changed)
+
+
+def scene(meshes: Any = ((MESH, "orange"),), size: Any = SIZE, **changed: Any) -> augment.Scene:
+    return augment.build_scene(meshes, size, **{"samples": 1, "light": "uniform", **changed})
+
+
+def attack(classifier: Any = CLASSIFIER, **changed: Any) -> AttackResult:
+    shown = changed.pop("scene") if "scene" in changed else small_scene()
+    return augment.attack(classifier, shown, **changed)
+
+
+def mesh_of(**changed: Any) -> renderer.Mesh:
+    return replace(MESH, **changed)
+
+
+def calls_of(
+    name: str, call: Callable[[Any], object], *values: Any
+) -> list[tuple[str, str, Callable[[], object]]]:
+    """(the argument's name, a title, the call) for each wrong value of an argument."""
+    return [(name, f"{name}={_title(value)}", lambda value=value: call(value)) for value in values]
+
+
+def _title(value: object) -> str:
+    return f"{type(value).__name__} {str(value)[:30]}".replace("\n", " ")
+
+
+RENDERING = [
+    *calls_of(
+        "mesh",
+        lambda x: render(mesh=x),
+        "orange.glb",
+        Path("a.glb"),
+        TRIMESH,
+        None,
+        MESH.vertices,
+        [MESH],
+        CAMERA,
+    ),
+    *calls_of(
+        "cameras",
+        lambda x: render(cameras=x),
+        None,
+        "front",
+        [],
+        1.0,
+        (1.0, 0.5),
+        {},
+        [None],
+        MESH,
+        [CAMERA, 3],
+    ),
+    *calls_of(
+        "light",
+        lambda x: render(light=x),
+        "grace",
+        COMPLEX,
+        COMPLEX.numpy(),
+        OBJECTS,
+        [[1, 2, 3], [4]],
+    ),
+    *calls_of(
+        "light",
+        lambda x: render(light=x),
+        LIGHT[:, 0],
+        LIGHT.T,
+        LIGHT[None],
+        LIGHT * NAN,
+        MESH,
+        3.0,
+        [],
+        {},
+    ),
+    *calls_of(
+        "light",
+        lambda x: render(light=x),
+        LIGHT.bool(),
+        LIGHT[:, :2],
+        LIGHT[:5],
+        [None],
+        [["a"] * 3] * 49,
+    ),
+    *calls_of("size", lambda x: render(size=x), *COUNT_FAULTS),
+    *calls_of(
+        "background",
+        lambda x: render(background=x),
+        255,
+        "white",
+        NAN,
+        None,
+        torch.rand(SIZE, SIZE, 3),
+        1j,
+        MESH,
+    ),
+    *calls_of(
+        "background",
+        lambda x: render(background=x),
+        -0.1,
+        [0.1, 0.2],
+        [0, 128, 255],
+        [[0.5], [0.5, 0.5]],
+        {},
+    ),
+    *calls_of(
+        "lights",
+        lambda x: render(lights=x),
+        LIGHT,
+        LAMP,
+        None,
+        [LIGHT],
+        [(LAMP, LIGHT)],
+        [(LAMP, "white")],
+    ),
+    *calls_of(
+        "lights",
+        lambda x: render(lights=x),
+        [(LAMP, [[1, 2j, 3]])],
+        [(LAMP,)],
+        "lamp",
+        [(LIGHT, LAMP)],
+    ),
+    *calls_of("lights", lambda x: render(lights=x), [(LAMP, [[NAN] * 3])]),
+    *calls_of(
+        "vertices",
+        lambda x: render(vertices=x),
+        np.ones((3, 3)),
+        "x",
+        MESH.vertices * NAN,
+        MESH.vertices * 1j,
+    ),
+    *calls_of(
+        "vertices",
+        lambda x: render(vertices=x),
+        MESH.vertices.T[:, :3].tolist(),
+        MESH,
+        [[1, 2], [3]],
+        1.0,
+    ),
+    *calls_of(
+        "albedo",
+        lambda x: render(albedo=x),
+        torch.full((4, 3), -5.0),
+        np.full((4, 3), -0.1),
+        torch.ones(3, 3),
+    ),
+    *calls_of(
+        "albedo",
+        lambda x: render(albedo=x),
+        "red",
+        torch.ones(4, 3) * NAN,
+        torch.full((4, 3), 255.0),
+        0.5,
+    ),
+    *calls_of(
+        "albedo",
+        lambda x: render(albedo=x),
+        torch.ones(4, 3) * 1j,
+        torch.ones(2, 2, 3),
+        MESH,
+        [None],
+    ),
+    *calls_of(
+        "albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH
+    ),
+    *calls_of(
+        "gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}
+    ),
+    *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, None, 65),
+    *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3, ["linear"]),
+    *calls_of("normals", lambda x: render(normals=x), "Smooth", None, True, np.ones((4, 3))),
+    *calls_of("shadows", lambda x: render(shadows=x), "no", 2, None, [True]),
+    *calls_of("bounces", lambda x: render(bounces=x), 1.5, -1, "2", True, None, 101),
+    *calls_of("silhouettes", lambda x: render(silhouettes=x), "yes", None),
+    *calls_of("rasterizer", lambda x: render(rasterizer=x), "gpu", None, 3, ["auto"]),
+    *calls_of("mesh", lambda x: operators(mesh=x), "orange.glb", TRIMESH, None),
+    *calls_of("cameras", lambda x: operators(cameras=x), None, [], "front", [1.0]),
+    *calls_of("size", lambda x: operators(size=x), *COUNT_FAULTS),
+    *calls_of("albedo_scale", lambda x: operators(albedo_scale=x), "2", None, -1.0),
+    *calls_of("gloss", lambda x: operators(gloss=x), 0.3, "shiny"),
+    *calls_of("rasterizer", lambda x: operators(rasterizer=x), "gpu", None),
+    *calls_of(
+        "lights",
+        lambda x: operator().image(x),
+        "grace",
+        COMPLEX,
+        OBJECTS,
+        LIGHT.T,
+        LIGHT * NAN,
+        None,
+        [1.0],
+        LAMP,
+    ),
+    *calls_of(
+        "lights",
+        lambda x: operator().radiance(x),
+        "grace",
+        COMPLEX.numpy(),
+        LIGHT[:9],
+        None,
+        [[1], [1, 2]],
+    ),
+    *calls_of(
+        "background",
+        lambda x: operator().image(LIGHT, x),
+        2.0,
+        "white",
+        None,
+        torch.rand(3, 4, 4),
+        1j,
+    ),
+    *calls_of(
+        "radiance_gradient",
+        lambda x: operator().light_gradient(x),
+        "x",
+        None,
+        torch.ones(3, 2),
+        LIGHT,
+        1.0,
+    ),
+    *calls_of("device", lambda x: operator().to(x), "gpu", 3.5, LIGHT),
+]
+
+CAMERAS = [
+    *calls_of(
+        "views", lambda x: renderer.orbit_cameras(x, 2.0), 0, -1, 2.5, "3", True, None, NAN, [3]
+    ),
+    *calls_of(
+        "width",
+        lambda x: renderer.orbit_cameras(1, x),
+        0,
+        -2.0,
+        "2",
+        NAN,
+        None,
+        math.inf,
+        [1.0, 2.0],
+        1j,
+    ),
+    *calls_of(
+        "polar",
+        lambda x: renderer.orbit_cameras(1, 2.0, polar=x),
+        "60",
+        None,
+        NAN,
+        60.0,
+        [1.0, 2.0],
+    ),
+    *calls_of(
+        "azimuth",
+        lambda x: renderer.orbit_cameras(1, 2.0, azimuth=x),
+        "45",
+        None,
+        NAN,
+        [0.0, 1.0],
+        45.0,
+    ),
+    *calls_of("fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 30, "30", 0, -1.0, NAN, 1j),
+    *calls_of(
+        "polar",
+        lambda x: renderer.OrthographicCamera(x, 0.0, 2.0),
+        "up",
+        None,
+        NAN,
+        np.ones(2),
+        torch.ones(3),
+        1j,
+    ),
+    *calls_of(
+        "azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]
+    ),
+    *calls_of(
+        "width",
+        lambda x: renderer.OrthographicCamera(1.0, 0.0, x),
+        0.0,
+        -1.0,
+        "wide",
+        None,
+        NAN,
+        True,
+    ),
+    *calls_of(
+        "right",
+        lambda x: renderer.OrthographicCamera(1.0, 0.0, 2.0, right=x),
+        "x",
+        None,
+        NAN,
+        (0.0, 0.1),
+    ),
+    *calls_of(
+        "reach", lambda x: renderer.OrthographicCamera(1.0, 0.0, 2.0, reach=x), 0.0, "far", None
+    ),
+    *calls_of(
+        "distance",
+        lambda x: renderer.PerspectiveCamera(1.0, 0.0, 2.0, distance=x),
+        0,
+        -4.0,
+        "far",
+        None,
+        NAN,
+    ),
+    *calls_of("size", lambda x: renderer.ImageSettings(size=x), *COUNT_FAULTS),
+    *calls_of("samples", lambda x: renderer.ImageSettings(samples=x), 0, 65, 2.5, "8"),
+    *calls_of("encoding", lambda x: renderer.ImageSettings(encoding=x), "gamma", None),
+]
+
+LIGHTS = [
+    *calls_of(
+        "light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"
+    ),
+    *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
+    *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 21, "6", True, LIGHT),
+    *calls_of(
+        "coefficients",
+        lambda x: renderer.save_light(Path("l.json"), x),
+        "x",
+        None,
+        LIGHT[:9],
+        LIGHT * NAN,
+        COMPLEX,
+    ),
+    *calls_of(
+        "basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", None, 6
+    ),
+    *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT),
+    *calls_of(
+        "directions",
+        lambda x: harmonics.basis(x, 2),
+        "up",
+        None,
+        torch.ones(4, 2),
+        1.0,
+        torch.ones(2, 3) * NAN,
+        1j,
+    ),
+    *calls_of(
+        "degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 21, "2", None, True
+    ),
+    *calls_of("light", harmonics.degree_of, "grace", None, torch.ones(49), torch.ones(3, 49), 6),
+    *calls_of(
+        "radiance",
+        lambda x: harmonics.project(x, 2),
+        "sky",
+        None,
+        torch.ones(4),
+        torch.ones(4, 8, 3) * NAN,
+        1.0,
+    ),
+    *calls_of("degree", lambda x: harmonics.project(torch.ones(4, 8, 3), x), -1, 2.5, "2", None),
+    *calls_of(
+        "coefficients",
+        lambda x: harmonics.rotate(x, torch.eye(3)),
+        "x",
+        None,
+        torch.ones(8, 3),
+        COMPLEX,
+    ),
+    *calls_of(
+        "rotation",
+        lambda x: harmonics.rotate(LIGHT, x),
+        "x",
+        None,
+        torch.eye(2),
+        torch.ones(3, 3),
+        torch.eye(3) * 2,
+    ),
+    *calls_of(
+        "zenith",
+        lambda x: skylight.coefficients(x, 0.0, 3.0),
+        "noon",
+        None,
+        2.0,
+        -0.1,
+        NAN,
+        1j,
+        [None],
+        LAMP,
+    ),
+    *calls_of(
+        "azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", None, NAN, [[1], [1, 2]]
+    ),
+    *calls_of(
+        "turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", None, 1.0, 11.0, NAN
+    ),
+    *calls_of(
+        "positions",
+        Lamps,
+        3,
+        None,
+        (),
+        ((1.0, 2.0),),
+        ((0.0, 0.0, 0.0),),
+        (1.0, 2.0, 3.0),
+        "above",
+        [["x"] * 3],
+    ),
+    *calls_of("power", lambda x: Lamps(((1.0, 1.0, 1.0),), x), 0, -1, "bright", None, NAN),
+    *calls_of("pixels", lambda x: Projector(pixels=x), 0, 2.5, "16", None, 257, True),
+    *calls_of("fov", lambda x: Projector(fov=x), 30, "30", None, 0),
+]
+
+MESHES = [
+    *calls_of("path", renderer.load_mesh, None, 3, TRIMESH, MESH, MESH.vertices, ["a.glb"]),
+    *calls_of("missing.glb", renderer.load_mesh, "missing.glb"),
+    *calls_of("folder.glb", renderer.load_mesh, "folder.glb"),
+    *calls_of("up", lambda x: renderer.load_mesh("a.glb", up=x), "x", None, "Z", 2),
+    *calls_of("gloss", lambda x: renderer.load_mesh("a.glb", gloss=x), "yes", 0.3, None),
+    *calls_of("mesh", renderer.normalize, "a.glb", None, TRIMESH, MESH.vertices, [MESH]),
+    *calls_of("mesh", lambda x: renderer.subdivide(x, 10), "a.glb", None, TRIMESH),
+    *calls_of(
+        "vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", None, True, 10**8, NAN
+    ),
+    *calls_of("mesh", lambda x: renderer.export_mesh(x, "a.glb"), "b.glb", None, TRIMESH),
+    *calls_of("path", lambda x: renderer.export_mesh(MESH, x), None, 3, MESH),
+    *calls_of("a.obj", lambda x: renderer.export_mesh(MESH, x), "a.obj"),
+    *calls_of("folder.glb", lambda x: renderer.export_mesh(MESH, x), "folder.glb"),
+    *calls_of("normals", lambda x: renderer.export_mesh(MESH, "a.glb", x), "hard", None, True),
+    *calls_of(
+        "cameras",
+        lambda x: renderer.export_mesh(MESH, "a.glb", cameras=x),
+        3,
+        None,
+        [None],
+        ["front"],
+    ),
+    *calls_of("first", lambda x: renderer.export_mesh(MESH, "a.glb", first=x), "x", 2.5, -1),
+    *calls_of("name", renderer.solid, "car", None, 3, MESH, ["orange"]),
+    *calls_of("seed", lambda x: renderer.solid("orange", x), -1, 1.5, "3", None, NAN, True),
+    *calls_of(
+        "vertices",
+        lambda x: renderer.Mesh.plain(x, MESH.faces),
+        "x",
+        None,
+        3.0,
+        np.ones((4, 2)),
+        np.ones((4, 3)) * 1j,
+    ),
+    *calls_of(
+        "faces",
+        lambda x: renderer.Mesh.plain(MESH.vertices, x),
+        "x",
+        None,
+        [[0, 1, 9]],
+        [[0, 1, 2.5]],
+        [[0, 1]],
+        [],
+    ),
+    *calls_of(
+        "color",
+        lambda x: renderer.Mesh.plain(MESH.vertices, MESH.faces, x),
+        "red",
+        None,
+        (255, 128, 0),
+        (1, 1),
+        -0.1,
+    ),
+    *calls_of("faces", lambda x: renderer.Mesh.plain(MESH.faces, x), MESH.vertices / 2),
+    *calls_of(
+        "vertices",
+        lambda x: mesh_of(vertices=x),
+        "x",
+        None,
+        MESH.vertices[:, :2],
+        MESH.vertices * 1j,
+    ),
+    *calls_of(
+        "faces",
+        lambda x: mesh_of(faces=x),
+        None,
+        MESH.faces + 1,
+        MESH.faces.astype(float) + 0.5,
+        "x",
+    ),
+    *calls_of(
+        "corner_colors",
+        lambda x: mesh_of(corner_colors=x),
+        None,
+        MESH.faces,
+        "red",
+        MESH.corner_colors * 1j,
+    ),
+    *calls_of(
+        "corner_colors",
+        lambda x: render(mesh=mesh_of(corner_colors=x)),
+        MESH.corner_colors * 255,
+        -MESH.corner_colors,
+    ),
+    *calls_of("corner_uvs", lambda x: mesh_of(corner_uvs=x), None, np.ones((4, 3)), "x"),
+    *calls_of(
+        "texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), np.zeros(4), [0, 0]
+    ),
+    *calls_of(
+        "textures",
+        lambda x: mesh_of(textures=x),
+        "a.png",
+        [np.ones((4, 4, 3))],
+        [np.ones((4, 4), np.uint8)],
+        3,
+        None,
+    ),
+    *calls_of(
+        "gloss",
+        lambda x: render(mesh=mesh_of(gloss=x)),
+        0.3,
+        np.full((4, 3), 2.0),
+        np.ones(3),
+        renderer.Gloss(0.3),
+    ),
+    *calls_of(
+        "roughness",
+        lambda x: renderer.Gloss(x).on(MESH),
+        "smooth",
+        None,
+        2.0,
+        -0.1,
+        NAN,
+        [0.1, 0.2],
+        1j,
+        MESH,
+    ),
+    *calls_of(
+        "metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", None, 1.5, np.ones((4, 3))
+    ),
+    *calls_of("strength", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", None, 1.5),
+    *calls_of("mesh", renderer.Gloss(0.3).on, "a.glb", None, TRIMESH),
+]
+
+SCENES = [
+    *calls_of(
+        "meshes",
+        scene,
+        "solid:orange",
+        None,
+        [],
+        [("solid:orange",)],
+        ["solid:orange"],
+        3,
+        MESH,
+        [MESH],
+        [None],
+    ),
+    *calls_of(
+        "meshes",
+        scene,
+        [(MESH, 3)],
+        [(MESH, None)],
+        [(TRIMESH, "orange")],
+        [(None, "orange")],
+        {"orange": MESH},
+        [()],
+    ),
+    *calls_of("size", lambda x: scene(size=x), *COUNT_FAULTS),
+    *calls_of("views", lambda x: scene(views=x), 0, 2.5, "3", None, True, -1),
+    *calls_of("shared", lambda x: scene(shared=x), "yes", None, 3),
+    *calls_of("scene", lambda x: scene(scene=x), {"views": 3}, 3, small_scene),
+    *calls_of("renderer", lambda x: scene(renderer=x), {"samples": 3}, "opengl", renderer),
+    *calls_of("device", lambda x: scene(device=x), "gpu", 3.5),
+    *calls_of("widht", lambda x: scene(widht=x), 2.0),
+    *calls_of(
+        "backgrounds",
+        lambda x: scene(backgrounds=x),
+        0.5,
+        [],
+        "gray",
+        [255],
+        [None],
+        [NAN],
+        ["missing.png"],
+        None,
+        [LIGHT],
+    ),
+    *calls_of(
+        "light",
+        lambda x: scene(light=x),
+        None,
+        3,
+        "sunset",
+        LIGHT.T,
+        COMPLEX,
+        OBJECTS,
+        LIGHT * NAN,
+        [[1, 2], [3]],
+    ),
+    *calls_of("degree", lambda x: scene(degree=x), 2.5, -1, 21, "6"),
+    *calls_of("exposure", lambda x: scene(exposure=x), -1, "bright", None, NAN, [1.0]),
+    *calls_of("width", lambda x: scene(width=x), 0, -1.0, "wide", None, NAN),
+    *calls_of("polar", lambda x: scene(polar=x), 200.0, "top", None, NAN),
+    *calls_of("azimuth", lambda x: scene(azimuth=x), "east", None, 1000.0),
+    *calls_of("fov", lambda x: scene(fov=x), 200.0, "30", 0),
+    *calls_of("vertices", lambda x: scene(vertices=x), 2.5, -1, "many", None),
+    *calls_of("ground", lambda x: scene(ground=x), [1, 2, 3], "wood", 0.5, [0.5, 0.5], [None] * 3),
+    *calls_of("projector", lambda x: scene(projector=x), Projector(), {"pixels": 4}, True, 16),
+    *calls_of("lamps", lambda x: scene(lamps=x), LAMP, [[2, 2, 2]], True),
+    *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
+    *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", None, 3),
+    *calls_of(
+        "pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"
+    ),
+    *calls_of(
+        "pattern",
+        lambda x: scene(projector=augment.ProjectorSettings(pattern=x)),
+        2.0,
+        "missing.png",
+        None,
+    ),
+    *calls_of(
+        "positions",
+        lambda x: scene(lamps=augment.LampsSettings(positions=x)),
+        3,
+        [],
+        [[1, 2]],
+        "above",
+        None,
+    ),
+    *calls_of(
+        "start",
+        lambda x: scene(lamps=augment.LampsSettings(start=x)),
+        -1.0,
+        [1, 2],
+        None,
+        NAN,
+        11.0,
+        [["a"] * 3] * 4,
+    ),
+    *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, "", MESH),
+    *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
+    *calls_of(
+        "albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", None, 0, NAN
+    ),
+    *calls_of(
+        "color",
+        lambda x: augment.ObjectSettings("solid:cup", "cup", color=x),
+        "red",
+        0.5,
+        [255, 0, 0],
+        [0, 0],
+        [None] * 3,
+    ),
+    *calls_of(
+        "gloss",
+        lambda x: augment.ObjectSettings("solid:cup", "cup", gloss=x),
+        "shiny",
+        [2.0],
+        1j,
+        {},
+        [1, 0, 1, 0],
+    ),
+    *calls_of(
+        "props",
+        lambda x: scene([augment.ObjectSettings("solid:cup", "cup", props=x)]),
+        ["solid:cup"],
+        3,
+        [MESH],
+        None,
+    ),
+    *calls_of(
+        "at",
+        lambda x: augment.PropSettings("solid:cup", x),
+        3,
+        "left",
+        None,
+        [1],
+        [NAN, 0],
+        [1, "2"],
+    ),
+    *calls_of("scale", lambda x: augment.PropSettings("solid:cup", [0, 0], x), 0, "big", None, NAN),
+    *calls_of("shift", lambda x: augment.VariationSettings(shift=x), 2.0, "far", None, NAN),
+    *calls_of(
+        "scale",
+        lambda x: augment.VariationSettings(scale=x),
+        2.0,
+        [2, 1],
+        None,
+        "big",
+        [1],
+        ["a", "b"],
+    ),
+    *calls_of(
+        "environments",
+        lambda x: augment.VariationSettings(environments=x),
+        "grace",
+        3,
+        None,
+        [3],
+        [LIGHT],
+    ),
+    *calls_of("instances", lambda x: augment.VariationSettings(instances=x), "yes", None),
+    *calls_of("fov", lambda x: augment.VariationSettings(fov=x), 30.0, None, [50, 60], "wide"),
+    *calls_of(
+        "gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None, renderer.Gloss(0.3)
+    ),
+    *calls_of("camera", lambda x: augment.VariationSettings(camera=x), 0.3, None, CAMERA),
+    *calls_of("noise", lambda x: augment.CameraEffectSettings(noise=x), 2.0, "much", None, NAN),
+    *calls_of(
+        "pattern_fill",
+        lambda x: augment.CameraEffectSettings(pattern_fill=x),
+        0.5,
+        [0, 2],
+        None,
+        "half",
+    ),
+    *calls_of(
+        "backgrounds",
+        lambda x: replace(small_scene(), backgrounds=x),
+        "gray",
+        None,
+        BYTES,
+        torch.rand(1, 3, 4, 4),
+        0.5,
+    ),
+    *calls_of(
+        "lights",
+        lambda x: replace(small_scene(), lights=x),
+        "grace",
+        None,
+        LIGHT[:9],
+        COMPLEX,
+        LIGHT * NAN,
+        LIGHT.long() > 0,
+    ),
+    *calls_of("examples", lambda x: replace(small_scene(), examples=x), [], None, [3], "all"),
+    *calls_of("objects", lambda x: replace(small_scene(), objects=x), [MESH], None, [], "orange"),
+    *calls_of("settings", lambda x: replace(small_scene(), settings=x), None, 8, {"size": 8}),
+    *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None, LIGHT, "now"),
+    *calls_of(
+        "examples",
+        lambda x: small_scene().render(small_scene().conditions(torch.arange(2)), x),
+        None,
+        "all",
+        [0.5, 1],
+        [0, 9],
+        torch.arange(1),
+    ),
+]
+
+STEPS = augment.StepSettings()
+ATTACKS = [
+    *calls_of("norm", augment.StepSettings, "l3", 0.1, None, 2),
+    *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN, [0.1], True),
+    *calls_of("step", lambda x: augment.StepSettings(step=x), "adam", None, 0.1),
+    *calls_of(
+        "step_size", lambda x: augment.StepSettings(step_size=x), 0, -0.1, "small", None, NAN
+    ),
+    *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", None, NAN),
+    *calls_of("joints", lambda x: augment.PoseSettings(joints=x), "elbow", None, 200.0, [30.0]),
+    *calls_of("roughness", lambda x: augment.MaterialSettings(roughness=x), 2, "rough", None),
+    *calls_of("zenith", lambda x: augment.SkylightSettings(zenith=x), "noon", None),
+    *calls_of(
+        "lighting",
+        lambda x: augment.AttackSettings(lighting=x),
+        0.1,
+        True,
+        "l2",
+        {"radius": 1.0},
+        MESH,
+    ),
+    *calls_of("pose", lambda x: augment.AttackSettings(pose=x), augment.StepSettings(), 10.0, True),
+    *calls_of(
+        "material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3
+    ),
+    *calls_of(
+        "skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings(), True
+    ),
+    *calls_of(
+        "max_steps",
+        lambda x: augment.AttackSettings(lighting=STEPS, max_steps=x),
+        2.5,
+        "x",
+        True,
+        -1,
+        None,
+    ),
+    *calls_of(
+        "restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1, None
+    ),
+    *calls_of(
+        "margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN, None
+    ),
+    *calls_of(
+        "rounded", lambda x: augment.AttackSettings(lighting=STEPS, rounded=x), "yes", None, 8
+    ),
+    *calls_of(
+        "allow_negative",
+        lambda x: augment.AttackSettings(lighting=STEPS, allow_negative=x),
+        "no",
+        None,
+    ),
+    *calls_of("shorten", lambda x: augment.AttackSettings(lighting=STEPS, shorten=x), "no", None),
+    *calls_of("eot", lambda x: augment.AttackSettings(lighting=STEPS, eot=x), 3, None, True),
+    *calls_of(
+        "batch_size",
+        lambda x: augment.AttackSettings(lighting=STEPS, batch_size=x),
+        0,
+        2.5,
+        "32",
+        None,
+    ),
+    *calls_of(
+        "classifier", attack, None, LINEAR, bright_or_dark, "efficientnet_lite0", small_scene
+    ),
+    *calls_of(
+        "scene", lambda x: attack(scene=x), None, "solid:orange", [MESH], MESH, CLASSIFIER, IMAGES
+    ),
+    *calls_of(
+        "target",
+        lambda x: attack(target=x, force=True),
+        3,
+        1,
+        True,
+        "pear",
+        ["other", "other"],
+        [3],
+        [],
+        0.5,
+        LIGHT,
+        {},
+    ),
+    *calls_of(
+        "settings", lambda x: attack(settings=x), {"lighting": STEPS}, STEPS, "lighting", True
+    ),
+    *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
+    *calls_of("seed", lambda x: attack(seed=x, force=True), "x", 1.5, None, -1, True),
+    *calls_of("force", lambda x: attack(force=x), "yes", None),
+    *calls_of(
+        "orange",
+        lambda x: attack(x, force=True),
+        augment.Classifier(bright_or_dark, SIZE, ["lemon", "pear"]),
+    ),
+    *calls_of(
+        "classifier",
+        lambda x: attack(x, force=True),
+        augment.Classifier(bright_or_dark, 16, CLASSES),
+    ),
+    *calls_of("result", augment.check, None, small_scene, CLASSIFIER, {}),
+    *calls_of("result", lambda x: augment.success_by_radius(x, [1.0]), None, IMAGES),
+    *calls_of(
+        "scales",
+        lambda x: augment.success_by_radius(small_result(), x),
+        0.5,
+        [],
+        ["x"],
+        [-1],
+        None,
+        [NAN],
+        "1",
+        [None],
+    ),
+    *calls_of("result", lambda x: augment.transfer(x, [CLASSIFIER]), None, CLASSIFIER),
+    *calls_of(
+        "classifiers",
+        lambda x: augment.transfer(small_result(), x),
+        CLASSIFIER,
+        ["squeezenet"],
+        None,
+        [LINEAR],
+        3,
+    ),
+    *calls_of(
+        "azimuths",
+        lambda x: augment.transfer(small_result(), azimuths=x),
+        30.0,
+        ["x"],
+        None,
+        [None],
+        [NAN],
+        "30",
+    ),
+    *calls_of(
+        "objects",
+        lambda x: augment.transfer(small_result(), objects=x),
+        [MESH],
+        MESH,
+        None,
+        ["solid:orange"],
+    ),
+    *calls_of("result", lambda x: augment.save(x, "out"), None, "out", small_scene),
+    *calls_of("folder", lambda x: augment.save(small_result(), x), None, 3, CLASSIFIER),
+    *calls_of("file.txt", lambda x: augment.save(small_result(), x), "file.txt", "file.txt/inside"),
+    *calls_of(
+        "checks",
+        lambda x: augment.save(small_result(), "out", checks=x),
+        3,
+        "all",
+        {"success": 1.0},
+    ),
+    *calls_of(
+        "verify",
+        lambda x: augment.save(small_result(), "out", verify=x),
+        "blender",
+        ["blender"],
+        None,
+        3,
+        "mitsubishi",
+    ),
+    *calls_of("folder", augment.reload, None, 3, MESH),
+    *calls_of("file.txt", augment.reload, "file.txt"),
+    *calls_of("missing", augment.reload, "missing"),
+]
+
+
+def half_network() -> augment.Classifier:
+    network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.Flatten(), nn.Linear(4 * (SIZE - 2) ** 2, 2))
+    return augment.Classifier(network.half(), SIZE, CLASSES)
+
+
+def returning(value: Any) -> augment.Classifier:
+    return augment.Classifier(lambda images: value, SIZE, CLASSES)
+
+
+CLASSIFIERS = [
+    *calls_of(
+        "function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES
+    ),
+    *calls_of(
+        "size",
+        lambda x: augment.Classifier(bright_or_dark, x, CLASSES),
+        *COUNT_FAULTS,
+        5000,
+        CLASSES,
+    ),
+    *calls_of(
+        "classes",
+        lambda x: augment.Classifier(bright_or_dark, SIZE, x),
+        "orange",
+        3,
+        [],
+        ["a", "a"],
+        [0, 1],
+        None,
+        [None],
+    ),
+    *calls_of("name", lambda x: augment.Classifier(bright_or_dark, SIZE, CLASSES, x), None, 3),
+    *calls_of(
+        "images",
+        CLASSIFIER,
+        BYTES,
+        BYTES.to(torch.uint8),
+        BYTES.numpy(),
+        IMAGES * 4 - 2,
+        IMAGES * NAN,
+        "x",
+        None,
+        1j,
+    ),
+    *calls_of(
+        "images",
+        CLASSIFIER,
+        IMAGES[0],
+        IMAGES.permute(0, 2, 3, 1),
+        IMAGES[..., :4],
+        [],
+        [[1], [2, 3]],
+        MESH,
+        IMAGES[:, :1],
+    ),
+    *calls_of("logits", augment.Classifier(probabilities, SIZE, CLASSES), IMAGES),
+    *calls_of("logits", returning(torch.tensor([[0.2, 0.8]] * 3)), IMAGES),
+    *calls_of("logits", returning(torch.full((3, 2), NAN)), IMAGES),
+    *calls_of("logits", returning(torch.ones(3, 5)), IMAGES),
+    *calls_of("logits", returning((torch.ones(3, 2), None)), IMAGES),
+    *calls_of("float16", half_network(), IMAGES),
+    *calls_of("float64", augment.Classifier(LINEAR, SIZE, CLASSES), IMAGES.double()),
+    *calls_of(
+        "logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities
+    ),
+    *calls_of("float16", lambda x: attack(x, force=True), half_network()),
+    *calls_of("label", CLASSIFIER.label, 3, None, ["orange"], 0.5),
+    *calls_of("pear", CLASSIFIER.label, "pear"),
+    *calls_of("images", CLASSIFIER.detect, BYTES, None),
+    *calls_of("operating point", CLASSIFIER.detect, IMAGES),
+    *calls_of("label", lambda x: CLASSIFIER.detect(IMAGES, x), 3, ["orange"]),
+    *calls_of("name", augment.load_classifier, None, 3, LINEAR, ["timm:resnet18"], Path("a.pth")),
+    *calls_of("resnet50", augment.load_classifier, "resnet50"),
+    *calls_of(
+        "weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR, {}
+    ),
+    *calls_of("run", load_run, None, 3, LINEAR),
+    *calls_of("missing", load_run, "missing"),
+    *calls_of("file.txt", load_run, "file.txt"),
+    *calls_of("weights", lambda x: load_run("pretrained/none", weights=x), "a.pt"),
+    *calls_of("size", lambda x: augment.build_scene([("solid:orange", "orange")], x), CLASSIFIER),
+]
+
+SERVICES = [
+    *calls_of("arm", augment.AugmentationSettings, "all", None, True, 3),
+    *calls_of("folder", lambda x: augment.AugmentationSettings("folder", x), None, 3),
+    *calls_of("examples", lambda x: augment.AugmentationSettings(examples=x), 2.5, "x", -1, True),
+    *calls_of("init", lambda x: augment.AugmentationSettings(init=x), "zero", None),
+    *calls_of("warm_start", lambda x: augment.AugmentationSettings(warm_start=x), "yes", None),
+    *calls_of("every", lambda x: augment.AugmentationSettings(every=x), 0, 2.5, "x"),
+    *calls_of("vary", lambda x: augment.AugmentationSettings(vary=x), {"shift": 0.1}, None, True),
+    *calls_of("random_light", lambda x: augment.AugmentationSettings(random_light=x), 0.5, None),
+    *calls_of("attack", lambda x: augment.AugmentationSettings(attack=x), STEPS, None, "lighting"),
+    *calls_of("amplitude", RandomLightSettings, 0, "x", None, NAN),
+    *calls_of(
+        "meshes",
+        lambda x: augment.AugmentationService.from_meshes(x, SIZE),
+        "solid:orange",
+        [(MESH,)],
+        [MESH],
+        None,
+        3,
+    ),
+    *calls_of("label", small_service, "orange", 1.5, None, True, [0], NAN),
+    *calls_of(
+        "size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0
+    ),
+    *calls_of("settings", lambda x: small_service(settings=x), {"arm": "random"}, STEPS, "random"),
+    *calls_of("seed", lambda x: small_service(seed=x), "x", 1.5, None, -1),
+    *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2, 53),
+    *calls_of("model", lambda x: small_service().regenerate(x, 0), None, "resnet", 3, IMAGES),
+    *calls_of(
+        "model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2), HALF
+    ),
+    *calls_of(
+        "logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))
+    ),
+    *calls_of("number", lambda x: small_service().regenerate(LINEAR, x), "x", 1.5, None, -1, True),
+    *calls_of(
+        "state",
+        lambda x: small_service().load_state_dict(x),
+        {},
+        None,
+        3,
+        [],
+        {"values": torch.zeros(5, 147)},
+        "state.pt",
+    ),
+    *calls_of("state", lambda x: small_service().load_state_dict(x.state_dict()), LINEAR),
+    *calls_of(
+        "state",
+        lambda x: x.load_state_dict(small_service(light="uniform").state_dict()),
+        small_service(),
+    ),
+    *calls_of(
+        "state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()
+    ),
+    *calls_of(
+        "state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()
+    ),
+]
+
+SCORES = [
+    *calls_of(
+        "folder",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, x, "orange", Path("out"), SIZE),
+        None,
+        3,
+    ),
+    *calls_of(
+        "file.txt",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, x, "orange", Path("out"), SIZE),
+        "file.txt",
+    ),
+    *calls_of(
+        "out", lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", x, SIZE), None, 3
+    ),
+    *calls_of(
+        "file.txt",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", x, SIZE),
+        "file.txt",
+    ),
+    *calls_of(
+        "label",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", x, "out", SIZE),
+        "pear",
+        None,
+        3,
+        [],
+    ),
+    *calls_of(
+        "classes",
+        lambda x: evaluate_photographs(LINEAR, x, "photos", "orange", "out", SIZE),
+        "orange",
+        None,
+        3,
+        ["orange"],
+    ),
+    *calls_of(
+        "size",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", "out", x),
+        *COUNT_FAULTS,
+    ),
+    *calls_of(
+        "model",
+        lambda x: evaluate_photographs(x, CLASSES, "photos", "orange", "out", SIZE),
+        None,
+        "resnet",
+        3,
+        nn.Linear(5, 2),
+    ),
+    *calls_of(
+        "logits",
+        lambda x: evaluate_photographs(x, CLASSES, "photos", "orange", "out", SIZE),
+        probabilities,
+    ),
+    *calls_of(
+        "by",
+        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", "out", SIZE, by=x),
+        "mesh",
+        "color",
+        None,
+    ),
+]
+
+CALLS = [
+    *RENDERING,
+    *CAMERAS,
+    *LIGHTS,
+    *MESHES,
+    *SCENES,
+    *ATTACKS,
+    *CLASSIFIERS,
+    *SERVICES,
+    *SCORES,
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mesh file, a file that is nothing else, a folder named like a mesh and two photographs."""
+    from PIL import Image
+
+    here = tmp_path_factory.mktemp("wrong_calls")
+    renderer.export_mesh(MESH, here / "a.glb")
+    (here / "file.txt").write_text("text")
+    (here / "folder.glb").mkdir()
+    for name in ("orange", "other"):
+        (here / "photos" / name).mkdir(parents=True)
+        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
+            here / "photos" / name / "0.png"
+        )
+    return here
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS]
+)
+def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
+    folder, monkeypatch, name, call
+):
+    monkeypatch.chdir(folder)
+    with pytest.raises(InputError) as refused:
+        call()
+    sentence = str(refused.value)
+    assert name in sentence and "\n" not in sentence, sentence
