@@ -68,6 +68,11 @@ class Conditions:
     gloss: Float[Tensor, "A F 3"] | Float[Tensor, "A 1 3"] | None = None
     hue: Float[Tensor, "A F"] | None = None
 
+    def __post_init__(self) -> None:
+        for name, values in vars(self).items():
+            if values is not None and not isinstance(values, Tensor):
+                object.__setattr__(self, name, as_tensor(name, values))
+
     def row(self, index: int, mesh: Mesh) -> Conditions:
         """One row as it is for its mesh, without the first dimension."""
         counts = {"vertices": len(mesh.vertices), **dict.fromkeys(("albedo", "gloss", "hue"), len(mesh.faces))}
@@ -198,8 +203,8 @@ class Scene:
         return tuple(camera.moved(*conditions.cameras[row]).seeing(radius) for camera in cameras)
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
-        """The unattacked conditions of some examples."""
-        return Conditions(self.lights[examples])
+        """The unattacked conditions of some examples. InputError: indices that are not there."""
+        return Conditions(self.lights[self._as_examples(examples)])
 
     def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
         """Images in [0, 1] of examples from their V views, differentiable in the conditions.
@@ -207,6 +212,9 @@ class Scene:
         InputError: NaN, other examples than the conditions are of.
         """
         require_kind("conditions", conditions, Conditions, "conditions, such as scene.conditions(examples)")
+        if conditions.light.shape[1:] != (self.basis.size, 3):
+            shape, expected = tuple(conditions.light.shape), (len(self), self.basis.size, 3)
+            raise InputError(f"conditions: light has shape {shape}, give one of each example, such as {expected}")
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
@@ -217,13 +225,18 @@ class Scene:
         images = self.camera_effects(images, examples) if self.camera_effects else images
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
-    def _as_examples(self, examples: object, count: int) -> Tensor:
-        """Convert as many indices of examples; InputError for others. On a GPU, the range of a tensor goes unchecked,
+    def _as_examples(self, examples: object, count: int | None = None) -> Tensor:
+        """Convert `count` indices of examples; InputError for others. On a GPU, the range of a tensor goes unchecked,
         since the host would wait for it."""
         indices = as_integers("examples", examples)
-        if indices.shape != (count,):
-            raise InputError(f"examples has shape {tuple(indices.shape)}: give {count} indices, one for each light")
-        if indices.device.type == "cpu" and count and not 0 <= int(indices.min()) <= int(indices.max()) < len(self):
+        if indices.ndim != 1 or count not in (None, len(indices)):
+            advice = f"give {'a list of' if count is None else count} indices, one for each light"
+            raise InputError(f"examples has shape {tuple(indices.shape)}: {advice}")
+        if (
+            indices.device.type == "cpu"
+            and len(indices)
+            and not 0 <= int(indices.min()) <= int(indices.max()) < len(self)
+        ):
             raise InputError(f"examples names some that are not there: give indices from 0 to {len(self) - 1}")
         return indices.to(self.lights.device)
 

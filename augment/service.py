@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
@@ -29,6 +30,7 @@ from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
 from renderer.validation import (
+    as_array,
     as_integers,
     as_list,
     as_tensor,
@@ -199,7 +201,19 @@ class AugmentationService:
     def __post_init__(self) -> None:
         require_kind("settings", self.settings, AugmentationSettings, "augment.AugmentationSettings(...)")
         require_seed("seed", self.seed)
+        require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
+        require_kind("phases", self.phases, Phases, "augment.utils.Phases()")
         self.labels = as_integers("labels", self.labels)
+        self.studied = [int(label) for label in as_integers("studied", self.studied)]
+        if self.scene is not None and self.labels.shape != (len(self.scene),):
+            raise InputError(
+                f"labels has shape {tuple(self.labels.shape)}: give one of each of {len(self.scene)} examples"
+            )
+        if self.images is not None:
+            images = as_array("images", self.images)
+            if images.dtype != np.uint8 or images.ndim != 4 or len(images) != len(self.labels):
+                raise InputError(f"images is {describe(images)}: give bytes (E, 3, H, W), one for each label")
+            self.images = torch.as_tensor(self.images)
         source = "images" if self.settings.arm == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(

@@ -83,7 +83,8 @@ def as_integers(name: str, value: object) -> Tensor:
         InputError: If the value is anything else.
     """
     if isinstance(value, Tensor):
-        if not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool):
+        integers = not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool)
+        if integers or not value.numel():
             return value.long()
     else:
         array = _as_numbers(value)

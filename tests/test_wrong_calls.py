@@ -16,7 +16,9 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attacks.attack import AttackResult
+from augment.scene import Conditions
 from augment.service import RandomLightSettings
+from augment.utils import Phases
 from renderer import InputError, harmonics, skylight
 from renderer.light.local import Lamps, Projector
 from train import load_run
@@ -77,6 +79,16 @@ def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService
     settings = augment.AugmentationSettings(warm_start=True)
     given = {"views": 1, "samples": 1, "settings": settings, **options}
     return augment.AugmentationService.from_meshes([(MESH, label)], SIZE, **given)
+
+
+def service_of(**changed: Any) -> augment.AugmentationService:
+    given: dict[str, Any] = {
+        "scene": small_scene(),
+        "labels": [0, 0],
+        "seed": 0,
+        "phases": Phases(),
+    }
+    return augment.AugmentationService(augment.AugmentationSettings(), **given | changed)
 
 
 def render(**changed: Any) -> Tensor:
@@ -1000,6 +1012,34 @@ def returning(value: Any) -> augment.Classifier:
     return augment.Classifier(lambda images: value, SIZE, CLASSES)
 
 
+DIRECT = [
+    *calls_of("degree", harmonics.quadrature, "x", 2.5, -1, None),
+    *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, None, 4.5),
+    *calls_of("examples", lambda x: small_scene().conditions(x), "all", None, [9], 0, [0.5]),
+    *calls_of(
+        "light",
+        lambda x: small_scene().render(x, [0]),
+        Conditions(LIGHT),
+        Conditions(LIGHT[None, :9]),
+    ),
+    *calls_of("scene", lambda x: service_of(scene=x), 3, MESH, "solid:orange"),
+    *calls_of(
+        "labels",
+        lambda x: service_of(labels=x),
+        "orange",
+        None,
+        [0],
+        [0.5, 1],
+        [0, 1, 1],
+        [True, False],
+    ),
+    *calls_of("studied", lambda x: service_of(studied=x), "orange", [0.5], None),
+    *calls_of("phases", lambda x: service_of(phases=x), None, "attack"),
+    *calls_of("seed", lambda x: service_of(seed=x), None, "x", 0.5),
+    *calls_of("images", lambda x: service_of(images=x), BYTES, IMAGES, [1], "folder"),
+]
+
+
 CLASSIFIERS = [
     *calls_of(
         "function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES
@@ -1197,6 +1237,7 @@ SCORES = [
 ]
 
 CALLS = [
+    *DIRECT,
     *RENDERING,
     *CAMERAS,
     *LIGHTS,

@@ -83,9 +83,9 @@ class Adversary:
         return Scene([self.shown], rows, background, light, self.settings, rasterizer, basis=self.basis)
 
     @torch.no_grad()
-    def render(self, rasterizer: Rasterizer | None = None) -> Tensor:
+    def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
         """Render the images (V, 3, size, size) again; with the default rasterizer, unless another is given."""
-        rasterizer = rasterizer or choose("auto")
+        rasterizer = rasterizer if isinstance(rasterizer, Rasterizer) else choose(rasterizer or "auto")
         pixels = None if self.pixels is None else self.pixels[None]
         return self.scene(rasterizer).render(Conditions(self.light[None], pixels=pixels), torch.arange(1))[0]
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
 MAX_DEGREE = 20
+MAX_QUADRATURE = 10**4  # degree of a quadrature, whose directions are as many as its square
+MAX_TEXELS = 10**6  # texels on a side of an environment map
 ORTHONORMAL = 1e-3  # largest error of a product of rotation and its inverse, also of one that is written by hand
 Constant = TypeVar("Constant")
 
@@ -225,6 +227,8 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
 
     Gauss-Legendre in z and equal steps in azimuth; the weights sum to 4π.
     """
+    require_whole("degree", degree)
+    require_range("degree", degree, 0, MAX_QUADRATURE)
     z, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     radius = np.sqrt(1 - z**2)[:, None]
@@ -238,6 +242,9 @@ def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
 
     Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
     """
+    for name, count in (("height", height), ("width", width)):
+        require_whole(name, count)
+        require_range(name, count, 1, MAX_TEXELS)
     edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
     z = (edges[:-1] + edges[1:]) / 2  # the mean of z over a row's solid angle
     azimuth = math.pi - 2 * math.pi * (torch.arange(width, dtype=torch.float64) + 0.5) / width

@@ -47,7 +47,7 @@ def test_views_follow_from_examples_meshes_and_backgrounds():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"meshes": []}, "examples is empty"),
+        ({"meshes": []}, "meshes is empty"),
         ({"backgrounds": ()}, "backgrounds is empty"),
         ({"light": torch.zeros(7, 3)}, r"light has shape \(7, 3\): give \(\(degree \+ 1\)², 3\)"),
         ({"ground": [0.5, 2.0, 0.5]}, "ground=.* must be red, green and blue"),
