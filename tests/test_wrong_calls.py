@@ -1279,3 +1279,72 @@ def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
         call()
     sentence = str(refused.value)
     assert name in sentence and "\n" not in sentence, sentence
+
+
+@pytest.mark.parametrize("size", [SIZE, np.int64(SIZE), np.uint8(SIZE)])
+def test_whole_numbers_of_numpy_are_sizes(size):
+    assert torch.equal(render(size=size), render())
+
+
+def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():
+    expected = render(albedo_scale=0.5, cameras=renderer.OrthographicCamera(1.0, 2.0, 4.0))
+    for kind in (
+        int,
+        np.float32,
+        np.float64,
+        np.int64,
+        torch.tensor,
+        lambda value: np.array([value]),
+    ):
+        camera = renderer.OrthographicCamera(kind(1.0), kind(2.0), kind(4.0))
+        assert torch.equal(render(albedo_scale=np.float32(0.5), cameras=camera), expected)
+
+
+def test_gradients_reach_fields_of_cameras_and_lists_of_tensors():
+    polar = torch.tensor([1.0], requires_grad=True)
+    rows = [row.clone().requires_grad_() for row in LIGHT]
+    camera = renderer.OrthographicCamera(polar, 0.5, 4.0)
+    image = render(cameras=camera, light=rows, silhouettes=True, samples=4)
+    gradients = torch.autograd.grad(image.sum(), [polar, *rows[:4]])
+    assert gradients[0].shape == (1,)
+    assert all(gradient.any() for gradient in gradients[:2])
+
+
+def test_logits_are_not_taken_for_probabilities():
+    """A single image, outputs beyond [0, 1], sums of 2 and single classes are no proof of a softmax."""
+    one_image = augment.Classifier(probabilities, SIZE, CLASSES)
+    one_image(IMAGES[:1])
+    with pytest.raises(InputError, match="logits"):
+        one_image(IMAGES[:1])  # the second image proves it
+    returning(torch.tensor([[0.2, 0.8], [0.3, 0.9], [0.2, 0.8]]))(IMAGES)
+    returning(torch.tensor([[1.2, -0.2]] * 3))(IMAGES)
+    augment.Classifier(lambda images: torch.ones(len(images), 1), SIZE, ["orange"])(IMAGES)
+    returning(bright_or_dark(IMAGES).log_softmax(1))(IMAGES)
+
+
+def test_a_network_that_returned_logits_may_return_what_looks_like_probabilities():
+    answers = [torch.tensor([[2.0, -1.0]] * 3), torch.tensor([[0.2, 0.8]] * 3)]
+    classifier = augment.Classifier(lambda images: answers.pop(0), SIZE, CLASSES)
+    classifier(IMAGES)
+    classifier(IMAGES)
+    assert not answers
+
+
+def test_images_may_exceed_their_range_as_interpolation_and_noise_do():
+    assert CLASSIFIER(IMAGES * 1.1 - 0.05).shape == (3, 2)
+
+
+def test_a_state_is_restored_into_the_same_scene_alone():
+    service = small_service()
+    service.regenerate(LINEAR, 0)
+    state = service.state_dict()
+    resumed = small_service()
+    resumed.load_state_dict(state)
+    assert torch.equal(resumed.regenerate(LINEAR, 1).images, service.regenerate(LINEAR, 1).images)
+    longer = replace(MESH, vertices=MESH.vertices * [1.0, 1.0, 1.5])
+    others = [{"meshes": [(longer, 0)]}, {"light": 1.5 * LIGHT}, {"backgrounds": [0.1] * 5}]
+    for changed in others:
+        given: dict[str, Any] = {"meshes": [(MESH, 0)], "size": SIZE, "views": 1, "samples": 1}
+        other = augment.AugmentationService.from_meshes(**given | changed)
+        with pytest.raises(InputError, match="another scene"):
+            other.load_state_dict(state)
