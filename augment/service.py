@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
@@ -210,10 +209,10 @@ class AugmentationService:
                 f"labels has shape {tuple(self.labels.shape)}: give one of each of {len(self.scene)} examples"
             )
         if self.images is not None:
-            images = as_array("images", self.images)
-            if images.dtype != np.uint8 or images.ndim != 4 or len(images) != len(self.labels):
-                raise InputError(f"images is {describe(images)}: give bytes (E, 3, H, W), one for each label")
-            self.images = torch.as_tensor(self.images)
+            if not isinstance(self.images, Tensor):
+                self.images = torch.from_numpy(as_array("images", self.images))
+            if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
+                raise InputError(f"images is {describe(self.images)}: give bytes (E, 3, H, W), one for each label")
         source = "images" if self.settings.arm == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
             raise InputError(

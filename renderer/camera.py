@@ -28,7 +28,8 @@ class Camera(ABC):
     width: width of the image in world units, at the origin; a normalized mesh spans at most [-1, 1] per axis.
     right, up: the origin's position in the image, in world units from the middle. reach: the depth along the view, in
     world units to either side of the origin, within which surfaces are visible. distance: of the camera from the
-    origin. InputError: a width or distance that is not positive, values that are not finite or too large.
+    origin. Fields may be tensors, arrays or lists of one number. InputError: a width or distance that is not positive,
+    values that are not finite or too large, a polar angle beyond two turns.
     """
 
     polar: float

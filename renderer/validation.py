@@ -251,7 +251,7 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
     Raises:
         InputError: If a field holds a value of another type.
     """
-    for name, hint in _field_hints(type(settings)).items():
+    for name, hint in _field_hints(type(settings)).items():  # type: ignore[arg-type]  # types are hashable
         value = getattr(settings, name)
         if name not in unchecked and not _fits(value, hint):
             raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}")

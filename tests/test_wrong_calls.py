@@ -1099,7 +1099,6 @@ CLASSIFIERS = [
     *calls_of("float16", lambda x: attack(x, force=True), half_network()),
     *calls_of("label", CLASSIFIER.label, 3, None, ["orange"], 0.5),
     *calls_of("pear", CLASSIFIER.label, "pear"),
-    *calls_of("images", CLASSIFIER.detect, BYTES, None),
     *calls_of("operating point", CLASSIFIER.detect, IMAGES),
     *calls_of("label", lambda x: CLASSIFIER.detect(IMAGES, x), 3, ["orange"]),
     *calls_of("name", augment.load_classifier, None, 3, LINEAR, ["timm:resnet18"], Path("a.pth")),

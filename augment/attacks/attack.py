@@ -194,7 +194,8 @@ def attack(
     the class of each image's lowest confidence. settings: what is changed, within which norm-balls; by default the
     light, without a limit. seed: of the restarts. force: also attack what the classifier gets wrong before. The scene
     lies on the classifier's device.
-    InputError where an example is misclassified before, the classifier lacks a class, or a target is the right one.
+    InputError where an argument is of another type, an example is misclassified before, the classifier lacks a class,
+    or a target is the right one.
 
     >>> def logits(images):
     ...     mean = images.mean((1, 2, 3))

@@ -152,14 +152,16 @@ class Classifier(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
-        """InputError for images of another size, and for a callable that fails or returns something else than finite
-        logits with a gradient."""
+        """InputError for images of another size or far from [0, 1], and for a callable that fails or returns something
+        else than finite logits with a gradient, such as probabilities."""
         name, size = f"classifier={self.name}", self.size
         images = as_images("images", images)
         if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
             raise InputError(f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}")
+        extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
+        require_unit_range("images", *extremes)  # only now, since the host waits here for a GPU
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
@@ -172,7 +174,6 @@ class Classifier(nn.Module):
         label: the class, where there are operating points of several. InputError without one, and as of `forward`.
         """
         require_kind("label", label, str | None, "the name of a class")
-        images = as_images("images", images)
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
@@ -193,24 +194,28 @@ class Classifier(nn.Module):
 
 
 def as_images(name: str, images: object) -> Tensor:
-    """Convert images to a tensor of RGB in [0, 1], which values may exceed a little.
+    """Convert images to a tensor of floating-point numbers; InputError for bytes and for what is no number."""
+    if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
+        raise InputError(f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255")
+    return as_tensor(name, images)
+
+
+def require_unit_range(name: str, *extremes: Tensor) -> None:
+    """Check that images are RGB in [0, 1], which values may exceed a little.
 
     Args:
         name: Name of the argument, for the error.
-        images: Tensor, array or nested lists of floating-point numbers.
+        extremes: The lowest and the highest value; none of no images.
 
     Raises:
-        InputError: If it is anything else, or if values are far from [0, 1]: bytes, normalized images, or NaN.
+        InputError: If values are far from [0, 1], as of bytes and of normalized images, or NaN.
     """
-    if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
-        raise InputError(f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255")
-    values = as_tensor(name, images)
-    if values.numel():
-        low, high = (extreme.item() for extreme in torch.aminmax(values.detach()))
-        if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-            remedy = "give RGB in [0, 1], not normalized; divide bytes by 255"
-            raise InputError(f"{name} holds values from {low:g} to {high:g}: {remedy}")
-    return values
+    if not extremes:
+        return
+    low, high = torch.stack(extremes).tolist()
+    if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
+        remedy = "give RGB in [0, 1], not normalized; divide bytes by 255"
+        raise InputError(f"{name} holds values from {low:g} to {high:g}: {remedy}")
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
