@@ -278,6 +278,8 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
 
 def load_background(choice: float | str | Path, size: int, name: str = "backgrounds") -> Tensor:
     """A gray value (1, size, size), or an image's center square (3, size, size), in [0, 1]. name: for errors."""
+    if isinstance(choice, bool):
+        raise InputError(f"{name}={choice}: give gray values in [0, 1] or image files")
     try:
         gray = float(choice)  # type: ignore[arg-type]  # of a path it raises
     except (ValueError, TypeError, OverflowError):

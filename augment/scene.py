@@ -23,7 +23,7 @@ from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transfer import build_operators
-from renderer.validation import as_integers, as_list, as_tensor, require_kind
+from renderer.validation import as_integers, as_list, as_tensor, describe, require_kind
 from renderer.views import InPlace, OperatorStack
 
 if TYPE_CHECKING:
@@ -109,6 +109,10 @@ class Scene:
 
     def __post_init__(self) -> None:
         require_kind("settings", self.settings, ImageSettings, "renderer.ImageSettings(size)")
+        require_kind("basis", self.basis, Basis, "a basis of light, such as Harmonics(degree)")
+        require_kind("camera_effects", self.camera_effects, Callable | None, "a function of images and examples")
+        if not hasattr(self.rasterizer, "rasterize"):
+            raise InputError(f"rasterizer is {describe(self.rasterizer)}: give renderer.rasterizer.choose(name)")
         self.objects = as_list("objects", self.objects, SceneObject, "a list of scene objects")
         self.examples = as_list("examples", self.examples, Example, "a list of examples")
         self.lights = as_tensor("lights", self.lights)

@@ -26,7 +26,7 @@ from renderer.fragments import Fragments
 from renderer.light.harmonics import unit
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
-from renderer.validation import as_tensor
+from renderer.validation import as_tensor, require_flag
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -57,6 +57,7 @@ class Gloss:
 
     def checked(self, faces: int) -> list[Tensor]:
         """Roughness, metallic and strength as tensors (1,) or (F,), of so many faces. InputError: as `on`."""
+        require_flag("textured", self.textured)
         checked = []
         for name in ("roughness", "metallic", "strength"):
             given = getattr(self, name)

@@ -189,12 +189,13 @@ def view_with_outlines(
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     """A local light with its coefficients (size, 3); without them it shines white, at its full power."""
-    if isinstance(light, LocalBasis):
-        return light, torch.full((light.size, 3), light.power)
-    if len(light) != 2 or not isinstance(light[0], LocalBasis):
-        raise InputError(f"lights holds {describe(light)}: give {_LOCAL_LIGHTS}")
-    basis = light[0]
-    values = as_tensor("lights: coefficients", light[1])
+    pair = (light, None) if isinstance(light, LocalBasis) else light
+    if len(pair) != 2 or not isinstance(pair[0], LocalBasis):
+        raise InputError(f"lights holds {describe(pair)}: give {_LOCAL_LIGHTS}")
+    basis, given = pair
+    if given is None:
+        return basis, torch.full((basis.size, 3), basis.power)
+    values = as_tensor("lights: coefficients", given)
     if values.shape != (basis.size, 3):
         raise InputError(f"lights: {basis} has coefficients of shape {tuple(values.shape)}, give {(basis.size, 3)}")
     require_bounded(lights=values)

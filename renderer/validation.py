@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import reprlib
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -153,14 +153,14 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
 
     Args:
         name: Name of the argument, for the error.
-        value: List, tuple or another iterable, but no string and no mapping.
+        value: List, tuple or another ordered iterable, but no string, mapping or set.
         kind: Type of the items, or a tuple of types.
         expected: What to give, for the error.
 
     Raises:
         InputError: If the value is no list, or an item is of another type.
     """
-    if isinstance(value, str | bytes | Mapping | Tensor) or not isinstance(value, Iterable):
+    if isinstance(value, str | bytes | Mapping | Set | Tensor) or not isinstance(value, Iterable):
         raise InputError(f"{name} is {describe(value)}: give {expected}")
     items = list(value)
     for index, item in enumerate(items):
@@ -309,7 +309,7 @@ def describe(value: object) -> str:
         return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
     if value is None or isinstance(value, str | bytes | bool | int | float | complex | np.generic):
         return " ".join(reprlib.repr(value).split())
-    if isinstance(value, list | tuple | dict):
+    if isinstance(value, list | tuple | dict | Set):
         return f"the {type(value).__name__} " + " ".join(reprlib.repr(value).split())
     if isinstance(value, type):
         return f"the class {value.__name__}"

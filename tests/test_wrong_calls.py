@@ -1013,6 +1013,14 @@ def returning(value: Any) -> augment.Classifier:
 
 
 DIRECT = [
+    *calls_of("rasterizer", lambda x: replace(small_scene(), rasterizer=x), "numpy", None),
+    *calls_of("basis", lambda x: replace(small_scene(), basis=x), "harmonics", None, 6),
+    *calls_of("camera_effects", lambda x: replace(small_scene(), camera_effects=x), 3, "blur"),
+    *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
+    *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes", None),
+    *calls_of(
+        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
+    ),
     *calls_of("degree", harmonics.quadrature, "x", 2.5, -1, None),
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, None, 4.5),
     *calls_of("examples", lambda x: small_scene().conditions(x), "all", None, [9], 0, [0.5]),
