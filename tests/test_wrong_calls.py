@@ -21,6 +21,7 @@ from augment.service import RandomLightSettings
 from augment.utils import Phases
 from renderer import InputError, harmonics, skylight
 from renderer.light.local import Lamps, Projector
+from renderer.validation import describe
 from train import load_run
 from train.photographs.scoring import evaluate_photographs
 
@@ -128,7 +129,8 @@ def calls_of(
 
 
 def _title(value: object) -> str:
-    return f"{type(value).__name__} {str(value)[:30]}".replace("\n", " ")
+    """Name a value without the address of an object, which differs between processes."""
+    return describe(value)[:60]
 
 
 RENDERING = [
