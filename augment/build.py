@@ -129,7 +129,7 @@ class SceneSettings:
     ground: list[float] | None = None
 
     def __post_init__(self) -> None:
-        require_field_types(self, "light")
+        require_field_types(self, "light", "vertices")
         require_range("exposure", self.exposure, 0, FACTOR)
         require_range("degree", self.degree, 0, MAX_DEGREE)
         require_range("views", self.views, 1, MOST_VIEWS)

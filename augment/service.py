@@ -32,6 +32,7 @@ from renderer.validation import (
     as_array,
     as_integers,
     as_list,
+    as_path,
     as_tensor,
     describe,
     require_field_types,
@@ -108,7 +109,9 @@ class AugmentationSettings:
     def __post_init__(self) -> None:
         require_choice("arm", self.arm, ARMS)
         require_kind("attack", self.attack, AttackSettings, "the settings of an attack")
-        require_field_types(self, "attack")
+        require_field_types(self, "attack", "folder")
+        if self.folder is not None:
+            as_path("folder", self.folder)
         if not self.attack.parameters:
             raise InputError("attack changes nothing: give TrainingAttackSettings(), or name a parameter")
         require_choice("init", self.init, INITS)

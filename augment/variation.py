@@ -26,7 +26,7 @@ from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
 from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
-from renderer.validation import require_field_types
+from renderer.validation import as_list, as_path, require_field_types
 
 UNCHANGED, NONE = (1.0, 1.0), (0.0, 0.0)
 WIDEST = 45.0  # degrees, of a lens that a normalized mesh is in front of
@@ -89,7 +89,10 @@ class VariationSettings:
     camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
 
     def __post_init__(self) -> None:
-        require_field_types(self)
+        require_field_types(self, "backgrounds", "environments")
+        if self.backgrounds is not None:
+            as_path("backgrounds", self.backgrounds)
+        as_list("environments", self.environments, str | Path, "a list of lights, as load_light takes them")
         fractions = {name: 1 for name in ("shift", "directional_fraction", "tables", "background_saturation")}
         for name, most in (fractions | {"azimuth": 180, "rotation": 180}).items():
             require_range(name, getattr(self, name), 0, most)

@@ -99,7 +99,11 @@ class Mesh:
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
         """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
-        faces = np.array(as_array("faces", faces, "iu"), dtype=np.int64)
+        corners = as_array("faces", faces)
+        with np.errstate(invalid="ignore"):  # NaN is refused below
+            faces = corners.astype(np.int64)
+        if not np.array_equal(faces, corners):
+            raise InputError("faces holds numbers that are not whole: give indices of vertices")
         color = as_array("color", color).astype(np.float32)
         if not color.size or not (color.min() >= 0 and color.max() <= 1):
             raise InputError(f"color={reprlib.repr(color.tolist())}: give red, green and blue from 0 to 1")
@@ -338,7 +342,8 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     (True, 0)
     """
     require_mesh("mesh", mesh)
-    require_whole("vertices", vertices)
+    is_whole_float = isinstance(vertices, float) and vertices.is_integer()  # such as 1e4
+    require_whole("vertices", int(vertices) if is_whole_float else vertices)
     require_range("vertices", vertices, 0, MOST_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)

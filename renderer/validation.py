@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -160,7 +160,8 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
     Raises:
         InputError: If the value is no list, or an item is of another type.
     """
-    if isinstance(value, str | bytes | Mapping | Set | Tensor) or not isinstance(value, Iterable):
+    without_items = isinstance(value, Tensor | np.ndarray) and not value.ndim
+    if without_items or isinstance(value, str | bytes | Mapping | Set) or not isinstance(value, Iterable):
         raise InputError(f"{name} is {describe(value)}: give {expected}")
     items = list(value)
     for index, item in enumerate(items):
@@ -198,6 +199,11 @@ def is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
+def is_flag(value: object) -> bool:
+    """Tell whether a value is True or False, or 1 or 0 in their place."""
+    return isinstance(value, bool | np.bool_) or (is_whole(value) and value in (0, 1))
+
+
 def require_whole(name: str, value: object) -> None:
     """Check that an argument is a whole number.
 
@@ -225,7 +231,8 @@ def require_flag(name: str, value: object) -> None:
     Raises:
         InputError: If it is anything else.
     """
-    require_kind(name, value, bool | np.bool_, "True or False")
+    if not is_flag(value):
+        raise InputError(f"{name} is {describe(value)}: give True or False")
 
 
 def require_seed(name: str, value: object) -> None:
@@ -274,9 +281,10 @@ def _fits(value: object, hint: Any) -> bool:
         return any(_fits(value, option) for option in get_args(hint))
     if origin is list:
         (item_hint,) = get_args(hint)
-        if isinstance(value, str) or not isinstance(value, Sequence):
+        has_items = isinstance(value, Tensor | np.ndarray) and value.ndim > 0
+        if isinstance(value, str) or not (has_items or isinstance(value, Sequence)):
             return False
-        return item_hint is Any or all(_fits(item, item_hint) for item in value)
+        return item_hint is Any or all(_fits(item, item_hint) for item in cast(Iterable[Any], value))
     return isinstance(value, origin or hint)
 
 
@@ -284,7 +292,7 @@ _PLAIN: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
     int: is_whole,
     float: is_number,
-    bool: lambda value: isinstance(value, bool | np.bool_),
+    bool: is_flag,
     str: lambda value: isinstance(value, str),
     type(None): lambda value: value is None,
 }

@@ -1309,6 +1309,16 @@ def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():
         assert torch.equal(render(albedo_scale=np.float32(0.5), cameras=camera), expected)
 
 
+def test_ones_whole_floats_and_paths_pass_where_they_always_did():
+    assert torch.equal(render(shadows=1), render(shadows=True))
+    assert len(renderer.subdivide(MESH, 1e1).vertices) > 10
+    assert scene(vertices=1e1).vertices.shape[1] > 10
+    augment.VariationSettings(backgrounds=Path("photos"), environments=[Path("a.hdr")])  # type: ignore[arg-type]
+    assert renderer.Mesh.plain(MESH.vertices, MESH.faces.astype(float)).faces.dtype == np.int64
+    assert scene(ground=np.array([0.5, 0.5, 0.5]), backgrounds=torch.tensor([0.2, 0.4])).views == 1
+    assert skylight.coefficients([0.25, 0.5], 0.5, 3.0).dtype == torch.float64
+
+
 def test_gradients_reach_fields_of_cameras_and_lists_of_tensors():
     polar = torch.tensor([1.0], requires_grad=True)
     rows = [row.clone().requires_grad_() for row in LIGHT]

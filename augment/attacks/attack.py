@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -248,7 +249,8 @@ def target_labels(
     else:
         known = is_whole(target) and 0 <= int(target) < len(classifier.classes)  # type: ignore[call-overload]
         example = classifier.classes[target] if known else classifier.classes[0]  # type: ignore[call-overload]
-        names = as_list("target", target, str, f"the name of a class, such as {example!r}, or a name for each view")
+        advice = f"the name of a class, such as {example!r}, or a name for each view"
+        names = [str(name) for name in as_list("target", target, str | Integral, advice)]
     if len(names) != views:
         counts = f"{len(names)} classes for {views} views that share what is attacked"
         raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")

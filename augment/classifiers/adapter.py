@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -21,7 +22,7 @@ from torch import Tensor, nn
 from augment.losses import log_odds
 from renderer.errors import InputError, in_one_line, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
-from renderer.validation import as_list, as_tensor, describe, require_kind, require_whole
+from renderer.validation import as_list, as_tensor, describe, is_whole, require_kind, require_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -98,7 +99,8 @@ class NetworkCall:
         reason = f"{self.name} fails on {given} ({type(error).__name__}: {in_one_line(error)})"
         if dtypes and images.dtype not in dtypes:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
-            return f"{reason}: its weights are {of_weights}, convert it with network.to({images.dtype})"
+            remedy = f"convert it with network.to({images.dtype}), or the light of the scene to {of_weights}"
+            return f"{reason}: its weights are {of_weights}, {remedy}"
         return f"{reason}: make it take these"
 
     def _require_no_probabilities(self, logits: Tensor) -> None:
@@ -260,7 +262,9 @@ class Normalized(nn.Module):
 
 def label_names(label: Label) -> list[str]:
     """The classes under study. InputError: none, or one twice."""
-    names = as_list("label", [label] if isinstance(label, str) else label, str, "the name of a class, or several")
+    listed = [label] if isinstance(label, str) or is_whole(label) else label
+    named = as_list("label", listed, str | Integral, "the name of a class, or several")
+    names = [str(name) for name in named]  # settings may read the name of a digit as a number
     if not names or len(set(names)) < len(names):
         raise InputError(f"label=[{', '.join(names)}] must name a class, or several, each once")
     return names

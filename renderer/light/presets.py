@@ -64,7 +64,8 @@ def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
     >>> bool((load_light("uniform")[1:] == 0).all())  # the same radiance from everywhere
     True
     """
-    light = str(as_path("light", light))
+    as_path("light", light)
+    light = str(light)
     if degree is not None:
         require_degree(degree)
     suffix = Path(light).suffix.lower()

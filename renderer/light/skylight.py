@@ -83,8 +83,10 @@ def _committed_fit() -> Tensor:
 
 def _checked(zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float) -> list[Tensor]:
     """The parameters as tensors of the dtype and on the device of the first floating one; numbers alone as float64."""
-    given = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
-    values = [value if is_number(value) else as_tensor(name, value) for name, value in given.items()]
+    for name, value in (("zenith", zenith), ("azimuth", azimuth), ("turbidity", turbidity)):
+        if not is_number(value):
+            as_tensor(name, value)  # or InputError
+    values = (zenith, azimuth, turbidity)
     floating = (value for value in values if isinstance(value, Tensor) and value.is_floating_point())
     like = next(floating, torch.zeros((), dtype=torch.float64))
     zenith, azimuth, turbidity = (torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in values)
