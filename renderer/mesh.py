@@ -329,7 +329,7 @@ def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
     )
 
 
-def subdivide(mesh: Mesh, vertices: int) -> Mesh:
+def subdivide(mesh: Mesh, vertices: float) -> Mesh:
     """The same surface with more vertices than `vertices`: every face is divided into four until there are enough.
 
     New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
