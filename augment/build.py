@@ -130,7 +130,7 @@ class SceneSettings:
 
     def __post_init__(self) -> None:
         require_field_types(self, "light", "vertices")
-        require_range("exposure", self.exposure, 0, FACTOR)
+        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("degree", self.degree, 0, MAX_DEGREE)
         require_range("views", self.views, 1, MOST_VIEWS)
         require_range("vertices", self.vertices, 0, MOST_VERTICES)

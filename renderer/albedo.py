@@ -84,7 +84,11 @@ def painted_albedo(
     """
     offset, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
     angles = None if hue is None else hue.index_select(0, fragments.faces)
-    of_corners, of_samples = (None, None) if angles is None else (angles[:, None], angles[fragments.face])
+    # index_select, since the gradient of an index in brackets adds in another order each time on several threads
+    of_corners, of_samples = None, None
+    if angles is not None:
+        of_corners = angles[:, None]
+        of_samples = angles.index_select(0, fragments.face)
     corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * albedo_scale
     albedo = fragments.interpolate(changed_albedo(corners, of_corners, added.index_select(0, fragments.faces)[:, None]))
     if not mesh.textures:
@@ -95,9 +99,10 @@ def painted_albedo(
     for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
         here = torch.nonzero(texture_ids == index).squeeze(1)
         taps = _taps(texture, uvs[:, here])
-        turn = None if of_samples is None else of_samples[here]
+        turn = None if of_samples is None else of_samples.index_select(0, here)
+        painted = offset.index_select(0, here)
         texels = [(weight.to(added), colors[here] * texture.texels(at).T) for weight, at in taps]
-        changed = (weight[:, None] * changed_albedo(texel, turn, offset[here]) for weight, texel in texels)
+        changed = (weight[:, None] * changed_albedo(texel, turn, painted) for weight, texel in texels)
         albedo = albedo.index_copy(0, here, reduce(torch.add, changed))
     return albedo
 

@@ -21,7 +21,7 @@ from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError, require_range
 from renderer.fitting import fit_scene
 from renderer.image import MOST_BOUNCES, decode
-from renderer.io.images import read_rgb
+from renderer.io.images import read_rgb, write_image
 from renderer.light.presets import save_light
 from renderer.rendering import render
 from train.errors import writable_folder
@@ -74,13 +74,14 @@ def main(settings: Settings) -> None:
     center = center + np.array([camera.right, -camera.up]) / camera.width * side
     background = cropped(image, center, side, DETAIL)
     out.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(background).save(out / "background.png")
+    write_image(out / "background.png", Image.fromarray(background))
     save_light(out / "light.json", found.light)
     centered = replace(camera, right=0.0, up=0.0)
     behind = as_tensor(background).double()
     shown = render(mesh, centered, found.light, DETAIL, behind, samples=4, encoding="srgb", **shared)[0]
     pair = torch.cat([behind, shown], dim=2)
-    Image.fromarray((pair * 255).round().byte().permute(1, 2, 0).numpy()).save(out / "comparison.png")
+    side_by_side = (pair * 255).round().byte().permute(1, 2, 0)
+    write_image(out / "comparison.png", Image.fromarray(side_by_side.numpy()))
     print(f"outlines overlap by {found.overlap:.1%}; the object's pixels differ by {found.error:.1%}")
     if found.overlap < DOUBTFUL or found.error > WRONG:
         print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")

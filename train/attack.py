@@ -1,6 +1,7 @@
 """The attack command: its settings, which are the schema of conf/attack.yaml, the run over meshes, and its output."""
 
 import csv
+import io
 import json
 import re
 import shlex
@@ -26,6 +27,7 @@ from augment.scene import Scene
 from augment.utils import generator
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
+from renderer.io.files import write_whole
 from train.device import choose_device
 from train.errors import writable_folder
 from train.run_folder import sole_writer, write_config
@@ -282,7 +284,7 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
         kind = next(iter(found))
         lines.append(json.dumps({kind: found[kind], **rate, **found}) + "\n")
         rows.append([f"{kind} {found[kind]}", f"{rate['n']} of {len(clean)}", format_fraction(rate)])
-    path.write_text("".join(lines), encoding="utf-8")
+    write_whole(path, "".join(lines))
     return str(Table("", ["adversaries shown to", "correct before", "success"], rows))
 
 
@@ -314,10 +316,11 @@ def write_sweeps(sweeps: Mapping[str, Sequence[Mapping[str, Any]]], norms: Mappi
         for method in METHODS
         for row in sweep
     ]
-    with open(out / TABLE, "w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, list(records[0]))
-        table.writeheader()
-        table.writerows(records)
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(records[0]))
+    table.writeheader()
+    table.writerows(records)
+    write_whole(out / TABLE, text.getvalue())
     _draw([record for record in records if record["mesh"] == records[-1]["mesh"] and record["n"]], norms, out / FIGURE)
 
 
@@ -343,4 +346,6 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
     if records:
         axes.set_title(f"{records[0]['n']} examples correct before, 95 % intervals", fontsize=10)
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    figure.savefig(path, dpi=150)
+    image = io.BytesIO()
+    figure.savefig(image, dpi=150)
+    write_whole(path, image.getbuffer())

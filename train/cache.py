@@ -6,7 +6,6 @@ damaged or deleted at any time, and processes may share the folder.
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from renderer.io.files import write_whole
 from train import console
 from train.checkpoint import content_hash
 
@@ -60,10 +60,7 @@ class TensorCache:
         content = safetensors.torch.save(dict(tensors))
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=self.folder) as temporary:
-                file = Path(temporary) / key
-                file.write_bytes(_checksum(key, content) + content)
-                os.replace(file, self.folder / key)
+            write_whole(self.folder / key, _checksum(key, content) + content)
         except OSError as error:
             console.warning(f"images and predictions are not cached: {error}")
             self.writable = False

@@ -6,7 +6,6 @@ what rebuilds it (`train.networks.describe`); and the `epoch`. last.pt has all o
 
 import hashlib
 import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,40 +14,18 @@ import torch
 from torch import Tensor, cuda
 
 from renderer.errors import InputError, require_file
+from renderer.io.files import write_whole
 
 LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
 HASH = "sha256"
 VERSION = 2  # of the stored architecture; version 1 had neither size nor normalization nor encoding
 
 
-def write_whole(path: Path, content: bytes | memoryview, previous: Path | None = None) -> None:
-    """Write a file so that at any moment, also after a loss of power, either the old or the new one is there.
-
-    previous: where the old file is kept. OSError that names the path where the disk refuses it; the old file stays.
-    """
-    temporary = path.with_suffix(".tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if previous and path.exists():
-            os.replace(path, previous)
-        os.replace(temporary, path)
-        if os.name == "posix":  # make the renaming last
-            folder = os.open(path.parent, os.O_RDONLY)
-            os.fsync(folder)
-            os.close(folder)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
     """Write tensors and plain values with `write_whole`."""
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
-    write_whole(path, content.getbuffer(), previous)
+    write_whole(path, content.getbuffer(), durable=True, previous=previous)
 
 
 def load(path: Path) -> dict[str, Any]:

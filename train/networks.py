@@ -21,8 +21,9 @@ from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
+from renderer.io.files import write_whole
 from renderer.validation import as_path, require_kind
-from train.checkpoint import BEST, VERSION, checked, load, write_whole
+from train.checkpoint import BEST, VERSION, checked, load
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
@@ -217,7 +218,7 @@ def export(path: Path, network: nn.Module) -> None:
     """Write the weights of a network that began with a classifier, under the names of its own file."""
     content = io.BytesIO()
     torch.save({name: value.cpu() for name, value in without_normalization(network).state_dict().items()}, content)
-    write_whole(path, content.getbuffer())
+    write_whole(path, content.getbuffer(), durable=True)
 
 
 def without_normalization(network: nn.Module) -> nn.Module:
@@ -302,7 +303,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
     """Write a checkpoint's network as half-precision safetensors, with its architecture and other facts as metadata."""
     model, metadata = state["model"], {key: json.dumps(state[key], ensure_ascii=False) for key in META if key in state}
     weights = {name: value.half().contiguous() if value.is_floating_point() else value for name, value in model.items()}
-    write_whole(path, safetensors.torch.save(weights, metadata))
+    write_whole(path, safetensors.torch.save(weights, metadata), durable=True)
 
 
 def _load_published(path: Path) -> dict[str, Any]:

@@ -26,9 +26,10 @@ from torch.nn.functional import interpolate
 from augment.service import AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
+from renderer.io.files import remove_unfinished, write_whole
+from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
-from train.checkpoint import write_whole
 from train.networks import selected_file
 from train.settings import ExperimentSettings, dotted, mapped
 
@@ -58,6 +59,8 @@ def locked(folder: Path) -> Iterator[bool]:
     lock = FileLock(folder / LOCK)
     with suppress(Timeout):
         lock.acquire(blocking=False)
+    if lock.is_locked:
+        remove_unfinished(folder)
     try:
         yield lock.is_locked
     finally:
@@ -129,7 +132,8 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
                 facts["working_folder"] = before.get("working_folder") or os.getcwd()
     facts = {name: fact for name, fact in facts.items() if "${" not in str(fact)}
     content = {**asdict(settings), **facts, "inputs": fingerprints(settings), "versions": versions}
-    write_whole(folder / CONFIG, yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    write_whole(folder / CONFIG, text.encode(), durable=True)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -258,7 +262,7 @@ class RunLog:
         from torch.utils.tensorboard import SummaryWriter  # half a second, which readers of metrics are spared
 
         self._metrics, self._renders, self._epochs = folder / METRICS, folder / "renders", len(history)
-        self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
+        write_whole(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
         self._board = SummaryWriter(str(folder), purge_step=self._epochs + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
@@ -281,7 +285,7 @@ class RunLog:
         grid = make_grid(to_bytes(images.cpu()), nrow=20, padding=1, pad_value=255)
         self._renders.mkdir(exist_ok=True)
         path = self._renders / f"epoch_{epoch:03d}.png"
-        Image.fromarray(grid.permute(1, 2, 0).numpy()).save(path, compress_level=1)
+        write_image(path, Image.fromarray(grid.permute(1, 2, 0).numpy()), compress_level=1)
         self._board.add_image("renders", grid, epoch)
 
     def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
@@ -297,4 +301,5 @@ class RunLog:
             spheres = (light_sphere(light, EXAMPLE // 2, basis=attack_examples.basis) for light in lights)
             columns[f"light {name}"] = tiles_of(spheres)
         self._renders.mkdir(exist_ok=True)
-        draw_grid([*zip(*columns.values(), strict=True)], [*columns]).save(self._renders / f"attacks_{epoch:03d}.png")
+        grid = draw_grid([*zip(*columns.values(), strict=True)], [*columns])
+        write_image(self._renders / f"attacks_{epoch:03d}.png", grid)

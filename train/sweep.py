@@ -19,6 +19,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
+from renderer.io.files import write_whole
 from train import checkpoint, console
 from train.errors import one_sentence, writable_folder
 from train.report.compare import format_table
@@ -113,7 +114,7 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
             console.error("failed: %s", reason, exc_info=None if sentence else error)
             with suppress(OSError):  # on a full disk only the console has it
-                (folder / FAILURE).write_text(f"{reason}\n", encoding="utf-8", errors="backslashreplace")
+                write_whole(folder / FAILURE, f"{reason}\n")
 
 
 def _unescaped(override: str) -> str:

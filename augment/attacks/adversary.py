@@ -20,7 +20,8 @@ from renderer.errors import FACTOR, InputError, in_one_line, require_bounded, re
 from renderer.gloss import Gloss
 from renderer.image import ImageSettings, to_bytes
 from renderer.io.export import export_mesh
-from renderer.io.images import read_numbers
+from renderer.io.files import write_whole
+from renderer.io.images import read_numbers, write_image, write_numbers
 from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Basis, LocalBasis, parts_of, with_local_lights
@@ -123,12 +124,12 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "pixels": adversary.pixels is not None,
     }
     if adversary.pixels is not None:
-        np.save(folder / PIXELS, adversary.pixels.numpy())
+        write_numbers(folder / PIXELS, adversary.pixels.numpy())
     for name, images in ((BEFORE, adversary.images_before), (AFTER, adversary.images)):
-        np.save(folder / f"{name}.npy", images.numpy())
+        write_numbers(folder / f"{name}.npy", images.numpy())
         for view, image in enumerate(to_bytes(images)):
-            Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / f"{name}_{view}.png")
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+            write_image(folder / f"{name}_{view}.png", Image.fromarray(image.permute(1, 2, 0).numpy()))
+    write_whole(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
     radiance = to_map(light, MAP_HEIGHT)
     if radiance.min() >= -NOWHERE * radiance.max():
         for suffix in (".hdr", ".exr"):
@@ -200,7 +201,8 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
     gray = float(background.flatten()[0])
     if (background == gray).all():
         return gray
-    Image.fromarray(to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0).numpy()).save(folder / BACKGROUND)
+    pixels = to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0)
+    write_image(folder / BACKGROUND, Image.fromarray(pixels.numpy()))
     return BACKGROUND
 
 

@@ -16,6 +16,8 @@ from augment.attacks.evaluate import CHECKED, warnings
 from augment.utils import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
 from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rasterizer import Rasterizer
@@ -60,7 +62,7 @@ def save(
     before, after, lines = problem.conditions(problem.start, problem.everything), result.conditions, []
     stems = [folder / f"example_{example:03d}" for example in range(len(result.images))]
     for example, stem in enumerate(progress(stems, "saving")):
-        figure(result, example).save(stem.with_suffix(".png"))
+        write_image(stem.with_suffix(".png"), figure(result, example))
         images = result.images_before[example], result.images[example]
         light = write_adversary(Adversary.of(scene, example, after, *images), stem)
         started = before.light[example].cpu() * scene.examples[example].exposure
@@ -70,7 +72,7 @@ def save(
     for example, line in enumerate(lines):
         line["versions"] = {name: numbers[example] for name, numbers in versions.items()}
     last = [] if checks is None else [{"checks": checks, "warnings": warnings(checks)}]
-    (folder / LINES).write_text("".join(json.dumps(line) + "\n" for line in [*lines, *last]), encoding="utf-8")
+    write_whole(folder / LINES, "".join(json.dumps(line) + "\n" for line in [*lines, *last]))
     return lines
 
 

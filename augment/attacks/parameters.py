@@ -17,7 +17,7 @@ from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import progress, rotation_matrices
 from renderer.camera import PerspectiveCamera
-from renderer.errors import InputError, require_range
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
@@ -38,6 +38,12 @@ class SkylightSettings(StepSettings):
     zenith: float = 45.0
     azimuth: float = 0.0
     turbidity: float = 3.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("zenith", self.zenith, 0, 90)  # to the horizon
+        require_range("azimuth", self.azimuth, -FACTOR, FACTOR)
+        require_range("turbidity", self.turbidity, *TURBIDITY)
 
 
 @dataclass
@@ -60,7 +66,7 @@ class PoseSettings(StepSettings):
             require_range(name, getattr(self, name), 0, most)
         limits = self.joints if isinstance(self.joints, Mapping) else {"joints": self.joints}
         for name, degrees in limits.items():
-            if not isinstance(degrees, int | float):
+            if isinstance(degrees, bool) or not isinstance(degrees, int | float):
                 raise InputError(f"joints={self.joints}: give degrees, or {{name: degrees}}")
             require_range("joints" if name == "joints" else f"joints.{name}", degrees, 0, 180)
         if not any([*limits.values(), *(getattr(self, name) for name in POSE)]):

@@ -12,6 +12,7 @@ from PIL import Image
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import NORMALS, decode
+from renderer.io.files import write_whole
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
 from renderer.normals import corner_normals
 from renderer.validation import as_list, as_path, require_whole
@@ -51,7 +52,7 @@ def export_mesh(
     content = _glb(mesh, shaded, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        write_whole(path, content)
     except OSError as error:
         raise InputError(f"mesh {path} cannot be written: {error}") from error
 

@@ -1,5 +1,6 @@
 """Image files, as a classifier sees them, and arrays of numbers as .npy files."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from renderer.errors import InputError, require_file
+from renderer.io.files import write_whole
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
@@ -53,6 +55,37 @@ def eight_bits(image: Image.Image) -> Image.Image:
         return Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
     image.load()
     return image
+
+
+def write_image(path: Path, image: Image.Image, **options: object) -> None:
+    """Write an image as a whole, in the format of the path's suffix.
+
+    Args:
+        path: The file to replace or to make.
+        image: The image.
+        **options: Those of Pillow's `Image.save`.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    content = io.BytesIO()
+    image.save(content, Image.registered_extensions()[path.suffix.lower()], **options)
+    write_whole(path, content.getbuffer())
+
+
+def write_numbers(path: Path, numbers: np.ndarray) -> None:
+    """Write an array as an .npy file, as a whole.
+
+    Args:
+        path: The file to replace or to make.
+        numbers: The array.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    content = io.BytesIO()
+    np.save(content, numbers)
+    write_whole(path, content.getbuffer())
 
 
 def read_numbers(path: Path) -> np.ndarray:

@@ -27,6 +27,8 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.gloss import SampleGloss
 from renderer.image import ImageSettings, decode, encode, to_bytes
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.environment import light_radiance, write_map
@@ -234,7 +236,7 @@ def write_mitsuba_scene(
     for number, part in enumerate(split_parts(mesh, corner_normals(mesh, settings.normals), settings.encoding)):
         _append(scene, "", _write_part(folder, number, part, settings.encoding, albedo_scale))
     xml.indent(scene, "    ")
-    (folder / SCENE).write_text(xml.tostring(scene, "unicode") + "\n", encoding="utf-8")
+    write_whole(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
@@ -287,17 +289,18 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
     gloss = part.gloss if part.gloss is not None and part.gloss[1:].any() else None  # of a matte part
     kept = 1.0 if gloss is None else _kept(gloss)
     corners = np.concatenate([part.uvs, kept * part.colors], axis=-1).reshape(-1, 5).astype(np.float32)
-    trimesh.Trimesh(
+    surface = trimesh.Trimesh(
         part.positions.reshape(-1, 3),
         np.arange(len(corners)).reshape(-1, 3),
         vertex_normals=part.normals.reshape(-1, 3),
         vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
         process=False,
-    ).export(folder / file, vertex_normal=True)
+    )
+    write_whole(folder / file, surface.export(file_type="ply", vertex_normal=True))
     albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.texture is not None:
         scaled = to_bytes(encode(kept * decode(torch.from_numpy(part.texture) / 255, encoding), encoding))
-        Image.fromarray(scaled.numpy()).save(folder / texture)
+        write_image(folder / texture, Image.fromarray(scaled.numpy()))
         albedo = {"type": "bitmap", "filename": texture, "raw": encoding == "linear"}
     material: Scene = {"type": "diffuse", "reflectance": albedo}
     if gloss is not None:
@@ -309,10 +312,10 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
             material[name] = max(factor, least)
             if part.factors is not None:
                 image = np.maximum(part.factors[..., index] * factor, 255 * least).round().astype(np.uint8)
-                Image.fromarray(image).save(folder / f"{name}_{number}.png")
+                write_image(folder / f"{name}_{number}.png", Image.fromarray(image))
                 material[name] = {"type": "bitmap", "filename": f"{name}_{number}.png", "raw": True}
-    surface = {"type": "twosided", "material": material}
-    return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": surface}
+    bsdf = {"type": "twosided", "material": material}
+    return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}
 
 
 def _kept(gloss: np.ndarray) -> float:

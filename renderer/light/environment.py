@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from renderer.errors import LARGEST, InputError, require_file
-from renderer.io.images import read_numbers
+from renderer.io.files import replacing
+from renderer.io.images import read_numbers, write_numbers
 from renderer.light.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
@@ -51,13 +52,14 @@ def negative_fraction(radiance: Tensor) -> float:
     return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
 
 
-def read_map(path: Path) -> Tensor:
+def read_map(path: str | Path) -> Tensor:
     """Radiance (H, W, 3) float32 of an .npy, .hdr or .exr file, taken as linear and in the file's own unit.
 
     Alpha is dropped and gray repeated; an .npy array is (H, W, C) with 1, 3 or 4 channels. Of an .exr file with
     layers, the unnamed one counts, or else the first that has red, green and blue.
     InputError: missing, unreadable, no such map, NaN, infinity or radiance beyond 1e12 (the sun has 1.6e9 cd/m²).
     """
+    path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
         texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
@@ -70,7 +72,7 @@ def read_map(path: Path) -> Tensor:
     return torch.from_numpy(radiance)
 
 
-def read_panorama(path: Path) -> Tensor:
+def read_panorama(path: str | Path) -> Tensor:
     """`read_map` of a map that can be one of the whole sphere, with zero for radiance from -NEGATIVE of the largest on.
     InputError: less; another shape, such as a mirror ball's; too few texels to be told from its midpoints."""
     radiance = read_map(path)
@@ -83,26 +85,28 @@ def read_panorama(path: Path) -> Tensor:
     return radiance.clamp(min=0)
 
 
-def write_map(path: Path, radiance: Tensor) -> None:
+def write_map(path: str | Path, radiance: Tensor) -> None:
     """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
 
     RGBE has no sign and one exponent for three channels: radiance below zero becomes zero (`negative_fraction` says how
     much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
     InputError where the suffix is another or the file cannot be written.
     """
+    path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix.lower() == ".npy":
-            with path.open("wb") as file:  # given a path, NumPy appends .npy to .NPY
-                np.save(file, radiance.numpy())
+            write_numbers(path, radiance.numpy())
         else:
-            texels = _to_rgbe_precision(radiance) if path.suffix.lower() == ".hdr" else radiance
+            file_format = "hdr" if path.suffix.lower() == ".hdr" else "openexr"
+            texels = _to_rgbe_precision(radiance) if file_format == "hdr" else radiance
             image = _openimageio().ImageBuf(texels.contiguous().numpy())
-            if not image.write(str(path)):
-                raise OSError(image.geterror())
+            with replacing(path) as temporary:
+                if not image.write(str(temporary), "unknown", file_format):
+                    raise OSError(image.geterror())
     except (OSError, ValueError) as error:  # OpenImageIO takes no name that is not UTF-8
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 

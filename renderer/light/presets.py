@@ -16,6 +16,8 @@ from torch import Tensor
 
 from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.image import to_bytes
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.environment import SUFFIXES, read_panorama
 from renderer.light.harmonics import (
@@ -50,7 +52,7 @@ _PUBLISHED_PROBES = {
 PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 
 
-def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
+def load_light(light: str | Path, degree: int | None = DEGREE) -> Tensor:
     """Coefficients ((degree + 1)², 3) float32 of a named probe, of `uniform` light, in which a surface shows its
     albedo, of an environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as
     `renderer.save_light` writes it).
@@ -86,14 +88,14 @@ def load_light(light: str, degree: int | None = DEGREE) -> Tensor:
     return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
 
 
-def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
+def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
     """Write a basis and coefficients (size, 3), a row [r, g, b] each, as JSON; and a projector's pattern as a .png of
     eight bits beside it, in which white is its power.
 
     `read_light` reads float32 back to the bit. InputError: another shape, NaN, or a file that cannot be written.
 
     >>> light = renderer.load_light("grace")
-    >>> save_light(Path("light.json"), light)
+    >>> save_light("light.json", light)
     >>> torch.equal(renderer.load_light("light.json"), light)
     True
     """
@@ -105,17 +107,18 @@ def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis =
         raise InputError(f"coefficients {tuple(coefficients.shape)} are not of {basis}: give {(basis.size, 3)}")
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     try:
-        path.write_text(json.dumps(description, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(description, allow_nan=False) + "\n")
         if isinstance(basis, Projector):
             pattern = to_bytes(coefficients.view(basis.pixels, basis.pixels, 3) / basis.power)
-            Image.fromarray(pattern.numpy()).save(path.with_suffix(".png"))
+            write_image(path.with_suffix(".png"), Image.fromarray(pattern.numpy()))
     except OSError as error:
         raise InputError(f"light {path} cannot be written: {error}") from error
 
 
-def read_light(path: Path, *kinds: type[Any]) -> tuple[Any, Tensor]:
+def read_light(path: str | Path, *kinds: type[Any]) -> tuple[Any, Tensor]:
     """(the basis, of one of these kinds, and coefficients (size, 3) float32) of a .json file; rows alone are of
     harmonics. InputError: a file that is missing or describes another light."""
+    path = Path(path)
     require_file(path, "give the path of a .json file of coefficients")
     try:
         description = json.loads(path.read_text(encoding="utf-8-sig"))

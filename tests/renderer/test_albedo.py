@@ -182,3 +182,26 @@ def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
     assert (painted.corner_colors == 1).all()
     expected = surface_albedo(mesh, fragments, "linear")
     torch.testing.assert_close(surface_albedo(painted, fragments, "linear"), expected, rtol=0, atol=1.1 / 255)
+
+
+def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads_and_on_one():
+    """Half a million samples of two faces add up to each value of the gradient, in one order."""
+    mesh = poster(random_texture(16, 16))
+    fragments = view(mesh, 256, samples=3)
+
+    def gradient(threads: int) -> list[torch.Tensor]:
+        torch.set_num_threads(threads)
+        hue = torch.tensor([0.2, -0.3], requires_grad=True)
+        added = torch.tensor([[0.1, 0.0, -0.1], [0.0, 0.05, 0.02]], requires_grad=True)
+        albedo = painted_albedo(mesh, fragments, "srgb", 1.0, added, hue)
+        weights = torch.linspace(-1, 1, albedo.numel()).view_as(albedo)
+        return list(torch.autograd.grad((weights * albedo).sum(), [hue, added]))
+
+    before = torch.get_num_threads()
+    try:
+        expected, *again = gradient(1), *(gradient(4) for _ in range(4))
+    finally:
+        torch.set_num_threads(before)
+    for found in again:
+        for values, exact in zip(found, expected, strict=True):
+            assert torch.equal(values, exact)

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from train import checkpoint
 from train.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
 
 STATE = {
@@ -33,7 +32,7 @@ def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint.os, function, fail)
+        patch.setattr(f"renderer.io.files.os.{function}", fail)
         with pytest.raises(OSError, match="No space left on device") as full:
             save(tmp_path / LAST, STATE | {"epoch": 4}, tmp_path / PREVIOUS)
     assert full.value.errno == errno.ENOSPC and full.value.filename == str(tmp_path / LAST)

@@ -188,7 +188,7 @@ def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(ti
     [
         pytest.param("tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSystem.append", id="TensorBoard"),
         pytest.param("train.run_folder.RunLog.scalars", id="metrics"),
-        pytest.param("train.checkpoint.os.fsync", id="checkpoint"),
+        pytest.param("renderer.io.files.os.fsync", id="checkpoint"),
     ],
 )
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # TensorBoard's, raised here, too

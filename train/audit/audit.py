@@ -16,12 +16,12 @@ from omegaconf import MISSING
 from augment.classifiers import load_classifier
 from augment.objects import ObjectSettings, load_object
 from renderer.errors import InputError, require_range
+from renderer.io.files import write_whole
 from renderer.io.mitsuba import mitsuba
 from renderer.light.presets import UNIFORM, load_light
 from train import console
 from train.audit import page
 from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers
-from train.checkpoint import write_whole
 from train.device import choose_device
 from train.errors import writable_folder
 from train.lab.laboratory import write_laboratory
@@ -149,7 +149,7 @@ def run_audit(settings: AuditSettings) -> Path:
 def _part(path: Path, measure: Callable[..., dict[str, Any]], *arguments: Any) -> None:
     """Write what is measured as JSON, unless the file is there."""
     if not path.exists():
-        write_whole(path, (json.dumps(measure(*arguments)) + "\n").encode())
+        write_whole(path, json.dumps(measure(*arguments)) + "\n", durable=True)
 
 
 def _whole(folder: Path, make: Callable[[Path], object]) -> None:

@@ -3,6 +3,7 @@
 Every classifier gets the same objects from the same sides, at its own size. Light is nowhere negative.
 """
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from augment.variation import VariationSettings, vary
 from renderer.camera import orbit_cameras
 from renderer.errors import FACTOR
 from renderer.image import ImageSettings, to_bytes
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
 from renderer.rasterizer import choose
@@ -117,14 +120,17 @@ def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path)
     counts: dict[str, Any] = {"adversarial": [int((row["adversarial"] | row["random"]).sum()) for row in by_radius]}
     counts["random"] = [int(row["random"].sum()) for row in by_radius]
     wrong = clean & result.success
-    np.savez(out / f"{kind}.npz", wrong=wrong.cpu(), values=result.descent.values.cpu())
+    kept = io.BytesIO()
+    np.savez(kept, wrong=wrong.cpu(), values=result.descent.values.cpu())
+    write_whole(out / f"{kind}.npz", kept.getbuffer())
     if wrong.any():
         row = int(wrong.nonzero()[0])
         logits = torch.stack([result.logits_before[row, 0], result.logits[row, 0]])
         counts["predicted"] = predictions(logits, classifier.classes)["predicted"]
         pair = to_bytes(torch.cat([result.images_before[row, 0], result.images[row, 0]], dim=2).cpu()).permute(1, 2, 0)
         method = Image.Resampling.NEAREST if classifier.size < SIDE else Image.Resampling.LANCZOS
-        Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method).save(out / f"{kind}.png")
+        shown = Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method)
+        write_image(out / f"{kind}.png", shown)
     return {"n": views.count, "correct": int(clean.sum()), **counts}
 
 

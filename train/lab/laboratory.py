@@ -1,6 +1,7 @@
 """Path-trace shots of objects, and write them as a folder of photographs."""
 
 import csv
+import io
 import json
 import platform
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from augment.objects import load_object
 from augment.utils import progress, stream_seed
 from renderer.errors import InputError
 from renderer.image import decode, encode
-from renderer.io.images import read_image
+from renderer.io.files import write_whole
+from renderer.io.images import read_image, write_image
 from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
@@ -141,23 +143,25 @@ def write_laboratory(settings: LabSettings) -> int:
                 image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
                 path = Path(label) / f"{number:04d}_{shot.family}.png"
                 (out / path).parent.mkdir(parents=True, exist_ok=True)
-                Image.fromarray((image * 255).round().byte().numpy()).save(out / path)
+                write_image(out / path, Image.fromarray((image * 255).round().byte().numpy()))
                 rows.append((path.as_posix(), shot.family, number, mesh, f"{shot.brightness:.4f}"))
-        with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([("path", "source_tag", "setup", "mesh", "brightness"), *sorted(rows)])
+        table = io.StringIO()
+        csv.writer(table).writerows([("path", "source_tag", "setup", "mesh", "brightness"), *sorted(rows)])
+        write_whole(out / TABLE, table.getvalue())
         versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
-        (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n", "utf-8")
+        description = {**asdict(settings), "versions": versions}
+        write_whole(out / DESCRIPTION, json.dumps(description, indent=2) + "\n")
         return len(rows)
 
 
 def _read_environment(path: Path) -> np.ndarray:
-    """Radiance (H, W, 3) of a map, or of a built-in light, of which negative radiance is left out; InputError where a
-    map is negative somewhere, or no light comes from above."""
+    """Radiance (H, W, 3) of a map, or of a built-in light, of which negative radiance is left out; InputError where no
+    light of a map comes from above, and as `read_panorama`."""
     if str(path) in PROBES:
         return to_map(load_light(str(path)), PROBE_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
-    if radiance.min() < 0 or not radiance[: len(radiance) // 2].max() > 0:
-        raise InputError(f"environments: {path} is negative somewhere or dark above: give a map of emitted light")
+    if not radiance[: len(radiance) // 2].max() > 0:
+        raise InputError(f"environments: {path} is dark above: give a map with light from above the horizon")
     return radiance
 
 

@@ -1,6 +1,7 @@
 """A model's predictions for photographs, and the table predictions.csv."""
 
 import csv
+import io
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from augment.losses import log_odds
 from augment.utils import eval_mode, progress
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_unit
+from renderer.io.files import write_whole
 from train.photographs.folder import SEPARATOR, Photograph, split_sources
 
 PREDICTIONS = "predictions.csv"
@@ -97,17 +99,18 @@ def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
 def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
     """Write a row per photograph, with columns for each class under study; None becomes an empty cell."""
     groups = by_label(predictions)
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        columns = dict.fromkeys(name for label in groups for name in _columns(label))
-        writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
-        for items in zip(*groups.values(), strict=True):
-            cells: dict[str, object] = {}
-            for item in items:
-                photograph, label, *values = vars(item).values()
-                cells |= zip(_columns(label), values, strict=True)
-            names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
-            writer.writerow([*names.values(), *cells.values()])
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    columns = dict.fromkeys(name for label in groups for name in _columns(label))
+    writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
+    for items in zip(*groups.values(), strict=True):
+        cells: dict[str, object] = {}
+        for item in items:
+            photograph, label, *values = vars(item).values()
+            cells |= zip(_columns(label), values, strict=True)
+        names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
+        writer.writerow([*names.values(), *cells.values()])
+    write_whole(path, table.getvalue())
 
 
 def read_predictions(path: Path, label: Label) -> list[Prediction]:

@@ -17,6 +17,8 @@ from augment.classifiers.adapter import Label, OperatingPoint, as_class_names, l
 from augment.utils import progress
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
 from renderer.validation import as_folder, require_kind, require_whole
 from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
 from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by, resampled, thresholds
@@ -24,7 +26,7 @@ from train.photographs.predictions import PREDICTIONS, Model, Prediction, comput
 from train.photographs.sheet import contact_sheet, write_roc
 from train.tables import Table, format_fraction, format_interval, fraction
 
-SUMMARY = "summary.json"
+SUMMARY, CONTACT_SHEET = "summary.json", "contact_sheet.png"
 WRONG_CLASSES = 5  # the most common ones, which are named
 COUNTED = ("recall", "top5", "false_positive_rate", "recall_at_threshold", "false_positive_rate_at_threshold")
 BY_CLASS = ("recall", "top5", "predicted_label")
@@ -133,8 +135,8 @@ def evaluate_photographs(
     out.mkdir(parents=True, exist_ok=True)
     write_predictions(out / PREDICTIONS, predictions)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    contact_sheet(predictions, images).save(out / "contact_sheet.png")
+    write_whole(out / SUMMARY, text + "\n")
+    write_image(out / CONTACT_SHEET, contact_sheet(predictions, images))
     curves = {name: group.scores for name, group in next(iter(pools.values())).items()}
     write_roc(out, {name: scores for name, scores in curves.items() if all(map(len, scores))}, " or ".join(labels))
     return summary

@@ -1,6 +1,7 @@
 """The images of an evaluation: a contact sheet of photographs with their predictions, and ROC curves."""
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps
 
+from renderer.io.files import write_whole
 from renderer.io.tiles import PAPER, Tile, draw_grid
 from train.photographs.metrics import RATES, auc_and_recalls, roc_curve
 from train.photographs.predictions import Prediction, by_label
@@ -72,11 +74,12 @@ def write_roc(folder: Path, scores: Mapping[str, Pair], label: str) -> None:
     """roc.csv, a row per point of each source's curve, and roc.png with all curves."""
     from matplotlib.figure import Figure  # half a second
 
-    with (folder / "roc.csv").open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
-        for source, pair in scores.items():
-            writer.writerows((source, *map(float, point)) for point in zip(*roc_curve(*pair), strict=True))
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
+    for source, pair in scores.items():
+        writer.writerows((source, *map(float, point)) for point in zip(*roc_curve(*pair), strict=True))
+    write_whole(folder / "roc.csv", table.getvalue())
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
     bold = {"all": {"color": "black", "linewidth": 2.5, "zorder": 3}}
@@ -84,7 +87,9 @@ def write_roc(folder: Path, scores: Mapping[str, Pair], label: str) -> None:
     axes.set_aspect("equal")
     if scores:
         axes.legend(loc="lower right")
-    figure.savefig(folder / "roc.png")
+    image = io.BytesIO()
+    figure.savefig(image)
+    write_whole(folder / "roc.png", image.getbuffer())
 
 
 def draw_roc(

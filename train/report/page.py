@@ -16,6 +16,7 @@ from augment.classifiers.adapter import label_names
 from augment.service import ARMS
 from augment.utils import announced
 from renderer.errors import InputError
+from renderer.io.files import write_whole
 from train.errors import one_sentence
 from train.loop import attack_success
 from train.photographs.metrics import LABEL, OVERALL, metric_title
@@ -84,7 +85,7 @@ def write_page(out: Path, body: str, **content: Any) -> Path:
     environment.filters |= {"fraction": fraction, "hits": format_fraction, "interval": format_interval}
     page = environment.get_template("page.html.jinja").render(body=body, **content)
     out.mkdir(parents=True, exist_ok=True)
-    (out / PAGE).write_text(page, encoding="utf-8", errors="replace")
+    write_whole(out / PAGE, page)
     return out / PAGE
 
 
