@@ -3,24 +3,19 @@
 import functools
 import os
 import platform
-import time
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from augment import utils
-from augment.utils import eval_mode, progress
 from renderer.errors import InputError, as_device, require_choice
 from train import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
 THREADS = torch.get_num_threads()  # before any run sets its own
-PASS, PASSES = 0.08, 5  # seconds of a pass by one thread, and passes of each, in a trial of threads
-CLEARLY = 1.25  # the ratio of seconds at which more threads are taken
-_CHOSEN: dict[str, int] = {}  # threads, by what they were tried with
+SMALL_WORK = 1e10  # weights × pixels of a batch, some milliseconds of one core: less is trained by one thread
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave on success, and validation
@@ -38,42 +33,36 @@ def choose_device(name: str) -> torch.device:
 
 
 def most_threads() -> int:
-    """Threads for all cores: torch's number at the start (OMP_NUM_THREADS sets it), but no more than a container's
-    quota of cores, above which threads wait for each other."""
+    """Count the cores that this process may use.
+
+    These are no more than the threads that torch took at the start (OMP_NUM_THREADS sets them), the cores that the
+    process is bound to (taskset, Slurm), and a container's quota of cores, above which threads wait for each other.
+    """
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = QUOTA.read_text().split()
-        cores = max(1, int(quota) // int(period))
+        permitted = max(1, int(quota) // int(period))
     except (OSError, ValueError):  # no such file (it is Linux's, cgroup v2), or "max 100000"
-        cores = os.cpu_count() or 1
-    return min(THREADS, cores)
+        permitted = bound
+    return min(THREADS, bound, permitted)
 
 
-def choose_threads(network: nn.Module, images: Tensor) -> int:
-    """1, or all threads where a trial on images (N, 3, H, W) shows them clearly faster; on cores in use they are not.
+def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
+    """Choose the threads of a training by a rule, so that the same command gives the same bits on a machine.
 
-    The trial takes about a second, once for a network and images, so that arms agree. All threads for a GPU and for
-    torchrun's processes, which have one each. The network and the random state are left as they were.
+    Small batches take one thread, since several would wait for each other most of the time. All others take
+    `most_threads`. A trial would choose better on a busy machine, and would choose otherwise the next time.
+
+    Args:
+        network: The network that is trained.
+        batch_size: The images of a batch.
+        size: The pixels per side of an image.
+
+    Returns:
+        The number of threads.
     """
-    most, before, parameters = most_threads(), torch.get_num_threads(), list(network.parameters())
-    key = f"{network} {tuple(images.shape)}"
-    if most == 1 or utils.world_size() > 1 or parameters[0].is_cuda or key in _CHOSEN:
-        return _CHOSEN.get(key, most)
-    parameters = [parameter for parameter in parameters if parameter.requires_grad]
-
-    def seconds(threads: int, count: int) -> float:
-        torch.set_num_threads(threads)
-        start = time.perf_counter()
-        torch.autograd.grad(network(images[:count]).sum(), parameters, allow_unused=True)
-        return time.perf_counter() - start
-
-    with eval_mode(network), torch.random.fork_rng(devices=[]), torch.enable_grad():
-        seconds(most, 1)  # which starts the threads
-        count = max(1, int(PASS / seconds(1, 1)))
-        trials = [(seconds(1, count), seconds(most, count)) for _ in progress(range(PASSES), "choosing threads")]
-    alone, together = map(median, zip(*trials, strict=True))
-    torch.set_num_threads(before)
-    _CHOSEN[key] = most if alone > CLEARLY * together else 1
-    return _CHOSEN[key]
+    weights = sum(parameter.numel() for parameter in network.parameters())
+    return most_threads() if weights * batch_size * size**2 >= SMALL_WORK else 1
 
 
 def set_deterministic(deterministic: bool) -> None:

@@ -1,6 +1,7 @@
 """The training loop: an epoch has one or more rounds, each with fresh renders; validation and a checkpoint end it."""
 
 import math
+import time
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -29,6 +30,8 @@ from train.recipe import MovingAverage, TrainSettings, augmentation, build_optim
 from train.run_folder import PHASES, RunLog
 
 EVALUATION_BATCH = 512  # images at a time
+SAVING_EVERY = 60.0  # seconds between checkpoints within an epoch, at least
+SAVING_SHARE = 0.02  # of the time of an epoch that goes to its checkpoints, at most
 SHOWN = ("attack_success_before", "attack_success", "steps")  # of each round's diagnostics in metrics.jsonl
 
 
@@ -80,6 +83,8 @@ class Trainer:
         self._under_way: EpochState | None = None  # of the epoch that has begun
         self._random_state: dict[str, Any] = {}  # where a checkpoint within an epoch left it
         self._best: dict[str, Any] | None = None  # selected, but not written yet
+        self._saved_at = time.perf_counter()  # when the last checkpoint was written, or the training began
+        self._saving_took = 0.0  # seconds
 
         self.model, self.device = model, next(model.parameters()).device
         self.initial = deepcopy(model).eval().requires_grad_(False) if settings.init_from else None
@@ -154,6 +159,8 @@ class Trainer:
                     state.step += 1
                     if interruption.requested():
                         return state.step == total
+                    if state.step < total and self._saving_is_due():
+                        self._save()
         return True
 
     def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
@@ -246,9 +253,20 @@ class Trainer:
             state, best, self._best = self.state_dict(), self._best, None
             if utils.rank() > 0:
                 return
+            start = time.perf_counter()
             if best:
                 checkpoint.save(self.folder / checkpoint.BEST, best)
             checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
+            self._saved_at = time.perf_counter()
+            self._saving_took = self._saved_at - start
+
+    def _saving_is_due(self) -> bool:
+        """Say whether to write a checkpoint within the epoch, so that a killed run loses no more than a minute or so.
+
+        Several processes would have to agree on the moment: they write at the end of an epoch, or on a signal.
+        """
+        wait = max(SAVING_EVERY, self._saving_took / SAVING_SHARE)
+        return utils.world_size() == 1 and time.perf_counter() - self._saved_at > wait
 
     def _description(self) -> dict[str, Any]:
         """What is stored beside the weights of a network."""
@@ -292,6 +310,29 @@ class Trainer:
             self._under_way = EpochState(renders, sums, begun["diagnostics"], begun["step"])
         self.epoch, self.history = state["epoch"], state["history"]
 
+    def _require_own_best(self) -> None:
+        """Raise InputError where best.pt is missing, damaged or another run's, before any training.
+
+        The scores at the end are those of its network. It is first written at the end of an epoch.
+        """
+        if not self.epoch:
+            return
+        path = self.folder / checkpoint.BEST
+        try:
+            best = checkpoint.load(path)
+            own = self._description()
+            if self.architecture | best["architecture"] != self.architecture:
+                raise ValueError("it has another architecture or other classes")
+            if (best["seed"], best["arm"]) != (own["seed"], own["arm"]):
+                raise ValueError("it is of another run")
+            epochs = self.history[: best["epoch"]]  # a later network is found again
+            if len(epochs) == best["epoch"] and epochs[-1]["validation/accuracy"] != best["validation_accuracy"]:
+                raise ValueError("its accuracy is not the one that this run had")
+        except (LookupError, TypeError, ValueError) as error:
+            reason = in_one_line(error)
+            remedy = f"restore {checkpoint.BEST}, or start in another folder with run="
+            raise InputError(f"{path} is not the network that this run kept ({reason}): {remedy}") from error
+
     def resume(self) -> None:
         """Go on from the folder's newest whole checkpoint; InputError where it does not belong to this run."""
         state, problem = checkpoint.load_newest(self.folder)
@@ -303,6 +344,7 @@ class Trainer:
             fault = f"the checkpoint in {self.folder} is not one that this run can go on from ({in_one_line(error)})"
             remedy = f"restore {checkpoint.LAST}, or start in another folder with run="
             raise InputError(f"{fault}: {remedy}") from error
+        self._require_own_best()
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or it would take the place of the whole one

@@ -15,7 +15,7 @@ from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, progress, stream_seed
 from renderer.errors import InputError, require_choice, require_range
-from renderer.image import LARGEST_SIZE, to_unit
+from renderer.image import LARGEST_SIZE
 from train import checkpoint, console
 from train.cache import TensorCache, cache_folder
 from train.data import (
@@ -213,7 +213,7 @@ def build_trainer(
 ) -> Trainer:
     """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before.
 
-    left_out: the part that validates the network, stored with it. threads: None where a trial is to choose.
+    left_out: the part that validates the network, stored with it. threads: None for those of `choose_threads`.
     """
     device, shape = choose_device(settings.train.device), settings.model.shape
     foreign = bool(base and CLASSIFIER in base[1]["architecture"])
@@ -232,8 +232,7 @@ def build_trainer(
     if settings.train.freeze:
         freeze(without_normalization(network), settings.train.freeze)
     model = MixedPrecision(network.to(device), choose_precision(settings.train.precision, device, network))
-    batch = to_unit(data.train.sample(settings.train.batch_size))
-    torch.set_num_threads(threads or choose_threads(model, batch))
+    torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
     service = build_service(settings, data, device)
     labeled, recipe = settings.data.name != UNLABELED, settings.train
     if recipe.eval_mode is None:

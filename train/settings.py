@@ -33,6 +33,7 @@ from train.recipe import TrainSettings
 
 Settings = TypeVar("Settings")
 _schema = cache(OmegaConf.structured)  # since OmegaConf takes as long to make it as to read a configuration into it
+REQUIRED = "${required:}"  # in a file of conf/: a value is to be given; ??? would leave the default of another file
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
@@ -255,8 +256,10 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
     """The dataclass from its configuration, which stands at a key; InputError naming the key that is unknown, unset, of
     the wrong type or, by the dataclass's own check, out of range."""
     try:
+        plain = cast(dict[str, Any], OmegaConf.to_container(config))
+        unset = {name for name, value in dotted(plain) if value == REQUIRED}
         merged: Any = OmegaConf.merge(_schema(kind), config)  # type: ignore[arg-type]  # types are hashable
-        if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
+        if unset := unset or OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
         _check(merged, key)
         return cast(Settings, OmegaConf.to_object(merged))

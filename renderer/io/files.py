@@ -56,7 +56,7 @@ def write_whole(
 ) -> None:
     """Write a file as a whole. Arguments and errors are those of `replacing`.
 
-    Text becomes UTF-8, in which characters that it lacks, such as those of a file name in another encoding, are escapes.
+    Text becomes UTF-8. Characters that it lacks, as file names in another encoding have, are written as escapes.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     with replacing(path, durable, previous) as temporary:

@@ -96,7 +96,7 @@ def test_a_table_receives_the_projection_and_the_shadow():
     """Lit from straight above, from where a screen through the origin, at 4, would be white: but for the shadow of the
     orange, the table below it is even, and darker by the squares of the distances."""
     above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, fov=60)
-    alone = {"exposure": 0.0, "projector": above, "lamps": None, "backgrounds": [0.0], "width": 4.0}
+    alone = {"light": torch.zeros(49, 3), "projector": above, "lamps": None, "backgrounds": [0.0], "width": 4.0}
     shown, bare = (scene(48, **alone, polar=0, ground=color, samples=4) for color in ([0.2, 0.5, 0.7], None))
     table, orange = (each.render(each.conditions(EVERY), EVERY)[0, 0] for each in (shown, bare))
     beside = table[:, (orange.sum(0) == 0) & (table.sum(0) > 0)]
@@ -189,7 +189,7 @@ def test_images_and_gradients_by_shape_and_color_add_up_over_the_lights():
         still = shown.render(shown.conditions(EVERY), EVERY)
         return still, images.detach(), *torch.autograd.grad((images * weights).sum(), (vertices, albedo))
 
-    both, dark = rendered(), {"exposure": 0.0}
+    both, dark = rendered(), {"light": torch.zeros(49, 3)}
     parts = rendered(projector=None, lamps=None), rendered(**dark, lamps=None), rendered(**dark, projector=None)
     assert both[0].max() < 1
     for whole, *alone in zip(both, *parts, strict=True):

@@ -1,5 +1,4 @@
 import os
-from copy import deepcopy
 
 import pytest
 import torch
@@ -38,34 +37,29 @@ def test_threads_are_no_more_than_the_containers_quota_of_cores(tmp_path, monkey
     if quota:
         (tmp_path / "cpu.max").write_text(quota)
     monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)))
     for at_start, expected in [(8, cores), (1, 1)]:
         monkeypatch.setattr(device, "THREADS", at_start)
         assert most_threads() == expected
 
 
-@pytest.mark.parametrize("seconds, expected", [(0.3, 4), (0.7, 4), (0.9, 1), (1.1, 1), (7.0, 1)])
-def test_all_cores_are_taken_where_they_are_clearly_faster_than_one(monkeypatch, network, seconds, expected):
-    """seconds: of four threads, for what one thread does in a second."""
-    now, before = [0.0], torch.get_num_threads()
-    monkeypatch.setattr(device.time, "perf_counter", lambda: now[0])
+def test_threads_are_no_more_than_the_cores_that_the_process_is_bound_to(tmp_path, monkeypatch):
+    monkeypatch.setattr(device, "THREADS", 64)
+    monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(before)})
+        assert most_threads() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+    assert most_threads() == len(before)
 
-    class Timed(torch.nn.Sequential):
-        def forward(self, images):
-            now[0] += 0.01 * len(images) * {1: 1.0, 4: seconds}[torch.get_num_threads()]
-            return super().forward(images)
 
-    timed, images = Timed(network, torch.nn.BatchNorm1d(3), torch.nn.Dropout()).train(), torch.rand(32, 3, 8, 8)
-    monkeypatch.setattr(device, "_CHOSEN", {})
-    monkeypatch.setattr(device, "most_threads", lambda: 4)
-    state, random = deepcopy(timed.state_dict()), torch.get_rng_state()
-    assert choose_threads(timed, images) == expected
-    assert now[0] < 4  # five passes of each
-    seconds = 1 / seconds  # when an arm beside it is prepared
-    assert choose_threads(timed, images) == expected
-    torch.testing.assert_close(timed.state_dict(), state, rtol=0, atol=0)
-    assert timed.training and all(parameter.grad is None for parameter in timed.parameters())
-    assert torch.equal(torch.get_rng_state(), random) and torch.get_num_threads() == before
+def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkeypatch):
+    monkeypatch.setattr(device, "most_threads", lambda: 6)
+    tiny, paper = WideResNet(3, 10, 1, dropout=0.0), WideResNet(100, 16, 4, dropout=0.0)
+    assert [choose_threads(tiny, 16, 16) for _ in range(3)] == [1, 1, 1]
+    assert [choose_threads(paper, 128, 32) for _ in range(3)] == [6, 6, 6]
 
 
 @pytest.mark.parametrize("supported", [True, False])

@@ -36,6 +36,15 @@ def test_every_experiment_takes_other_data(experiment):
     assert (settings.data.name, settings.data.path, settings.train.init_from in ("b", None)) == ("npz", "a.npz", True)
 
 
+@pytest.mark.parametrize("experiment", ["harden", "best", "classifier"])
+def test_an_experiment_that_fine_tunes_asks_for_the_network_to_begin_with(experiment):
+    config = compose("train", [f"experiment={experiment}", "data=npz", "data.path=a.npz", "run=here"])
+    with pytest.raises(InputError, match=r"^train\.init_from is not set"):
+        read_settings(ExperimentSettings, config)
+    config = compose("train", ["experiment=harden", "train.init_from=null", "run=here"])
+    assert read_settings(ExperimentSettings, config).train.init_from is None  # where random weights are asked for
+
+
 def test_a_classifier_of_others_needs_no_class_but_the_label():
     settings = read_settings(
         ExperimentSettings,
