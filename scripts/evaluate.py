@@ -21,6 +21,7 @@ from train.errors import writable_folder
 from train.networks import load_run, published
 from train.photographs import scoring
 from train.photographs.metrics import GROUPS
+from train.results import require_replaceable
 from train.run_folder import sole_writer
 
 
@@ -37,6 +38,7 @@ class Settings:
     calibrate: str | None = None  # a folder like photos; null: the threshold that a published network carries, if any
     by: str = "source"  # source | mesh: the groups of the tables, columns of photos.csv
     skip_unreadable: bool = False  # skip broken photographs
+    overwrite: bool = False  # write over the results that out holds
     precision: str = "auto"  # auto (bfloat16 where the hardware has it) | bfloat16 | float32
     device: str = "auto"  # auto | cpu | cuda | cuda:N
 
@@ -61,6 +63,7 @@ def main(settings: Settings) -> None:
         network.label(name)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
     points = network.operating_points
     options = network.size, settings.skip_unreadable, device
     with sole_writer("out", out):

@@ -25,6 +25,7 @@ from renderer.io.images import read_rgb, write_image
 from renderer.light.presets import save_light
 from renderer.rendering import render
 from train.errors import writable_folder
+from train.results import require_replaceable
 
 MARGIN = 1.6  # the image's side, in those of the object's box
 DETAIL = 448  # pixels per side of the background that is written
@@ -43,6 +44,7 @@ class Settings:
     label: str = "orange"  # the class of the printed attack
     size: int = 64  # pixels per side that are compared
     out: str = "runs/fit"  # the folder of background.png, light.json and comparison.png
+    overwrite: bool = False  # write over the results that out holds
 
     def __post_init__(self) -> None:
         require_range("size", self.size, 16, 512)
@@ -57,6 +59,7 @@ class Settings:
 @cli.command()
 def main(settings: Settings) -> None:
     image, out = read_file(settings.photograph), writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
     mask = read_mask(settings.mask, image) if settings.mask else grab_cut(image, settings.box)
     mesh = load_object(ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)).mesh
     rows, columns = np.flatnonzero((mask > 127).any(1)), np.flatnonzero((mask > 127).any(0))

@@ -12,6 +12,7 @@ from omegaconf import MISSING
 from renderer.errors import InputError, require_range
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.presets import load_light
+from train.results import require_replaceable
 from train.settings import keyed
 
 
@@ -20,6 +21,7 @@ class Settings:
     light: str = MISSING  # grace | eucalyptus | st_peters | uniform | a map (.npy, .hdr, .exr) | coefficients (.json)
     out: str = MISSING  # the map's file, .hdr, .exr or .npy, in which negative radiance becomes 0
     height: int = 256  # rows; there are twice as many columns
+    overwrite: bool = False  # replace a file that exists
 
     def __post_init__(self) -> None:
         require_range("height", self.height, 1, 8192)  # a map of that height takes 3 GB
@@ -30,6 +32,7 @@ def main(settings: Settings) -> None:
     out = Path(settings.out)
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
+    require_replaceable(out, "out", settings.overwrite)
     radiance = to_map(load_light(settings.light, degree=None), settings.height)
     with keyed("out"):
         write_map(out, radiance.clamp(min=0))  # negative light is refused where maps are read

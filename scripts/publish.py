@@ -18,6 +18,7 @@ from train.errors import writable_folder
 from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish, published
 from train.photographs import scoring
 from train.report.summary import summarize
+from train.results import require_replaceable
 from train.settings import mapped
 
 
@@ -29,6 +30,7 @@ class Settings:
     calibrate: str | None = None  # a folder of photographs as for pnb-evaluate; null: the threshold it has, if any
     label: Any = "orange"  # the class of the threshold, or several, each with its own
     model: str | None = None  # python:package.module:function, if such a function made the run's network
+    overwrite: bool = False  # write over the results that out holds
 
     def __post_init__(self) -> None:
         scoring.require_calibration(self.false_positive_rate, self.calibrate)
@@ -38,6 +40,8 @@ class Settings:
 def main(settings: Settings) -> None:
     out, given = writable_folder(settings.out, "out"), Path(settings.run)
     path, state = load_selected(given)
+    own = [PUBLISHED] if path.resolve() == (out / PUBLISHED).resolve() else []  # it gets an operating point
+    require_replaceable(out, "out", settings.overwrite, own)
     if path.suffix != Path(PUBLISHED).suffix:  # a run of pnb-train
         run = summarize(given)
         # Names of files in place of their paths, which are of this machine alone.

@@ -13,13 +13,17 @@ from omegaconf import MISSING
 from renderer.errors import InputError
 from train.errors import writable_folder
 from train.report.page import write_report
+from train.results import OF_AUDIT, RESULTS, require_replaceable
 from train.settings import quoted
 
 
 @dataclass
 class Settings:
     runs: list[str] = MISSING  # folders of runs, sweeps and attacks; folders below them count, too
-    out: str | None = None  # the folder of the page and its images; null: the common parent of the runs
+    out: str | None = (
+        None  # the folder of the page and its images; null: their common parent, whose page it replaces
+    )
+    overwrite: bool = False  # write over the results that out holds
 
     def __post_init__(self) -> None:
         if not self.runs:
@@ -35,8 +39,13 @@ def as_overrides(arguments: list[str]) -> list[str]:
 
 @cli.command(as_overrides)
 def main(settings: Settings) -> None:
-    out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
-    page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
+    parent = Path(os.path.commonpath([Path(run).absolute() for run in settings.runs]))
+    out = writable_folder(settings.out or parent, "out")
+    # The page beside the runs is of them, and is written anew. That of an audit is not.
+    is_beside = out.resolve() == parent.resolve()
+    own = [pattern for pattern in RESULTS if pattern not in OF_AUDIT] if is_beside else []
+    require_replaceable(out, "out", settings.overwrite, own)
+    page = write_report([Path(run) for run in settings.runs], out)
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -27,6 +27,7 @@ from train.processes import Interrupted, broadcast, process_group
 from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import summarize
+from train.results import require_new_run
 from train.run import load_data, prepare
 from train.run_folder import CONFIG, require_same_run, resumed, sole_writer
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, program, read_settings
@@ -84,8 +85,10 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
     arms[folder] = settings
     for path, arm_settings in arms.items():
+        # Before anything is written.
         if settings.train.resume and (path / CONFIG).is_file():
-            require_same_run(path, arm_settings)  # before anything is written
+            require_same_run(path, arm_settings)
+        require_new_run(path, "run", settings.overwrite, settings.train.resume)
     if first:
         log_to(writable_folder(run, "run") / LOG)
     try:

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.io.files import write_whole
 from train.device import choose_device
 from train.errors import writable_folder
+from train.results import require_replaceable
 from train.run_folder import sole_writer, write_config
 from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
 from train.tables import Table, format_fraction, fraction
@@ -101,6 +103,7 @@ class AttackExperimentSettings:
     seed: int = 0
     out: str = ""
     reload: str | None = None
+    overwrite: bool = False
     device: str = "auto"
     attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
     transfer: TransferSettings = field(default_factory=TransferSettings)
@@ -140,10 +143,10 @@ def run(settings: AttackExperimentSettings) -> None:
             return
     others = load_others(settings, classifier, device)
     out = writable_folder(settings.out, "out")
-    if any(out.glob(f"*/{LINES}")):  # whose examples would lie among the new ones
-        raise InputError(f"out={out} holds the adversaries of an earlier call: choose another folder, or remove it")
+    require_replaceable(out, "out", settings.overwrite)
     sweeps: dict[str, list[dict[str, Any]]] = {}
     with sole_writer("out", out):
+        _remove_adversaries(out)
         for index, (name, scene, result) in enumerate(attacks(settings, classifier, device, adversary)):
             if scene != settings.scene:
                 print(f"{name} is misclassified in the scene as it is, but not with {overrides(scene, settings.scene)}")
@@ -161,6 +164,17 @@ def run(settings: AttackExperimentSettings) -> None:
             write_sweeps(sweeps, {name: steps.norm for name, steps in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         write_config(out, settings, command=shlex.join([*program("attack"), *sys.argv[1:]]))
+
+
+def _remove_adversaries(out: Path) -> None:
+    """Remove those of an earlier call, which the report would count among the new ones."""
+    for lines in out.glob(f"*/{LINES}"):
+        for example in lines.parent.glob("example_*"):
+            shutil.rmtree(example) if example.is_dir() else example.unlink()
+        for file in (lines, lines.with_name(TRANSFERS)):
+            file.unlink(missing_ok=True)
+    for name in (TABLE, FIGURE):
+        (out / name).unlink(missing_ok=True)
 
 
 def attacks(

@@ -50,7 +50,7 @@ from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.recipe import freeze
 from train.rendered_shapes import load_shapes
-from train.run_folder import BEFORE, RunLog, require_same_run, write_config
+from train.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
 Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_initial` gives it
@@ -79,9 +79,11 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
     set_deterministic(settings.train.deterministic)
-    threads, begun = settings.train.threads, checkpoint.exists(folder)
+    anew = settings.overwrite and not settings.train.resume
+    threads, begun = settings.train.threads, checkpoint.exists(folder) and not anew
     if begun and not settings.train.resume:
-        raise InputError(f"run={folder} holds a run already: set train.resume=true to go on, or choose another run")
+        advice = "set train.resume=true to go on or overwrite=true to begin anew, or choose another run"
+        raise InputError(f"run={folder} holds a run already: {advice}")
     if begun:
         before = require_same_run(folder, settings)
         recorded = OmegaConf.select(before, "hardware.threads")
@@ -100,6 +102,8 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     elif settings.train.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
+        if anew:
+            remove_run(folder)
         hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
         write_config(folder, settings, hardware=hardware, command=command, test_images=_test_images(settings, data))
 

@@ -6,6 +6,7 @@ import logging
 import os
 import platform
 import shlex
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, fields
@@ -30,10 +31,12 @@ from renderer.io.files import remove_unfinished, write_whole
 from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
+from train.checkpoint import BEST, LAST, PREVIOUS
 from train.networks import selected_file
 from train.settings import ExperimentSettings, dotted, mapped
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
+RENDERS = "renders"  # sub-folder with the images of the epochs
 BEFORE = "before"  # sub-folder with the scores of the network that the run began with
 EXAMPLE = 128  # px: the least side of the examples of an attack
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
@@ -41,7 +44,19 @@ logging.raiseExceptions = False  # on a full disk train.log lacks lines, and onl
 
 # Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
 CIRCUMSTANCES = (
-    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
+    *(
+        "run",
+        "sweep",
+        "out",
+        "device",
+        "launcher",
+        "overwrite",
+        "compare",
+        "command",
+        "working_folder",
+        "hardware",
+        "versions",
+    ),
     *("inputs", "test_images"),
     *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
@@ -252,6 +267,19 @@ def _content_hash(path: Path, size: int, modified: int) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
+def remove_run(folder: Path) -> None:
+    """Remove the results of a run that would stand among those of the next one in its folder.
+
+    The scores on photographs, the log and the report have the same names in both, and are replaced in any case.
+    """
+    for name in (LAST, PREVIOUS, BEST, METRICS, FAILURE):
+        (folder / name).unlink(missing_ok=True)
+    for events in folder.glob("events.out.tfevents.*"):
+        events.unlink()
+    for name in (RENDERS, BEFORE):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
 class RunLog:
     """Writes a run folder's metrics.jsonl, TensorBoard events, renders and attack examples; OSError on a full disk.
 
@@ -261,8 +289,9 @@ class RunLog:
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
         from torch.utils.tensorboard import SummaryWriter  # half a second, which readers of metrics are spared
 
-        self._metrics, self._renders, self._epochs = folder / METRICS, folder / "renders", len(history)
+        self._metrics, self._renders, self._epochs = folder / METRICS, folder / RENDERS, len(history)
         write_whole(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
+        remove_unfinished(self._renders)
         self._board = SummaryWriter(str(folder), purge_step=self._epochs + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:

@@ -131,6 +131,7 @@ class ExperimentSettings:
 
     run: str = ""
     sweep: str = "runs/sweep"
+    overwrite: bool = False
     seed: int = 0
     label: Any = "orange"  # str | list[str], a union that OmegaConf has no type for
     weights: str | None = None

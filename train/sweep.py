@@ -23,8 +23,9 @@ from renderer.io.files import write_whole
 from train import checkpoint, console
 from train.errors import one_sentence, writable_folder
 from train.report.compare import format_table
-from train.report.page import report_of
+from train.report.page import PAGE, report_of
 from train.report.summary import is_finished, summarize
+from train.results import require_new_run, require_replaceable
 from train.run import load_data, prepare
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, quoted, read_settings
@@ -58,15 +59,19 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     InputError before the first run where two runs are the same, or a folder holds a run with other settings.
     """
     runs = _runs(overrides)
-    parent = writable_folder(str(compose("train", runs[0]).sweep), "sweep")
+    first = compose("train", runs[0])
+    parent = writable_folder(str(first.sweep), "sweep")
+    require_replaceable(parent, "sweep", bool(first.overwrite), own=[PAGE])  # the page of the sweep so far
     fixed = [text.partition("=")[0] for text in set.intersection(*map(set, runs))]
     folders = [parent / run_name(words, fixed, str(parent)) for words in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has a run twice: give each value once")
     for folder, words in zip(folders, runs, strict=True):
-        if is_finished(folder) or checkpoint.exists(folder):
-            settings = read_settings(ExperimentSettings, compose("train", words))
+        settings = read_settings(ExperimentSettings, compose("train", words)) if folder.exists() else None
+        if settings and (is_finished(folder) or checkpoint.exists(folder)):
             require_same_run(folder, settings, finished=True)
+        elif settings:
+            require_new_run(folder, "sweep", settings.overwrite, resume=True)
     handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that launchers end theirs
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, fixed))}]")
     try:

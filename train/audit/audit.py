@@ -4,8 +4,8 @@ import json
 import shlex
 import shutil
 import sys
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Collection
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,8 @@ from train.lab.shots import LabSettings
 from train.networks import published
 from train.photographs.folder import FOREIGN, find_photographs
 from train.photographs.scoring import evaluate_photographs
-from train.run_folder import CONFIG, require_same, sole_writer, write_config
+from train.results import RESULTS, require_replaceable
+from train.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
 from train.settings import LARGEST_SEED, program, read_object, solid_name
 
 VIEWS, LIGHTS, ATTACKED, SETUPS = 24, 8, 12, 6  # views, random lights, attacked views, and setups of each pattern
@@ -52,6 +53,7 @@ class AuditSettings:
     laboratory: str | None = None  # the same of renders; null: made of the meshes, if Mitsuba is installed
     environments: list[str] = field(default_factory=lambda: ["grace", "eucalyptus", "st_peters"])  # or maps (.hdr ...)
     budget: float = 1.0  # factor of views, lights and renders; 1 takes EfficientNet-Lite0 18 minutes of one core
+    overwrite: bool = False  # begin anew in a folder that holds an audit or other results
     seed: int = 0
     device: str = "auto"  # auto | cpu | cuda | cuda:N
     out: str = "runs/audits/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # that of an audit that was stopped goes on
@@ -111,6 +113,7 @@ def run_audit(settings: AuditSettings) -> Path:
     lights = [UNIFORM, *settings.environments], settings.times(LIGHTS)
     views, attacked = (Views(objects, settings.times(n), settings.seed, device) for n in (VIEWS, ATTACKED))
     out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite, own=_own_results(out))
     caveats, renders = list[str](), out / "renders"  # an object of the label and another in every light
     sizes = [str(network.size) for network in networks.values()]
     if len({*sizes}) > 1:
@@ -118,14 +121,17 @@ def run_audit(settings: AuditSettings) -> Path:
     lab = settings.renders(renders, max(network.size for network in networks.values()))
     if page.LABORATORY not in folders:
         try:
-            with nullcontext() if renders.exists() else mitsuba():
+            with nullcontext() if renders.exists() and not settings.overwrite else mitsuba():
                 folders = {page.LABORATORY: renders} | folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and look_alikes with it ({error}).")
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
-        if (out / CONFIG).exists():
+        if settings.overwrite:
+            for name in (page.CLASSIFIER, page.HARDENED, renders.name):
+                shutil.rmtree(out / name, ignore_errors=True)
+        elif (out / CONFIG).exists():
             require_same(out, settings, "out=", lambda key, old, new: old is None and key in ADDED)
         write_config(out, settings, command=shlex.join([*program("audit"), *sys.argv[1:]]))
         if folders.get(page.LABORATORY) == renders:
@@ -144,6 +150,13 @@ def run_audit(settings: AuditSettings) -> Path:
                 _part(own / page.TRANSFER, transfers, network, *rest, attacked, own)
         names = {key: network.name for key, network in networks.items()}
         return page.write_audit_page(settings.label, names, folders, out, caveats)
+
+
+def _own_results(out: Path) -> Collection[str]:
+    """The results in a folder that an audit goes on with: all, if it is that of an audit."""
+    with suppress(InputError):
+        return RESULTS if "look_alikes" in read_config(out / CONFIG) else ()
+    return ()
 
 
 def _part(path: Path, measure: Callable[..., dict[str, Any]], *arguments: Any) -> None:

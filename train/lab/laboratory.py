@@ -34,6 +34,7 @@ from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
 from train.settings import read_object, solid_name
 
+RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"  # by label, with the number of the setup and the name of its light
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
 PROBE_HEIGHT = 64  # rows of the map of a built-in light
@@ -132,8 +133,12 @@ def write_laboratory(settings: LabSettings) -> int:
     slides = [decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy() for path in settings.slides]
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
-        if any(path.name != LOCK for path in out.iterdir()):
-            raise InputError(f"out={out} is not an empty folder: name another, or delete it")
+        if settings.overwrite:
+            for render in out.glob(RENDERS):
+                render.unlink()
+        elif any(path.name != LOCK for path in out.iterdir()):
+            advice = "choose another, or set overwrite=true to write over its results"
+            raise InputError(f"out={out} is not an empty folder: {advice}")
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             seed = stream_seed(settings.seed, "samples", number) % 2**32

@@ -56,6 +56,7 @@ class LabSettings:
     spp: int = 32  # paths per pixel and light
     bounces: int = 4  # of light, at most
     seed: int = 0
+    overwrite: bool = False  # render into a folder that is not empty, in place of the renders in it
 
     def __post_init__(self) -> None:
         families = {family for pattern in self.patterns for family in pattern.split("+")}

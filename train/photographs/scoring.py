@@ -17,7 +17,7 @@ from augment.classifiers.adapter import Label, OperatingPoint, as_class_names, l
 from augment.utils import progress
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
-from renderer.io.files import write_whole
+from renderer.io.files import remove_unfinished, write_whole
 from renderer.io.images import write_image
 from renderer.validation import as_folder, require_kind, require_whole
 from train.photographs.folder import TABLE, find_photographs, left_out, load_photographs, require_outside
@@ -133,6 +133,7 @@ def evaluate_photographs(
     }
 
     out.mkdir(parents=True, exist_ok=True)
+    remove_unfinished(out)
     write_predictions(out / PREDICTIONS, predictions)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     write_whole(out / SUMMARY, text + "\n")

@@ -19,6 +19,7 @@ from train.photographs.predictions import Prediction, by_label
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+ROC_TABLE, ROC_FIGURE = "roc.csv", "roc.png"
 PER_SECTION, COLUMNS = 40, 10
 IMAGE, FRAME = 96, 4  # px: the side of an enlarged image, and the width of its frame
 LONGEST_CAPTION = 18  # characters
@@ -79,7 +80,7 @@ def write_roc(folder: Path, scores: Mapping[str, Pair], label: str) -> None:
     writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
     for source, pair in scores.items():
         writer.writerows((source, *map(float, point)) for point in zip(*roc_curve(*pair), strict=True))
-    write_whole(folder / "roc.csv", table.getvalue())
+    write_whole(folder / ROC_TABLE, table.getvalue())
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
     bold = {"all": {"color": "black", "linewidth": 2.5, "zorder": 3}}
@@ -89,7 +90,7 @@ def write_roc(folder: Path, scores: Mapping[str, Pair], label: str) -> None:
         axes.legend(loc="lower right")
     image = io.BytesIO()
     figure.savefig(image)
-    write_whole(folder / "roc.png", image.getbuffer())
+    write_whole(folder / ROC_FIGURE, image.getbuffer())
 
 
 def draw_roc(
