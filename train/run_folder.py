@@ -44,20 +44,8 @@ logging.raiseExceptions = False  # on a full disk train.log lacks lines, and onl
 
 # Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
 CIRCUMSTANCES = (
-    *(
-        "run",
-        "sweep",
-        "out",
-        "device",
-        "launcher",
-        "overwrite",
-        "compare",
-        "command",
-        "working_folder",
-        "hardware",
-        "versions",
-    ),
-    *("inputs", "test_images"),
+    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
+    *("inputs", "test_images", "overwrite"),
     *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (

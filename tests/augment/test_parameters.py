@@ -63,6 +63,17 @@ def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
     return Goal(classes, None if target is None else classes + target)
 
 
+@pytest.mark.parametrize("factors", [(1.0, 0.3, 2.5)])
+def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene, factors):
+    scene = make_scene()
+    lights = scene.lights * torch.tensor(factors).double()[:, None, None]
+    scene = replace(scene, lights=lights)
+    problem = problem_of(scene, skylight=sky_at(SKY))
+    skies = problem.conditions(problem.start, EVERY).light
+    for sky, light in zip(skies, lights, strict=True):
+        assert mean_luminance(sky) == pytest.approx(mean_luminance(light), rel=1e-9)
+
+
 SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
 
 

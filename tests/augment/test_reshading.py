@@ -5,9 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
+import augment
 from augment.scene import Conditions, Scene
 from renderer.image import ENCODINGS, decode, encode
+from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.shapes import solid
 from renderer.transfer import build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -120,3 +123,17 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
         behind = scene.backgrounds[:, None].expand_as(images)
         torch.testing.assert_close(images.detach(), behind, rtol=0, atol=0)
         assert not torch.autograd.grad(images.sum(), values)[0].any()
+
+
+def test_frozen_shadows_darken_with_the_color():
+    """A cup shades itself inside. Painted half as bright, it looks like a cup of that color."""
+    cup, images = solid("cup"), []
+    options = {"encoding": "linear", "normals": "flat", "rasterizer": "numpy", "width": 2.4, "polar": 35.0}
+    for gray, added, shadows in ((0.6, -0.3, True), (0.3, 0.0, True), (0.3, 0.0, False)):
+        mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
+        scene = augment.build_scene([(mesh, "cup")], 24, 1, **options, shadows=shadows, backgrounds=[0.0])
+        albedo = torch.full((1, len(mesh.faces), 3), added)
+        images.append(scene.render(Conditions(scene.lights, albedo=albedo), torch.arange(1)))
+    painted, expected, without_shadows = images
+    assert (without_shadows - expected).abs().max() > 0.02
+    torch.testing.assert_close(painted, expected, rtol=0, atol=1e-5)

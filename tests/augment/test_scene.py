@@ -59,6 +59,20 @@ def test_an_impossible_scene_is_refused(wrong, message):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | wrong)
 
 
+def test_light_has_the_degree_of_the_smoothest_part_of_a_gloss_texture():
+    """Half of the texture is rough. The degree is that of a mesh which is as smooth all over."""
+    pear, roughness = renderer.solid("pear"), 64 / 255
+    factors = np.full((8, 8, 2), 255, np.uint8)
+    factors[:4, :, 0] = 64
+    uvs, ids = np.zeros((len(pear.faces), 3, 2), np.float32), np.zeros(len(pear.faces), np.int32)
+    gloss = np.tile(np.float32([1.0, 0.0, 1.0]), (len(pear.faces), 1))
+    white = (np.full((8, 8, 3), 255, np.uint8),)
+    textured = replace(pear, corner_uvs=uvs, texture_ids=ids, textures=white, gloss=gloss, gloss_textures=(factors,))
+    smooth = replace(pear, gloss=gloss * np.float32([roughness, 1, 1]))
+    bases = [build_scene([(mesh, "pear")], 8, 1, rasterizer="numpy").basis for mesh in (textured, smooth)]
+    assert bases[0] == bases[1] and bases[0].degree > 6
+
+
 def test_light_has_the_degree_that_gloss_needs_and_attacks_change_all_of_it(tmp_path):
     """An attack on a scene of this degree is written, and read back to the same image; of degree 6, rings are said."""
     write_map(tmp_path / "map.exr", to_map(probe("grace"), 64).clamp(min=0))

@@ -307,3 +307,14 @@ def test_attack_examples_are_new_successes_before_and_after(serve, scene, model)
         assert max(gaps) < 100 * EPS32
         torch.testing.assert_close(predictions, logits_of(model, images).softmax(1))
         assert ((predictions.argmax(1) == examples.labels) == right).all()
+
+
+def test_attack_examples_do_not_show_those_that_were_wrong_before(serve, model, labels):
+    """Half of the examples are given the class that the network does not see in them."""
+    wrong = torch.where(torch.arange(100) % 2 == 0, labels, 1)
+    settings = TrainingAttackSettings(max_steps=30, step_size=0.5)
+    renders = serve(labels=wrong, attack=settings).regenerate(model, 0)
+    examples = renders.attack_examples
+    assert renders.diagnostics["attack_success_before"] >= 0.5 and len(examples) > 0
+    assert (examples.labels != 1).all()
+    assert (examples.predictions[0].argmax(1) == examples.labels).all()

@@ -205,3 +205,14 @@ def test_the_answer_is_yes_only_where_intervals_lie_above_what_is_called_safe(mo
     parts["summary.json"] = {"recall": rate, "false_positive_rate": none}
     monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
     assert page._answer("orange", "a", Path(), ["laboratory"]).startswith(f"Is a safe in strange light? {answer}")
+
+
+def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(monkeypatch):
+    rate, views = page.fraction(400, 400), [True] * 400
+    parts = {page.RECOGNIZED: {"uniform": views, "random 1": views}}
+    parts |= {f"{kind}.json": {"correct": 4, "adversarial": [0, 1, 2, 4]} for kind in KINDS}
+    parts["summary.json"] = {"recall": rate, "false_positive_rate": page.fraction(0, 400)}
+    monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
+    answer = page._answer("orange", "a", Path(), ["laboratory"])
+    for light in KINDS.values():
+        assert f"{light.title} of radius {light.radii[2]:g} " in answer

@@ -129,7 +129,7 @@ def test_what_cannot_be_photographed_is_refused_before_anything_is_written(tmp_p
 
 def test_a_folder_that_holds_something_is_left_alone(laboratory):
     before = {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
-    with pytest.raises(InputError, match=r"out=.*lab is not an empty folder: name another, or delete it"):
+    with pytest.raises(InputError, match=r"out=.*lab .* overwrite=true"):
         lab.write_laboratory(settings(laboratory))
     assert before == {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
 

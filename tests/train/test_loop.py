@@ -120,6 +120,50 @@ def test_a_step_in_parts_follows_the_clipped_gradient_of_the_whole_batch(tmp_pat
         torch.testing.assert_close(step, 0.1 * gradient / length, rtol=0, atol=tolerance)
 
 
+def test_a_step_in_parts_is_that_of_the_mean_over_the_whole_batch(tmp_path, monkeypatch):
+    settings = {"accumulate": 4, "momentum": 0.0, "weight_decay": 0.0, "learning_rate": 1.0}
+    layer, before, gradients = step_on(monkeypatch, tmp_path, **settings)
+    for name, gradient in zip(("weight", "bias"), gradients, strict=True):
+        torch.testing.assert_close(before[name] - getattr(layer, name), gradient, rtol=0, atol=1e-6)
+
+
+def test_each_epoch_of_a_soup_begins_without_the_momentum_of_the_last(tmp_path, monkeypatch):
+    """All epochs have the same images and rates, so that all end at the weights of the first."""
+    draws = torch.Generator().manual_seed(1)
+    images, labels = torch.randint(0, 256, (3, 8, 3, 2, 2), generator=draws).to(torch.uint8), torch.arange(8) % 3
+    batches = [(batch, labels, labels < 0) for batch in images]
+    monkeypatch.setattr("train.loop.training_batches", lambda *rest: iter(batches))
+    monkeypatch.setattr("train.loop.evaluate", lambda *rest: {"loss": 1.0, "accuracy": 0.0})
+    ends = []
+    for epochs in (1, 3):
+        torch.manual_seed(1)
+        network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
+        settings = {"epochs": epochs, "batch_size": 8, "soup": True, "momentum": 0.9, "schedule": "one_cycle"}
+        trainer = make_trainer(tmp_path / str(epochs), network, **settings)
+        (tmp_path / str(epochs)).mkdir()
+        split = Split(images.flatten(0, 1), labels.repeat(3))
+        trainer.fit(split, torch.zeros(24, dtype=torch.bool), RunLog(trainer.folder))
+        ends.append(trainer.model.state_dict())
+    torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=0)
+
+
+def test_several_processes_that_resume_count_a_loss_once_between_them(tmp_path, monkeypatch):
+    trainer, saved = make_trainer(tmp_path, epochs=1, batch_size=8), []
+    due = iter([False, False, True, False])  # after each of the first four of five steps
+    monkeypatch.setattr(trainer, "_saving_is_due", lambda: next(due))
+    monkeypatch.setattr(trainer, "_save", lambda: saved.append(copy.deepcopy(trainer.state_dict())))
+    fit_noise(trainer)
+    whole = saved[0]["under_way"]["sums"]
+    assert saved[0]["under_way"]["step"] == 3 and whole[0] > 0
+    parts = []
+    for rank in range(2):
+        monkeypatch.setattr("train.loop.utils.rank", lambda rank=rank: rank)
+        resumed = make_trainer(tmp_path, epochs=1, batch_size=8)
+        resumed.load_state_dict(saved[0])
+        parts.append(resumed.state_dict()["under_way"]["sums"])
+    torch.testing.assert_close(sum(parts), whole, rtol=0, atol=0)
+
+
 def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
     trainer = make_trainer(tmp_path, precision="float16", epochs=1)
     trainer.scaler.load_state_dict(trainer.scaler.state_dict() | {"scale": 256.0})

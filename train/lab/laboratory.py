@@ -138,7 +138,7 @@ def write_laboratory(settings: LabSettings) -> int:
                 render.unlink()
         elif any(path.name != LOCK for path in out.iterdir()):
             advice = "choose another, or set overwrite=true to write over its results"
-            raise InputError(f"out={out} is not an empty folder: {advice}")
+            raise InputError(f"out={out} holds other files, and a laboratory needs an empty folder: {advice}")
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             seed = stream_seed(settings.seed, "samples", number) % 2**32

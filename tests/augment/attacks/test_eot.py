@@ -69,6 +69,15 @@ def test_each_change_does_what_it_says(monkeypatch):
     assert 0.05 < inner.abs().max() < 0.115  # a shift of a tenth of a ramp from 0 to 1, and a corner's turn
 
 
+def test_shifts_reach_the_jitter_as_a_fraction_of_the_width(monkeypatch):
+    """At the center, which turns and scales leave where it is, a ramp changes by the shift alone."""
+    monkeypatch.setattr(eot, "as_jpeg", lambda images, quality: images)
+    ramp = torch.linspace(0, 1, 32).expand(600, 3, 32, 32)
+    _, (_, moved) = transformed(ramp, jitter=0.1)
+    shift = (moved - ramp)[..., 15:17, 15:17].mean((1, 2, 3)).abs().max() * 31 / 32  # of 32 pixels from 0 to 1
+    assert 0.095 < shift < 0.105
+
+
 def test_jpeg_is_pillows():
     images = noise(2, 3, 16, 16)
     for image, found in zip(images, as_jpeg(images, 60), strict=True):

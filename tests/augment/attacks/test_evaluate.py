@@ -35,6 +35,15 @@ def test_a_success_within_the_steps_counts_also_where_a_margin_sends_it_on(attac
     assert checks["success"] == 1 and checks["success_by_steps"] == {3: 1, 9: 1, 30: 1}
 
 
+def test_a_success_at_the_very_last_step_counts_among_those_of_as_many_steps(attacked):
+    light = {"lighting": StepSettings(step_size=0.02)}
+    [last] = attacked(light, max_steps=60).steps.tolist()
+    assert 1 < last < 60
+    checks = augment.check(attacked(light, max_steps=last))
+    assert checks["success"] == 1 and checks["success_by_steps"][last] == 1
+    assert augment.check(attacked(light, max_steps=last - 1))["success"] == 0
+
+
 def test_random_search_that_does_as_well_is_a_warning(attacked):
     """Any change is a success against a classifier that knows images of almost exactly one brightness alone."""
     brightness, width = attacked("lighting", max_steps=0).images_before.mean(), 1e-4
