@@ -20,9 +20,7 @@ from train.settings import quoted
 @dataclass
 class Settings:
     runs: list[str] = MISSING  # folders of runs, sweeps and attacks; folders below them count, too
-    out: str | None = (
-        None  # the folder of the page and its images; null: their common parent, whose page it replaces
-    )
+    out: str | None = None  # the folder of the page and its images; null: their common parent, whose page it replaces
     overwrite: bool = False  # write over the results that out holds
 
     def __post_init__(self) -> None:

@@ -67,11 +67,11 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has a run twice: give each value once")
     for folder, words in zip(folders, runs, strict=True):
-        settings = read_settings(ExperimentSettings, compose("train", words)) if folder.exists() else None
-        if settings and (is_finished(folder) or checkpoint.exists(folder)):
+        if is_finished(folder) or checkpoint.exists(folder):
+            settings = read_settings(ExperimentSettings, compose("train", words))
             require_same_run(folder, settings, finished=True)
-        elif settings:
-            require_new_run(folder, "sweep", settings.overwrite, resume=True)
+        else:
+            require_new_run(folder, "sweep", bool(first.overwrite), resume=True)
     handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that launchers end theirs
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, fixed))}]")
     try:

@@ -59,6 +59,7 @@ def test_an_impossible_scene_is_refused(wrong, message):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | wrong)
 
 
+@pytest.mark.filterwarnings("ignore")  # of rings, which a lower degree would show
 def test_light_has_the_degree_of_the_smoothest_part_of_a_gloss_texture():
     """Half of the texture is rough. The degree is that of a mesh which is as smooth all over."""
     pear, roughness = renderer.solid("pear"), 64 / 255

@@ -90,8 +90,8 @@ def test_every_command_refuses_another_commands_folder_and_leaves_it_as_it_is(ca
     place = "run=out" if command == "train" else "out=out"
     assert call(command, *COMMANDS[command], place) == USER_ERROR
     printed = capsys.readouterr().err
-    last = [line for line in printed.splitlines() if line.startswith("error: ")]
-    assert len(last) == 1 and place.partition("=")[0] + "=" in last[0] and "out holds" in last[0] and "overwrite=true" in last[0], printed
+    [error] = [line for line in printed.splitlines() if line.startswith("error: ")]
+    assert place.partition("=")[0] + "=" in error and "out holds" in error and "overwrite=true" in error
     assert contents(here) == before
 
 

@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -160,7 +161,7 @@ def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp
 def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
     for settings, message in [
-        (tiny(), "holds a run already: set train.resume=true to go on, or choose another"),
+        (tiny(), "holds a run already: set train.resume=true to go on or overwrite=true"),
         (tiny("train.resume=true", "seed=8"), "was made with seed=7, not 8"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -171,8 +172,8 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
 def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(tiny, tmp_path, monkeypatch):
     before, counts = torch.get_num_threads(), []
     try:
-        for faster, asked in [(2, "null"), (1, "null"), (1, "3")]:
-            monkeypatch.setattr("train.run.choose_threads", Mock(return_value=faster))
+        for chosen, asked in [(2, "null"), (1, "null"), (1, "3")]:
+            monkeypatch.setattr("train.run.choose_threads", Mock(return_value=chosen))
             settings = tiny("augment=none", "train.epochs=1", f"train.threads={asked}", "train.resume=true")
             train_and_score = prepare(settings, load_data(settings), tmp_path)
             torch.set_num_threads(before)  # as another arm's may be
@@ -429,3 +430,67 @@ def test_statistics_are_those_of_the_network_begun_with_after_training_in_eval_m
     for name, value in trained.items():
         is_statistic = name.rpartition(".")[2] in ("running_mean", "running_var", "num_batches_tracked", "mean", "std")
         assert torch.equal(value, begun[name]) == is_statistic, name
+
+
+def test_a_run_killed_within_its_first_epoch_goes_on_within_it_and_ends_the_same(tiny, tmp_path, monkeypatch):
+    """A checkpoint after each step stands for one each minute; KeyboardInterrupt, which saves nothing, for the kill."""
+    settings = tiny("train.epochs=2", "train.resume=true")
+    train(settings, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "SAVING_EVERY", 0.0)
+        patch.setattr(loop, "SAVING_SHARE", 1e9)
+
+        def kill():
+            raise KeyboardInterrupt
+
+        act_at(patch, 0, 4, kill)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings, tmp_path / "killed")
+    state = checkpoint.load(tmp_path / "killed" / checkpoint.LAST)
+    assert (state["epoch"], state["under_way"]["step"]) == (0, 3)
+    train(settings, tmp_path / "killed")
+    assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
+    assert metrics(tmp_path / "killed") == metrics(tmp_path / "whole")
+
+
+def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, tiny, monkeypatch):
+    """The clock of the test goes on by 10 s in each step, and by 3 s in each checkpoint: one in 150 s or more."""
+    now, saved = [0.0], []
+    save, requested = checkpoint.save, loop.Interruption.requested
+    monkeypatch.setattr(loop.time, "perf_counter", lambda: now[0])
+
+    def slow_save(*arguments):
+        now[0] += 3
+        saved.append(now[0])
+        save(*arguments)
+
+    def slow_step(self):
+        now[0] += 10
+        return requested(self)
+
+    monkeypatch.setattr(checkpoint, "save", slow_save)
+    monkeypatch.setattr(loop.Interruption, "requested", slow_step)
+    train(tiny("augment=none", "train.epochs=1", "train.batch_size=1", "train.accumulate=1"), tmp_path)
+    *within, _, _ = saved  # the last two are best.pt and last.pt at the end
+    assert len(within) >= 3 and within[0] <= 75
+    assert all(later - earlier >= 150 for earlier, later in pairwise(within))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(lambda path, other: path.unlink(), id="missing"),
+        pytest.param(lambda path, other: path.write_bytes(path.read_bytes()[:2000]), id="cut"),
+        pytest.param(lambda path, other: path.write_bytes((other / "best.pt").read_bytes()), id="another run's"),
+    ],
+)
+def test_a_missing_or_foreign_best_network_stops_a_resumed_run_before_it_trains(tiny, finished, tmp_path, spoil):
+    """The other run differs in its seed alone."""
+    train(tiny("augment=none", "train.epochs=1", "seed=8"), tmp_path / "other")
+    train(tiny("augment=none", "train.epochs=1"), tmp_path / "run")
+    spoil(tmp_path / "run" / "best.pt", tmp_path / "other")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")}
+    settings = tiny("augment=none", "train.epochs=2", "train.resume=true")
+    with pytest.raises(InputError, match=r"best\.pt is not the network that this run kept"):
+        prepare(settings, load_data(settings), tmp_path / "run")
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")} == before

@@ -31,6 +31,7 @@ from train.errors import writable_folder
 from train.lab.patterns import RESOLUTION
 from train.lab.shots import FOV, LabSettings, Shot, draw_shots
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
+from train.results import require_replaceable
 from train.run_folder import LOCK, sole_writer
 from train.settings import read_object, solid_name
 
@@ -123,6 +124,7 @@ def write_laboratory(settings: LabSettings) -> int:
     Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
     subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
     environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
     labels = label_names(settings.label)
