@@ -83,8 +83,8 @@ class LampsSettings:
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
         require_field_types(self)
-        if isinstance(self.start, str):
-            lamps, powers = read_light(Path(self.start), Lamps)
+        if isinstance(self.start, str | Path):
+            lamps, powers = read_light(self.start, Lamps)
             return lamps, lamps.project_nonnegative(powers)
         try:
             positions = tuple((float(x), float(y), float(z)) for x, y, z in self.positions)
@@ -208,7 +208,7 @@ def build_scene(
     objects = [on_ground(item, shown.ground) for item in read]
     environment: Any = shown.light
     if isinstance(environment, str | Path):
-        environment = load_light(str(environment), _degree(objects, shown.degree))
+        environment = load_light(environment, _degree(objects, shown.degree))
     else:
         environment = as_tensor("light", environment)
         degree_of(environment)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ class MeshSettings:
 
     def __post_init__(self) -> None:
         require_field_types(self)
+        if isinstance(self.mesh, Path):
+            self.mesh = str(self.mesh)
         if self.gloss == "file" and self.mesh.startswith("solid:"):
             raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
         if self.gloss not in (None, "file"):

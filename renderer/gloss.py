@@ -147,7 +147,8 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
         rows = mesh.gloss[:1] if (mesh.gloss == mesh.gloss[0]).all() else mesh.gloss
         gloss = Gloss(*torch.from_numpy(rows).unbind(1))
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
-    values = [column if len(column) == 1 else column[fragments.faces][fragments.face] for column in columns]
+    by_face = [column if len(column) == 1 else column.index_select(0, fragments.faces) for column in columns]
+    values = [column if len(column) == 1 else column.index_select(0, fragments.face) for column in by_face]
     roughness, metallic, strength = values
     if textures:
         sources = [Texture.of(torch.from_numpy(texture).to(fragments.coverage) / 255) for texture in textures]

@@ -19,6 +19,7 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
 from augment.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
+from renderer.errors import InputError
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
@@ -63,10 +64,17 @@ def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
     return Goal(classes, None if target is None else classes + target)
 
 
-@pytest.mark.parametrize("factors", [(1.0, 0.3, 2.5)])
-def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene, factors):
+@pytest.mark.parametrize("wrong", [{"zenith": 120}, {"zenith": -1}, {"turbidity": 1}, {"azimuth": math.nan}])
+def test_a_sky_outside_of_the_model_is_refused_when_its_settings_are_made_in_their_units(wrong):
+    [(name, value)] = wrong.items()
+    with pytest.raises(InputError, match=f"{name}={value}"):
+        SkylightSettings(**wrong)
+    assert SkylightSettings(zenith=90, azimuth=-180, turbidity=10).zenith == 90
+
+
+def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene):
     scene = make_scene()
-    lights = scene.lights * torch.tensor(factors).double()[:, None, None]
+    lights = scene.lights * torch.tensor([1.0, 0.3, 2.5]).double()[:, None, None]
     scene = replace(scene, lights=lights)
     problem = problem_of(scene, skylight=sky_at(SKY))
     skies = problem.conditions(problem.start, EVERY).light

@@ -155,6 +155,8 @@ def test_a_pose_without_outlines_or_parts_is_refused_in_one_sentence():
         (200, "joints=200 must be"),
         ({"elbow": -1}, "joints.elbow=-1 must be"),
         ({"elbow": "far"}, "give degrees"),
+        ({"elbow": True}, "give degrees"),
+        (True, "give degrees"),
         ({"elbow": 10, "knee": 10}, "no joint knee: choose from shoulder, elbow, wrist"),
         (10, "pear:0 has no skin"),
     ],

@@ -1,6 +1,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,6 +58,24 @@ def test_views_follow_from_examples_meshes_and_backgrounds():
 def test_an_impossible_scene_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | wrong)
+
+
+def test_a_scene_without_light_is_refused():
+    with pytest.raises(InputError, match="exposure=0 must be"):
+        build_scene([("solid:orange", "orange")], 8, exposure=0)
+
+
+def test_a_scene_takes_paths_as_text_and_as_path(tmp_path):
+    renderer.export_mesh(renderer.solid("pear"), tmp_path / "pear.glb")
+    renderer.save_light(tmp_path / "light.json", probe("grace"))
+    Image.new("RGB", (8, 8), "teal").save(tmp_path / "behind.png")
+    images = []
+    for kind in (str, Path):
+        options = {"light": kind(tmp_path / "light.json"), "backgrounds": [kind(tmp_path / "behind.png")]}
+        for mesh in ((kind(tmp_path / "pear.glb"), "pear"), ObjectSettings(kind(tmp_path / "pear.glb"), "pear")):
+            scene = build_scene([mesh], 8, **options, rasterizer="numpy")
+            images.append(scene.render(scene.conditions(torch.arange(1)), torch.arange(1)))
+    assert all(torch.equal(image, images[0]) for image in images)
 
 
 @pytest.mark.filterwarnings("ignore")  # of rings, which a lower degree would show
