@@ -1,8 +1,9 @@
-"""The camera and the light of a photograph of a mesh, by descent through the renderer.
+"""Estimate the camera and the light of a photograph of a mesh by descent through the renderer.
 
-All but the mesh is made one gray, so that the image shows outline and shading at once. Of each camera, the light that
-fits best is the solution of linear equations, since images are linear in it. The gradient by the camera at that light
-is the gradient of the whole (variable projection, Golub and Pereyra 1973), so descent moves the camera alone.
+All pixels outside the mesh are set to one gray, so that the image shows outline and shading at once. For each camera,
+the best light is the solution of a convex quadratic program: images are linear in the light, and its radiance must not
+be negative. The gradient of the whole by the camera is the gradient at this light (variable projection, Golub and
+Pereyra 1973; the theorem of the envelope extends it to constraints), so descent moves the camera alone.
 
 Light and albedo appear as their product: an albedo twice as large halves the light.
 """
@@ -12,35 +13,55 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.optimize import minimize
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize, nnls
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.light.harmonics import bands
+from renderer.image import decode
+from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
 from renderer.rendering import precompute_transfer, render
+from renderer.shapes import sphere
 from renderer.transfer import COEFFICIENTS, DEGREE
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
-COARSE, KEPT, STEPS = 32, 3, 40  # pixels of the first search, its best cameras, and steps of descent from each
-SAMPLES = 8  # per side of a pixel
-SMOOTH = 1e-5  # weight of the light's squared Laplacian; what no surface shows of the light stays small
+COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
+SEARCH_STEPS, STEPS = 25, 40  # Steps of descent at the coarse and at the full size.
+SEARCH_SAMPLES, SAMPLES = 4, 8  # Samples per side of a pixel at the coarse and at the full size.
+DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
+PLAUSIBLE = 1.5  # Cameras with this multiple of the least squared error are compared at the full size.
+SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.
+DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of the channels.
+CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
+CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
+LEAST_RADIANCE = 0.005  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
+SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
 WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
 LEAST = 16  # pixels that the object must cover
 
 
 class FittedScene(NamedTuple):
-    """light: (49, 3). error: root mean square over the object's pixels, relative to theirs. overlap: of the rendered
-    and the given outline, their intersection over their union."""
+    """Camera and light of a photograph.
+
+    Attributes:
+        camera: The camera.
+        light: Coefficients, shape (49, 3), of a radiance that is nowhere negative.
+        error: Root mean square of the differences in linear light over the object's pixels, divided by that of the
+            photograph.
+        overlap: Intersection over union of the rendered and the given outline.
+    """
 
     camera: Camera
     light: Tensor
@@ -55,17 +76,33 @@ def fit_scene(
     *,
     fov: float | None = None,
     albedo_scale: float = 1.0,
+    encoding: str = "linear",
     normals: str = "smooth",
     bounces: int = 0,
     rasterizer: str = "auto",
 ) -> FittedScene:
-    """The camera and the environment light under which renders of a normalized mesh resemble a photograph most.
+    """Find the camera and the environment light under which renders of a normalized mesh resemble a photograph most.
 
-    photograph: linear, in [0, 1]. mask: the object's share of each pixel, in [0, 1]. fov: in radians between the
-    image's sides; None for a camera without perspective. The camera is upright and its optical axis may lie outside the
-    image's middle (`Camera.right`, `Camera.up`). bounces: of the light that is returned, with shadows;
-    without them, that of a concave mesh is too bright or too dim. InputError: no object in the mask, or shapes that do
-    not fit.
+    The camera is upright, and its optical axis may lie outside the image's middle (`Camera.right`, `Camera.up`).
+
+    Args:
+        photograph: Linear values in [0, 1], shape (3, size, size). Values of 1 count as clipped.
+        mask: The object's share of each pixel in [0, 1], shape (size, size).
+        mesh: The mesh, normalized and upright.
+        fov: Angle between the image's sides in radians. None for a camera without perspective.
+        albedo_scale: Factor of the mesh's albedo.
+        encoding: Encoding of the images that are to be rendered with the result, linear or srgb. It says whether the
+            mesh's colors are decoded, as in `render`. The photograph is linear in either case.
+        normals: flat or smooth.
+        bounces: Bounces of the returned light, with shadows. Without them, the light of a concave mesh is too bright
+            or too dim. The search for the camera ignores shadows.
+        rasterizer: auto, opengl, numba or numpy.
+
+    Returns:
+        The camera, the light, and how well they fit.
+
+    Raises:
+        InputError: If the mask holds no object, or if shapes do not fit.
     """
     size = photograph.shape[-1]
     if photograph.shape != (3, size, size) or mask.shape != (size, size):
@@ -73,21 +110,34 @@ def fit_scene(
         raise InputError(f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)")
     if float(mask.sum()) < LEAST:
         raise InputError(f"the mask covers {float(mask.sum()):.0f} pixels of {size}²: give one that shows the object")
-    options = {"albedo_scale": albedo_scale, "normals": normals, "rasterizer": rasterizer}
+    options = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals, "rasterizer": rasterizer}
     photograph, mask = photograph.double(), mask.double()
-    coarse, fine = (_Target.of(photograph, mask, mesh, small, options) for small in (min(COARSE, size), size))
+    coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), SEARCH_SAMPLES, options)
+    fine = _Target.of(photograph, mask, mesh, size, SAMPLES, options)
     cameras = [
         camera.seeing(float(np.linalg.norm(mesh.vertices, axis=1).max()))
         for polar in POLAR
         for camera in orbit_cameras(AZIMUTHS, 2.0, math.radians(polar), fov=fov)
     ]
-    framed = coarse.ranked(_framed(camera, mesh, mask) for camera in cameras)
+    framed = [camera for _, camera in coarse.ranked(_framed(camera, mesh, mask) for camera in cameras)]
     # Of a round object, all azimuths fit alike: so the best of each polar angle, too.
     of_polar = {camera.polar: camera for camera in reversed(framed)}
     starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
-    descended = coarse.ranked(coarse.descended(camera) for camera in starts)
-    camera = fine.ranked(fine.descended(camera) for camera in descended[:KEPT])[0]
+    descended = coarse.ranked(coarse.descended(camera, SEARCH_STEPS) for camera in starts)
+    least = descended[0][0]
+    plausible = _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])
+    _, camera = fine.ranked(fine.descended(camera, STEPS) for camera in plausible[:KEPT])[0]
     return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+
+
+def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
+    """Keep the first of all cameras whose axes differ by less than `DISTINCT`."""
+    kept: list[Camera] = []
+    for camera in cameras:
+        cosines = [float((camera.axes() * other.axes()).sum(1).min()) for other in kept]
+        if max(cosines, default=-1.0) < math.cos(DISTINCT):
+            kept.append(camera)
+    return kept
 
 
 class _Target(NamedTuple):
@@ -98,10 +148,13 @@ class _Target(NamedTuple):
     gray: float
     mesh: Mesh
     size: int
+    samples: int
     options: dict[str, Any]
 
     @staticmethod
-    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: dict[str, Any]) -> _Target:
+    def of(
+        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, samples: int, options: dict[str, Any]
+    ) -> _Target:
         inside = (mask > WHOLE).double()[None]
         near, weight = (F.avg_pool2d(values, 2 * BORDER + 1, 1, BORDER) for values in (photograph * inside, inside))
         photograph = torch.where(inside > 0, photograph, near / weight.clamp(min=1e-9))  # without background
@@ -110,34 +163,58 @@ class _Target(NamedTuple):
         )
         gray = 0.0 if float(photograph.sum()) > 1.5 * float(mask.sum()) else 1.0  # far from the object's own
         image = photograph + gray * (1 - mask)
-        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
+        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, samples, options)
 
-    def fitted(self, camera: Camera, least: float = 0.0) -> tuple[float, Tensor, Tensor]:
-        """(squared error, light (49, 3), coverage (size²,)) of the best light for a camera. least: share of the pixels
-        that the light is fitted to."""
-        [operator] = precompute_transfer(self.mesh, camera, self.size, samples=SAMPLES, **self.options)
+    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> tuple[float, Tensor, Tensor]:
+        """Fit the light for a camera.
+
+        Args:
+            camera: The camera.
+            least: The light is fitted to the pixels of which mesh and mask cover at least this share.
+            grid: Subdivisions of the grid of directions in which the light is at least `LEAST_RADIANCE`.
+
+        Returns:
+            The squared error with the penalty, the light (49, 3) and the coverage (size²,).
+        """
+        [operator] = precompute_transfer(self.mesh, camera, self.size, samples=self.samples, **self.options)
         units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, 3)
         shown = operator.radiance(units).permute(1, 0, 2)  # (3, 49, P)
         coverage = self.mask.new_zeros(self.size**2).index_copy(0, operator.pixels, operator.coverage.double())
-        wanted = (self.image - self.gray * (1 - coverage))[:, operator.pixels]
-        known = shown * (torch.minimum(coverage, self.mask)[operator.pixels] >= least)
-        light = torch.linalg.solve(known @ shown.mT + torch.diag(self.penalty), (known @ wanted[..., None])[..., 0]).T
-        predicted = self.gray * (1 - coverage).repeat(3, 1)
-        predicted[:, operator.pixels] += (light.T[:, None] @ shown)[:, 0]
-        error = (predicted - self.image).square().sum() + (self.penalty[:, None] * light.square()).sum()
+        behind = self.gray * (1 - coverage)
+        image = self.image[:, operator.pixels]
+        seen = (torch.minimum(coverage, self.mask)[operator.pixels] >= least).expand(3, -1)
+        clipped = image >= CLIPPED
+        used = seen
+        for _ in range(CLIPPING_ROUNDS):
+            known = shown * used[:, None]
+            squares = known @ shown.mT
+            penalty = self.penalty(squares)
+            wanted = known @ (image - behind[operator.pixels])[..., None]
+            light = _nonnegative_light(squares + torch.diag_embed(penalty), wanted[..., 0], grid)
+            predicted = (light.T[:, None] @ shown)[:, 0] + behind[operator.pixels]
+            brighter = seen & ~(clipped & (predicted > 1))  # A clipped pixel may be brighter than the photograph.
+            if torch.equal(brighter, used):
+                break
+            used = brighter
+        whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
+        error = (whole.clamp(max=1) - self.image).square().sum() + (penalty * light.T.square()).sum()
         return float(error), light, coverage
 
-    def ranked(self, cameras: Iterable[Camera]) -> list[Camera]:
-        """The cameras, those first whose best light fits best."""
-        return sorted(cameras, key=lambda camera: self.fitted(camera)[0])
+    def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
+        """Sort cameras by the squared error of their best light, which is returned with each."""
+        errors = [(self.fitted(camera)[0], camera) for camera in cameras]
+        return sorted(errors, key=lambda pair: pair[0])
 
-    @property
-    def penalty(self) -> Tensor:
+    def penalty(self, squares: Tensor) -> Tensor:
+        """Weights (3, 49) of the light's squared coefficients, in proportion to the squares (3, 49, 49) of what they
+        show, so that the result does not depend on the albedo's scale."""
+        constant = squares[:, 0, 0]
+        weight = torch.maximum(constant, DARKEST * constant.mean() + 1e-12 * self.mask.sum())
         band = bands(DEGREE).double()
-        return SMOOTH * self.mask.sum() * (1 + (band * (band + 1)).square())
+        return SMOOTH * weight[:, None] * (1 + (band * (band + 1)).square())
 
-    def descended(self, camera: Camera) -> Camera:
-        """The camera after descent, with numbers for fields."""
+    def descended(self, camera: Camera, steps: int) -> Camera:
+        """Return the camera after some steps of descent, with numbers for fields."""
         width = camera.width
 
         def moved(values: Sequence[Any]) -> Camera:
@@ -150,23 +227,67 @@ class _Target(NamedTuple):
         def step(values: np.ndarray) -> tuple[float, np.ndarray]:
             error, light, _ = self.fitted(moved(values.tolist()))
             fields = torch.from_numpy(values).requires_grad_()
-            options = {"samples": SAMPLES, "silhouettes": True, **self.options}
-            image = render(self.mesh, moved(fields.unbind()), light, self.size, self.gray, **options)[0]
-            (gradient,) = torch.autograd.grad((image.flatten(1) - self.image).square().sum(), fields)
+            image = self.rendered(moved(fields.unbind()), light, silhouettes=True)
+            (gradient,) = torch.autograd.grad((image - self.image).square().sum(), fields)
             return error, gradient.numpy()
 
         start = np.array([camera.polar, camera.azimuth, 1.0, camera.right / width, camera.up / width])
         bounds = [(0.02, math.pi - 0.02), (None, None), (0.5, 2.0), (-1.0, 1.0), (-1.0, 1.0)]
-        found = minimize(step, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+        found = minimize(step, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
         return moved(found.x.tolist())
 
+    def rendered(self, camera: Camera, light: Tensor, silhouettes: bool = False) -> Tensor:
+        """Render the mesh in linear light, shape (3, size²)."""
+        options = {"samples": self.samples, "silhouettes": silhouettes, **self.options}
+        image = render(self.mesh, camera, light, self.size, self.gray, **options)[0]
+        return decode(image, self.options["encoding"]).flatten(1)
+
     def scene(self, camera: Camera) -> FittedScene:
-        _, light, coverage = self.fitted(camera, WHOLE)
-        image = render(self.mesh, camera, light, self.size, self.gray, samples=SAMPLES, **self.options)[0].flatten(1)
+        """Fit the light of a camera and measure the result."""
+        _, light, coverage = self.fitted(camera, WHOLE, FINAL_GRID)
+        image = self.rendered(camera, light)
         inside = self.mask > WHOLE
         error = (image - self.image)[:, inside].norm() / self.image[:, inside].norm()
         overlap = torch.minimum(coverage, self.mask).sum() / torch.maximum(coverage, self.mask).sum()
         return FittedScene(camera, light, float(error), float(overlap))
+
+
+def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
+    """Minimize xᵀ S x / 2 − wᵀ x for each channel over lights x of nowhere negative radiance.
+
+    With S = L Lᵀ and y = Lᵀ x, this is the projection of L⁻¹ w onto the cone {y: G y ≥ 0}, where G = R L⁻ᵀ and R holds
+    the harmonics in the directions of a grid. By Moreau's decomposition, it is L⁻¹ w + Gᵀ μ with the non-negative μ
+    that minimizes |L⁻¹ w + Gᵀ μ|.
+
+    Args:
+        squares: The positive definite matrices S, shape (3, 49, 49).
+        wanted: The vectors w, shape (3, 49).
+        grid: Subdivisions of the grid of directions.
+
+    Returns:
+        The lights, shape (49, 3).
+    """
+    rows = _radiance_above_least(grid)
+    lights = []
+    for square, vector in zip(squares.numpy(), wanted.numpy(), strict=True):
+        lower = np.linalg.cholesky(square)
+        nearest = solve_triangular(lower, vector, lower=True)
+        sides = solve_triangular(lower, rows.T, lower=True)
+        if (nearest @ sides).min() < 0:
+            multipliers, _ = nnls(sides, -nearest)
+            nearest = nearest + sides @ multipliers
+        lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
+    return torch.from_numpy(np.stack(lights, axis=1))
+
+
+@cache
+def _radiance_above_least(grid: int) -> NDArray[Any]:
+    """Map a light's coefficients to its radiance in the directions of a grid, less `LEAST_RADIANCE` of its mean:
+    shape (N, 49)."""
+    directions, _ = sphere(grid)
+    rows = basis(torch.from_numpy(directions), DEGREE).numpy()
+    rows[:, 0] *= 1 - LEAST_RADIANCE
+    return rows
 
 
 def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:

@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,21 @@ from omegaconf import MISSING
 from PIL import Image
 
 from augment.objects import ObjectSettings, load_object
-from renderer.camera import PerspectiveCamera
-from renderer.errors import InputError, require_range
+from renderer.camera import Camera, PerspectiveCamera
+from renderer.errors import InputError, require_choice, require_range
 from renderer.fitting import fit_scene
-from renderer.image import MOST_BOUNCES, decode
-from renderer.io.images import read_rgb, write_image
+from renderer.image import ENCODINGS, MOST_BOUNCES, decode, encode, to_bytes
+from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.presets import save_light
-from renderer.rendering import render
+from train.attack import AttackExperimentSettings, build_attacked
 from train.errors import writable_folder
 from train.results import require_replaceable
+from train.settings import compose, read_object, read_settings
 
 MARGIN = 1.6  # the image's side, in those of the object's box
 DETAIL = 448  # pixels per side of the background that is written
+ATTACKED = 224  # pixels per side of the images that the printed attack renders, for its default classifier
+WHOLE = 0.98  # a pixel with a larger share is the object's
 DOUBTFUL, WRONG = 0.9, 0.3  # overlap of the outlines, error of the pixels
 
 
@@ -38,16 +41,18 @@ class Settings:
     mesh: str = MISSING  # a file, or solid:NAME:SEED; upright, as in the photograph
     mask: str | None = None  # an image of the photograph's size, white where the object is
     box: list[int] = field(default_factory=list)  # or [left, top, right, bottom] in pixels, for OpenCV's GrabCut
-    fov: float | None = None  # degrees between the image's sides, about the object; null: orthographic
+    fov: float | None = None  # degrees between the sides of a square around the object, 1.6 times as wide; null: orthographic
     albedo_scale: float = 1.0  # of the mesh; twice as much halves the light
+    encoding: str = "srgb"  # of the photograph, the mesh's colors and the printed attack's images: srgb | linear
     bounces: int = 3  # of the light between the mesh's surfaces; 0: without shadows, too
     label: str = "orange"  # the class of the printed attack
     size: int = 64  # pixels per side that are compared
-    out: str = "runs/fit"  # the folder of background.png, light.json and comparison.png
+    out: str = "runs/fit"  # the folder of background.png, mask.png, light.json and comparison.png
     overwrite: bool = False  # write over the results that out holds
 
     def __post_init__(self) -> None:
         require_range("size", self.size, 16, 512)
+        require_choice("encoding", self.encoding, ENCODINGS)
         require_range("bounces", self.bounces, 0, MOST_BOUNCES)
         require_range("albedo_scale", self.albedo_scale, 1e-3, 1e3)
         if self.fov is not None:
@@ -68,33 +73,66 @@ def main(settings: Settings) -> None:
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     fov = None if settings.fov is None else math.radians(settings.fov)
-    photograph, share = (as_tensor(cropped(array, center, side, settings.size)) for array in (image, mask))
-    linear = decode(photograph, "srgb")
-    shared: dict[str, Any] = {"albedo_scale": settings.albedo_scale, "bounces": settings.bounces}
-    found = fit_scene(linear, share[0], mesh, fov=fov, **shared)
+    share = mask[..., None]
+    found = fit_scene(
+        cropped(image, center, side, settings.size, settings.encoding),
+        cropped(share, center, side, settings.size, beyond=0)[0],
+        mesh,
+        fov=fov,
+        albedo_scale=settings.albedo_scale,
+        encoding=settings.encoding,
+        bounces=settings.bounces,
+    )
     camera = found.camera
     # The scene's cameras look at the mesh's middle, so the background is cut out around it.
     center = center + np.array([camera.right, -camera.up]) / camera.width * side
-    background = cropped(image, center, side, DETAIL)
+    behind = cropped(image, center, side, DETAIL, settings.encoding)
     out.mkdir(parents=True, exist_ok=True)
-    write_image(out / "background.png", Image.fromarray(background))
+    write_values(out / "background.png", encode(behind, settings.encoding))
+    write_values(out / "mask.png", cropped(share, center, side, DETAIL, beyond=0).expand(3, -1, -1))
     save_light(out / "light.json", found.light)
-    centered = replace(camera, right=0.0, up=0.0)
-    behind = as_tensor(background).double()
-    shown = render(mesh, centered, found.light, DETAIL, behind, samples=4, encoding="srgb", **shared)[0]
-    pair = torch.cat([behind, shown], dim=2)
-    side_by_side = (pair * 255).round().byte().permute(1, 2, 0)
-    write_image(out / "comparison.png", Image.fromarray(side_by_side.numpy()))
-    print(f"outlines overlap by {found.overlap:.1%}; the object's pixels differ by {found.error:.1%}")
-    if found.overlap < DOUBTFUL or found.error > WRONG:
+    command = attack_command(settings, camera, out)
+    photograph, shown = rendered_by(command)
+    inside = read_image(out / "mask.png", ATTACKED)[0] > WHOLE
+    error = relative_error(shown[:, inside], photograph[:, inside], settings.encoding)
+    write_values(out / "comparison.png", torch.cat([photograph, shown], dim=2))
+    print(f"outlines overlap by {found.overlap:.1%}; the object's pixels differ by {error:.1%}")
+    if found.overlap < DOUBTFUL or error > WRONG:
         print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")
-    angles = f"scene.polar={math.degrees(camera.polar):.3f}", f"scene.azimuth={math.degrees(camera.azimuth) % 360:.3f}"
-    view = [f"scene.fov={math.degrees(camera.angle):.3f}"] if isinstance(camera, PerspectiveCamera) else []
-    named = f"scene.meshes=[{{mesh: '{settings.mesh}', albedo_scale: {settings.albedo_scale:g}}}]"
-    scene = [named, *angles, f"scene.width={camera.width:.4f}", *view, f"scene.light={out / 'light.json'}"]
-    scene += [f"scene.backgrounds=[{out / 'background.png'}]", "scene.search=0", "renderer.encoding=srgb"]
+    print(shlex.join(command))
+
+
+def attack_command(settings: Settings, camera: Camera, out: Path) -> list[str]:
+    """Write the command that attacks the light of the fitted scene, as a list of its words."""
+    mesh = f"scene.meshes=[{{mesh: '{settings.mesh}', albedo_scale: {settings.albedo_scale:g}}}]"
+    polar = f"scene.polar={math.degrees(camera.polar):.3f}"
+    azimuth = f"scene.azimuth={math.degrees(camera.azimuth) % 360:.3f}"
+    scene = [mesh, polar, azimuth, f"scene.width={camera.width:.4f}"]
+    if isinstance(camera, PerspectiveCamera):
+        scene.append(f"scene.fov={math.degrees(camera.angle):.3f}")
+    scene += [f"scene.light={out / 'light.json'}", f"scene.backgrounds=[{out / 'background.png'}]", "scene.search=0"]
     shadows = f"renderer.bounces={settings.bounces}" if settings.bounces else "renderer.shadows=false"
-    print(shlex.join(["pnb-attack", "attack=lighting", f"label={settings.label}", *scene, shadows]))
+    renderer = [f"renderer.encoding={settings.encoding}", shadows]
+    return ["pnb-attack", "attack=lighting", f"label={settings.label}", *scene, *renderer]
+
+
+def rendered_by(command: list[str]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Read a command of `attack_command` and its files as pnb-attack does.
+
+    Returns:
+        The background and the image that is attacked, both encoded, shape (3, ATTACKED, ATTACKED).
+    """
+    settings = read_settings(AttackExperimentSettings, compose("attack", command[1:]))
+    item = read_object(settings.scene.meshes[0], settings.label, 0)
+    scene = build_attacked(settings, item, settings.scene, ATTACKED, torch.device("cpu"))
+    first = torch.arange(1)
+    return scene.backgrounds[0], scene.render(scene.conditions(first), first)[0, 0]
+
+
+def relative_error(shown: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
+    """Root mean square difference of encoded pixels in linear light, relative to the photograph's root mean square."""
+    expected = decode(photograph.double(), encoding)
+    return float((decode(shown.double(), encoding) - expected).norm() / expected.norm())
 
 
 def read_file(path: str) -> np.ndarray:
@@ -129,19 +167,47 @@ def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
     return np.where(labels % 2 == 1, 255, 0).astype(np.uint8)  # certain and probable foreground
 
 
-def cropped(array: np.ndarray, center: np.ndarray, side: float, size: int) -> np.ndarray:
-    """(size, size, ...) of a square about a point (x, y); beyond the image, its border goes on."""
-    pad = math.ceil(side)
-    mode = "edge" if array.ndim == 3 else "constant"  # a mask has no object there
-    padded = np.pad(array, [(pad, pad), (pad, pad), (0, 0)][: array.ndim], mode=mode)  # type: ignore[call-overload]
-    left, top = center - side / 2 + pad
+def cropped(
+    image: np.ndarray,
+    center: np.ndarray,
+    side: float,
+    size: int,
+    encoding: str = "linear",
+    beyond: int | None = None,
+) -> torch.Tensor:
+    """Cut out a square, decode it and resample it.
+
+    Args:
+        image: Pixels of 8 bits, shape (H, W, C).
+        center: The middle of the square (x, y) in pixels.
+        side: Pixels of the image per side of the square.
+        size: Pixels per side of the result.
+        encoding: Encoding of the pixels.
+        beyond: Value outside the image, 0 to 255. None repeats its border.
+
+    Returns:
+        Linear values in [0, 1], shape (C, size, size), float32.
+    """
+    left, top = center - side / 2
+    columns = np.arange(math.floor(left), math.ceil(left + side))
+    rows = np.arange(math.floor(top), math.ceil(top + side))
+    height, width = image.shape[:2]
+    window = image[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1)]
+    if beyond is not None:
+        outside = ((rows < 0) | (rows >= height))[:, None] | (columns < 0) | (columns >= width)
+        window[outside] = beyond
+    linear = decode(torch.from_numpy(window).permute(2, 0, 1) / 255, encoding)
+    left, top = left - math.floor(left), top - math.floor(top)
     box = left, top, left + side, top + side
-    return np.asarray(Image.fromarray(padded).resize((size, size), Image.Resampling.BOX, box=box))
+    # The box filter is the renderer's. Where pixels are enlarged, it would leave steps.
+    method = Image.Resampling.BOX if side >= size else Image.Resampling.BICUBIC
+    channels = [Image.fromarray(channel.numpy()).resize((size, size), method, box=box) for channel in linear]
+    return torch.from_numpy(np.stack([np.array(channel) for channel in channels])).clamp(0, 1)
 
 
-def as_tensor(array: np.ndarray) -> torch.Tensor:
-    """(C, H, W) float32 in [0, 1]."""
-    return torch.from_numpy(np.atleast_3d(array).copy()).permute(2, 0, 1) / 255
+def write_values(path: Path, image: torch.Tensor) -> None:
+    """Write values (3, H, W) in [0, 1] as an image of 8 bits."""
+    write_image(path, Image.fromarray(to_bytes(image.permute(1, 2, 0)).numpy()))
 
 
 if __name__ == "__main__":

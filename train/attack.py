@@ -183,13 +183,7 @@ def attacks(
     """(name, settings of the attacked scene, result) of an adversary, around which norm-balls then are, or without one
     of each mesh, in a scene that `scene.search` found. InputError also where the classifier is wrong before."""
 
-    def build(item: ObjectSettings, scene: AttackSceneSettings) -> Scene:
-        """An example per view and background, or per background where views share the attack."""
-        options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
-        options["rasterizer"] = chosen_rasterizer(settings.renderer)
-        with keyed("scene", vars(scene)):
-            return build_scene([item], classifier.size, scene.views, shared=settings.attack.shared, **options)
-
+    build = partial(build_attacked, settings, size=classifier.size, device=device)
     target, seed, force = settings.target, settings.seed, settings.attack.force
     if adversary is not None:
         if adversary.pixels is not None:
@@ -209,6 +203,30 @@ def attacks(
         except InputError as error:  # which names arguments of Python
             raise InputError(re.sub(r"(force|shared)=True", r"attack.\1=true", str(error))) from error
         yield named.mesh, chosen, result
+
+
+def build_attacked(
+    settings: AttackExperimentSettings, item: ObjectSettings, scene: AttackSceneSettings, size: int, device: torch.device
+) -> Scene:
+    """Build the scene of one mesh, with an example per view and background, or per background if views share the attack.
+
+    Args:
+        settings: All settings of the attack.
+        item: The mesh.
+        scene: The settings of the scene, which replace those in `settings`.
+        size: Pixels per side of the images.
+        device: The device of the light and the images.
+
+    Returns:
+        The scene that is attacked.
+
+    Raises:
+        InputError: If a setting of the scene does not fit, which the message names.
+    """
+    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
+    options["rasterizer"] = chosen_rasterizer(settings.renderer)
+    with keyed("scene", vars(scene)):
+        return build_scene([item], size, scene.views, shared=settings.attack.shared, **options)
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
