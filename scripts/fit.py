@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -83,15 +83,14 @@ def main(settings: Settings) -> None:
         encoding=settings.encoding,
         bounces=settings.bounces,
     )
-    camera = found.camera
     # The scene's cameras look at the mesh's middle, so the background is cut out around it.
-    center = center + np.array([camera.right, -camera.up]) / camera.width * side
+    center = center + np.array([found.camera.right, -found.camera.up]) / found.camera.width * side
     behind = cropped(image, center, side, DETAIL, settings.encoding)
     out.mkdir(parents=True, exist_ok=True)
     write_values(out / "background.png", encode(behind, settings.encoding))
     write_values(out / "mask.png", cropped(share, center, side, DETAIL, beyond=0).expand(3, -1, -1))
     save_light(out / "light.json", found.light)
-    command = attack_command(settings, camera, out)
+    command = attack_command(settings, turned_to_mesh(found.camera), out)
     photograph, shown = rendered_by(command)
     inside = read_image(out / "mask.png", ATTACKED)[0] > WHOLE
     error = relative_error(shown[:, inside], photograph[:, inside], settings.encoding)
@@ -100,6 +99,21 @@ def main(settings: Settings) -> None:
     if found.overlap < DOUBTFUL or error > WRONG:
         print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")
     print(shlex.join(command))
+
+
+def turned_to_mesh(camera: Camera) -> Camera:
+    """Turn a camera at its place, so that it looks at the mesh's middle. Its image is cut out there, too.
+
+    A camera with perspective sees the mesh from another angle than that of its optical axis if the mesh is not in the
+    middle of the image.
+    """
+    if not isinstance(camera, PerspectiveCamera):
+        return replace(camera, right=0.0, up=0.0)
+    x, y, z = camera.eye()[:3].tolist()
+    distance = math.hypot(x, y, z)
+    polar = math.acos(z / distance)
+    azimuth = math.atan2(y, x)
+    return replace(camera, polar=polar, azimuth=azimuth, right=0.0, up=0.0, distance=distance)
 
 
 def attack_command(settings: Settings, camera: Camera, out: Path) -> list[str]:

@@ -9,10 +9,11 @@ import torch
 import renderer
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.fitting import fit_scene
+from renderer.fitting import FINAL_GRID, LEAST_RADIANCE, _nonnegative_light, fit_scene
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
-from renderer.light.environment import write_map
+from renderer.light.environment import to_map, write_map
+from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
 
 FAR = OrthographicCamera(0.9, 2.0, 3.0, 0.2, -0.1)
@@ -80,6 +81,29 @@ def test_how_high_the_camera_stands_is_found_of_a_round_object():
     mask = 1 - renderer.render(mesh, camera, 0 * light, 64, 1.0, samples=8)[0, 0]
     found = fit_scene(image.clamp(0, 1), mask, mesh, fov=camera.angle)
     assert found.camera.polar == pytest.approx(camera.polar, abs=math.radians(1))
+
+
+def test_the_light_of_a_quadratic_program_is_nowhere_negative_and_no_other_such_light_is_better():
+    """At the minimum of a convex function, its derivative toward any other light of the set is not negative. The other
+    lights are the squares of lights of degree 3 and a constant light, and zero."""
+    generator = torch.Generator().manual_seed(0)
+    factors = torch.randn(3, 49, 60, generator=generator, dtype=torch.float64)
+    squares = factors @ factors.mT
+    wanted = (squares @ torch.randn(3, 49, 1, generator=generator, dtype=torch.float64))[..., 0]
+    light = _nonnegative_light(squares, wanted, FINAL_GRID)
+    radiance = to_map(light, 256)
+    assert radiance.min() >= 0
+    free = torch.linalg.solve(squares, wanted[..., None])[..., 0].T
+    assert to_map(free, 64).amin((0, 1)).max() < -0.1  # The constraint matters in all channels.
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3, generator=generator, dtype=torch.float64), dim=1)
+    harmonics = basis(directions, 6)
+    roots = basis(directions, 3) @ torch.randn(16, 200, generator=generator, dtype=torch.float64)
+    others = torch.linalg.lstsq(harmonics, roots.square()).solution
+    others[0] += 2 * LEAST_RADIANCE * others[0]
+    others = torch.cat([others, 0 * others[:, :1]], dim=1)
+    slope = (squares @ light.T[..., None])[..., 0] - wanted  # (3, 49)
+    toward = slope @ others - (slope * light.T).sum(1, keepdim=True)
+    assert toward.min() > -1e-6 * toward.abs().max()
 
 
 def test_a_mask_of_nothing_is_refused():

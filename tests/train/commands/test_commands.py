@@ -14,6 +14,7 @@ from PIL import Image
 import renderer
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
+from renderer.image import decode
 from renderer.io.images import read_image
 from renderer.light.environment import to_map
 from renderer.light.harmonics import project
@@ -164,7 +165,8 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
         assert call(*fit, *arguments) == USER_ERROR
         assert message in capsys.readouterr().err and not (here / "fitted").exists()
     assert call(*fit, "mask=mask.png") == 0
-    command = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    output = capsys.readouterr().out
+    command = shlex.split(output.splitlines()[-1])
     settings = read_settings(AttackExperimentSettings, compose("attack", command[1:]))
     assert not settings.renderer.shadows and settings.label == "orange"  # as it was fitted
     scene, angles = settings.scene, [math.radians(angle) for angle in (settings.scene.polar, settings.scene.azimuth)]
@@ -172,3 +174,12 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     shown = renderer.render(mesh, found, load_light(scene.light), 64, background, samples=4, encoding="srgb")[0]
     differ = (shown - background).abs().amax(0)
     assert (differ > 0).double().mean() > 0.2 and float(differ[differ > 0].mean()) < 0.06  # all else is photographed
+    background = read_image(scene.backgrounds[0], 224).double()  # of the pixels of the default classifier
+    light = load_light(scene.light).double()
+    shown = renderer.render(mesh, found, light, 224, background, samples=2, encoding="srgb")[0]
+    inside = read_image(here / "fitted" / "mask.png", 224)[0] > 0.98
+    shown, background = (decode(image[:, inside], "srgb") for image in (shown, background))
+    real = float((shown - background).norm() / background.norm())
+    printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
+    assert printed == pytest.approx(real, abs=0.00051) and real < 0.05
+    assert to_map(light, 128).min() >= 0
