@@ -47,6 +47,7 @@ DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of t
 CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
 CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
 LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
+FIRST_DIRECTIONS = 16  # Every so many directions of a grid constrain the first solution.
 SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
 WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
 LEAST = 16  # pixels that the object must cover
@@ -152,9 +153,7 @@ class _Target(NamedTuple):
     options: dict[str, Any]
 
     @staticmethod
-    def of(
-        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, samples: int, options: dict[str, Any]
-    ) -> _Target:
+    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, samples: int, options: dict[str, Any]) -> _Target:
         inside = (mask > WHOLE).double()[None]
         near, weight = (F.avg_pool2d(values, 2 * BORDER + 1, 1, BORDER) for values in (photograph * inside, inside))
         photograph = torch.where(inside > 0, photograph, near / weight.clamp(min=1e-9))  # without background
@@ -271,11 +270,17 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     lights = []
     for square, vector in zip(squares.numpy(), wanted.numpy(), strict=True):
         lower = np.linalg.cholesky(square)
-        nearest = solve_triangular(lower, vector, lower=True)
+        free = solve_triangular(lower, vector, lower=True)
         sides = solve_triangular(lower, rows.T, lower=True)
-        if (nearest @ sides).min() < 0:
-            multipliers, _ = nnls(sides, -nearest)
-            nearest = nearest + sides @ multipliers
+        nearest = free
+        # Few directions matter, so others join when radiance is negative there. The result is that of all directions.
+        known = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
+        negative = free @ sides < 0
+        while negative.any():
+            multipliers, _ = nnls(sides[:, known], -free)
+            nearest = free + sides[:, known] @ multipliers
+            negative = (nearest @ sides < 0) & ~known
+            known |= negative
         lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
     return torch.from_numpy(np.stack(lights, axis=1))
 

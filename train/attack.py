@@ -206,9 +206,13 @@ def attacks(
 
 
 def build_attacked(
-    settings: AttackExperimentSettings, item: ObjectSettings, scene: AttackSceneSettings, size: int, device: torch.device
+    settings: AttackExperimentSettings,
+    item: ObjectSettings,
+    scene: AttackSceneSettings,
+    size: int,
+    device: torch.device,
 ) -> Scene:
-    """Build the scene of one mesh, with an example per view and background, or per background if views share the attack.
+    """Build the scene of one mesh: an example per view and background, or per background if the views are shared.
 
     Args:
         settings: All settings of the attack.
