@@ -147,7 +147,8 @@ def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
 def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
     """A cup in front of noise, at another place than the image's middle: rendered and scored as photographed."""
     camera, light = OrthographicCamera(1.0, 0.5, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
-    mesh, size = renderer.normalize(renderer.solid("cup")), 96
+    light[0] += 0.2  # no negative radiance
+    mesh, size = renderer.normalize(renderer.solid("cup")), 192
     behind = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)).double()
     image = renderer.render(mesh, camera, light, size, behind, samples=4, encoding="srgb")[0]
     share = 1 - renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0, 0]
@@ -157,7 +158,7 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     Image.new("L", (9, 9), 255).save(here / "small.png")
     Image.new("L", (size, size)).save(here / "black.png")
     for arguments, message in (
-        (["mask=small.png"], "mask=small.png has 9 × 9 pixels: give one of the photograph's size, 96 × 96"),
+        (["mask=small.png"], "mask=small.png has 9 × 9 pixels: give one of the photograph's size, 192 × 192"),
         (["mask=black.png"], "no object is found"),
         (["mask=none.png"], "none.png cannot be read"),
         ([], "give mask=FILE or box=[left,top,right,bottom], one of them"),
@@ -181,5 +182,5 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     shown, background = (decode(image[:, inside], "srgb") for image in (shown, background))
     real = float((shown - background).norm() / background.norm())
     printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
-    assert printed == pytest.approx(real, abs=0.00051) and real < 0.05
+    assert printed == pytest.approx(real, abs=0.00051) and real < 0.15
     assert to_map(light, 128).min() >= 0
