@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
-SEARCH_STEPS, STEPS = 25, 40  # Steps of descent at the coarse and at the full size.
-SEARCH_SAMPLES, SAMPLES = 4, 8  # Samples per side of a pixel at the coarse and at the full size.
+STEPS = 40  # Steps of descent from each camera.
+SAMPLES = 8  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
-PLAUSIBLE = 1.5  # Cameras with this multiple of the least squared error are compared at the full size.
+PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
 SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.
 DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of the channels.
 CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
@@ -113,8 +113,8 @@ def fit_scene(
         raise InputError(f"the mask covers {float(mask.sum()):.0f} pixels of {size}²: give one that shows the object")
     options = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals, "rasterizer": rasterizer}
     photograph, mask = photograph.double(), mask.double()
-    coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), SEARCH_SAMPLES, options)
-    fine = _Target.of(photograph, mask, mesh, size, SAMPLES, options)
+    coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
+    fine = _Target.of(photograph, mask, mesh, size, options)
     cameras = [
         camera.seeing(float(np.linalg.norm(mesh.vertices, axis=1).max()))
         for polar in POLAR
@@ -124,10 +124,10 @@ def fit_scene(
     # Of a round object, all azimuths fit alike: so the best of each polar angle, too.
     of_polar = {camera.polar: camera for camera in reversed(framed)}
     starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
-    descended = coarse.ranked(coarse.descended(camera, SEARCH_STEPS) for camera in starts)
+    descended = coarse.ranked(coarse.descended(camera) for camera in starts)
     least = descended[0][0]
     plausible = _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])
-    _, camera = fine.ranked(fine.descended(camera, STEPS) for camera in plausible[:KEPT])[0]
+    _, camera = fine.ranked(fine.descended(camera) for camera in plausible[:KEPT])[0]
     return fine._replace(options={**options, "bounces": bounces}).scene(camera)
 
 
@@ -149,11 +149,10 @@ class _Target(NamedTuple):
     gray: float
     mesh: Mesh
     size: int
-    samples: int
     options: dict[str, Any]
 
     @staticmethod
-    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, samples: int, options: dict[str, Any]) -> _Target:
+    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: dict[str, Any]) -> _Target:
         inside = (mask > WHOLE).double()[None]
         near, weight = (F.avg_pool2d(values, 2 * BORDER + 1, 1, BORDER) for values in (photograph * inside, inside))
         photograph = torch.where(inside > 0, photograph, near / weight.clamp(min=1e-9))  # without background
@@ -162,7 +161,7 @@ class _Target(NamedTuple):
         )
         gray = 0.0 if float(photograph.sum()) > 1.5 * float(mask.sum()) else 1.0  # far from the object's own
         image = photograph + gray * (1 - mask)
-        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, samples, options)
+        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
 
     def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> tuple[float, Tensor, Tensor]:
         """Fit the light for a camera.
@@ -175,7 +174,7 @@ class _Target(NamedTuple):
         Returns:
             The squared error with the penalty, the light (49, 3) and the coverage (size²,).
         """
-        [operator] = precompute_transfer(self.mesh, camera, self.size, samples=self.samples, **self.options)
+        [operator] = precompute_transfer(self.mesh, camera, self.size, samples=SAMPLES, **self.options)
         units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, 3)
         shown = operator.radiance(units).permute(1, 0, 2)  # (3, 49, P)
         coverage = self.mask.new_zeros(self.size**2).index_copy(0, operator.pixels, operator.coverage.double())
@@ -212,8 +211,8 @@ class _Target(NamedTuple):
         band = bands(DEGREE).double()
         return SMOOTH * weight[:, None] * (1 + (band * (band + 1)).square())
 
-    def descended(self, camera: Camera, steps: int) -> Camera:
-        """Return the camera after some steps of descent, with numbers for fields."""
+    def descended(self, camera: Camera) -> Camera:
+        """Return the camera after descent, with numbers for fields."""
         width = camera.width
 
         def moved(values: Sequence[Any]) -> Camera:
@@ -232,12 +231,12 @@ class _Target(NamedTuple):
 
         start = np.array([camera.polar, camera.azimuth, 1.0, camera.right / width, camera.up / width])
         bounds = [(0.02, math.pi - 0.02), (None, None), (0.5, 2.0), (-1.0, 1.0), (-1.0, 1.0)]
-        found = minimize(step, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
+        found = minimize(step, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
         return moved(found.x.tolist())
 
     def rendered(self, camera: Camera, light: Tensor, silhouettes: bool = False) -> Tensor:
         """Render the mesh in linear light, shape (3, size²)."""
-        options = {"samples": self.samples, "silhouettes": silhouettes, **self.options}
+        options = {"samples": SAMPLES, "silhouettes": silhouettes, **self.options}
         image = render(self.mesh, camera, light, self.size, self.gray, **options)[0]
         return decode(image, self.options["encoding"]).flatten(1)
 
