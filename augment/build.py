@@ -24,7 +24,7 @@ from renderer.errors import (
     require_range,
 )
 from renderer.gloss import smoothest
-from renderer.image import ImageSettings
+from renderer.image import ImageSettings, samples_per_side
 from renderer.io.images import read_image
 from renderer.light.basis import with_local_lights
 from renderer.light.harmonics import MAX_DEGREE, degree_of
@@ -143,12 +143,12 @@ class SceneSettings:
 class RendererSettings:
     """How `build_scene` renders; the schema of a command's `renderer`, too.
 
-    rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples: per pixel side. encoding,
-    normals, shadows, bounces, silhouettes: as for `renderer.render`.
+    rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples, encoding, normals, shadows,
+    bounces, silhouettes: as for `renderer.render`.
     """
 
     rasterizer: str = "auto"
-    samples: int = 2
+    samples: int | None = None
     encoding: str = "linear"
     normals: str = "smooth"
     shadows: bool = False
@@ -162,7 +162,9 @@ class RendererSettings:
 
     def image(self, size: int) -> ImageSettings:
         """The settings of an image of `size` pixels per side."""
-        return ImageSettings(size, **{name: value for name, value in vars(self).items() if name != "rasterizer"})
+        choices = {name: value for name, value in vars(self).items() if name != "rasterizer"}
+        choices["samples"] = samples_per_side(self.samples, self.silhouettes)
+        return ImageSettings(size, **choices)
 
 
 Shown = str | Path | Mesh

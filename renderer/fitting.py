@@ -26,7 +26,7 @@ from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.image import decode
+from renderer.image import decode, samples_per_side
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
 from renderer.rendering import precompute_transfer, render
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
 STEPS = 40  # Steps of descent from each camera.
-SAMPLES = 8  # Samples per side of a pixel.
+SAMPLES = samples_per_side(None, silhouettes=True)  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
 PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
 SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.

@@ -130,6 +130,11 @@ class Fragments:
         by_row = image.view(self.size, self.size, self.samples, self.samples).transpose(1, 2)
         return by_row.reshape(self.size * self.samples, -1)
 
+    def of_image(self, image: Tensor) -> Tensor:
+        """(S,) the values of an image of samples, (size · samples, size · samples), at the samples."""
+        by_pixel = image.view(self.size, self.samples, self.size, self.samples).transpose(1, 2)
+        return by_pixel.flatten().index_select(0, self.sample)
+
     def interpolate(self, corners: Tensor) -> Tensor:
         """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
         rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()

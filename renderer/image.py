@@ -22,6 +22,7 @@ MOST_BOUNCES = 100
 LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
 FINEST = 64  # samples per pixel side: coverage is resolved to 1/4096
+SAMPLES, SAMPLES_OF_OUTLINES = 2, 8  # per pixel side by default, the latter where derivatives see how outlines move
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,21 @@ class ImageSettings:
     def global_illumination(self) -> bool:
         """Whether a mesh changes its own light, by shadows or bounces."""
         return self.shadows or self.bounces > 0
+
+
+def samples_per_side(samples: int | None, silhouettes: bool) -> int:
+    """The samples per side of a pixel that were asked for or, of None, the default.
+
+    Args:
+        samples: per side of a pixel, or None.
+        silhouettes: derivatives see how outlines move, whose documented accuracy needs more samples.
+
+    Returns:
+        A number per side of a pixel.
+    """
+    if samples is not None:
+        return samples
+    return SAMPLES_OF_OUTLINES if silhouettes else SAMPLES
 
 
 def tonemap(

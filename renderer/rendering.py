@@ -17,7 +17,7 @@ from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_bounded, require_choice, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.image import ImageSettings, as_background, composite, decode
+from renderer.image import SAMPLES, ImageSettings, as_background, composite, decode, samples_per_side
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh, require_mesh
@@ -55,7 +55,7 @@ def render(
     albedo: Float[Tensor, "F 3"] | Float[Tensor, "height width 3"] | None = None,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
-    samples: int = 2,
+    samples: int | None = None,
     encoding: str = "linear",
     normals: str = "smooth",
     shadows: bool = False,
@@ -72,7 +72,7 @@ def render(
     they cast shadows and do not bounce. background: see `renderer.image.as_background`; one for all views, or an image
     for each. vertices: in place of the mesh's. albedo: linear in [0, 1], in place of the mesh's colors per face, or of
     its only texture. albedo_scale multiplies the albedo, also beyond 1. gloss: in place of the mesh's. samples: per
-    pixel side. encoding: linear or srgb. normals: flat or smooth. shadows: that the mesh casts on itself. bounces: of
+    pixel side; None is 2, or 8 with silhouettes. encoding: linear or srgb. normals: flat or smooth. shadows: that the mesh casts on itself. bounces: of
     light between its surfaces, shadows included. rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold
     visibility constant; those by vertices, albedo and gloss also hold shadows and bounces of environment light
     constant. silhouettes: gradients by vertices, and by fields of the cameras that are tensors of one number, also see
@@ -85,7 +85,8 @@ def render(
     (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
     require_mesh("mesh", mesh)
-    settings = ImageSettings(size, samples, encoding, normals, shadows, bounces, silhouettes)
+    per_side = samples_per_side(samples, silhouettes)
+    settings = ImageSettings(size, per_side, encoding, normals, shadows, bounces, silhouettes)
     cameras = _listed(cameras)
     _require_scale(albedo_scale)
     _require_gloss(gloss)
@@ -209,7 +210,7 @@ def precompute_transfer(
     *,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
-    samples: int = 2,
+    samples: int = SAMPLES,
     encoding: str = "linear",
     normals: str = "smooth",
     shadows: bool = False,

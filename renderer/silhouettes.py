@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -32,7 +31,6 @@ from renderer.rasterizer.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-LARGE = 128  # pixels per side: surfaces' slopes are taken along one row and column of samples per pixel, otherwise two
 NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on it
 
 
@@ -103,21 +101,11 @@ def _by_surface(
     positions: Tensor, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
 ) -> Tensor:
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
-    stride = fragments.samples if fragments.size >= LARGE else max(fragments.samples // 2, 1)
-    forces, levels = radiance.new_zeros(2, radiance.shape[1]), fragments.image_of_samples(radiance.sum(0), torch.nan)
-    for axis, force in enumerate(forces):
-        lines, level = ((image.T if axis else image)[stride // 2 :: stride].contiguous() for image in (grid, levels))
-        differ = F.pad((level[:, 1:] - level[:, :-1]).abs() > 0, (0, 1)).flatten().nonzero().squeeze(1)  # NaN is not
-        first, second = (lines.view(-1).index_select(0, cells).long() for cells in (differ, differ + 1))
-        before, after = crossings.samples[:, crossings.horizontal == (axis == 0)]
-        goes_on = torch.ones_like(force, dtype=torch.bool).index_fill_(0, before[(before >= 0) & (after >= 0)], False)
-        jump = radiance.index_select(1, first) - radiance.index_select(1, second)
-        jump *= sum(upstream.index_select(1, fragments.pixel.index_select(0, pair)) for pair in (first, second))
-        jump = jump.sum(0) * goes_on.index_select(0, first)
-        moved = jump * (stride / 2 if axis == 0 else -stride / 2)  # rows run down
-        force.index_add_(0, first, moved).index_add_(0, second, moved)
-    moving = torch.nonzero((forces[0] != 0) | (forces[1] != 0)).squeeze(1)
-    part, forces = fragments.select(moving), forces.index_select(1, moving).T
+    right = _forces_along(1, fragments, crossings, grid, radiance, upstream)
+    down = _forces_along(0, fragments, crossings, grid, radiance, upstream)
+    moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
+    part = fragments.select(moving)
+    forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
     if fragments.depths is not None:
         depth = part.interpolate(positions[:, 2:][part.corners])
         forces = _homogeneous(forces, part.positions(), depth)
@@ -125,6 +113,30 @@ def _by_surface(
     gradient = positions.new_zeros(positions.shape[::-1])
     gradient[: forces.shape[1]].index_add_(1, part.corners.T.flatten(), by_corners)
     return gradient.T
+
+
+def _forces_along(
+    dim: int, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
+) -> Tensor:
+    """(S,) the gradient by the places of samples along columns (dim 0) or rows (dim 1) of all samples of the image."""
+    samples, steps = fragments.samples, len(grid) - 1
+    upstream = upstream.index_select(1, fragments.pixel)
+    level = fragments.image_of_samples((radiance * upstream).sum(0), torch.nan)
+    jump = torch.zeros_like(level)  # from a sample to the next one
+    torch.sub(level.narrow(dim, 0, steps), level.narrow(dim, 1, steps), out=jump.narrow(dim, 0, steps))
+    jump.nan_to_num_(0)  # one of them is background
+    # The upstream gradient differs between the two pixels of neighbors across a border.
+    borders = slice(samples - 1, -1, samples), slice(samples, None, samples)
+    before, after = ((border, slice(None)) if dim == 0 else (slice(None), border) for border in borders)
+    covered = (grid[before] >= 0) & (grid[after] >= 0)
+    first, second = grid[before][covered], grid[after][covered]
+    both = upstream.index_select(1, first) + upstream.index_select(1, second)
+    difference = radiance.index_select(1, first) - radiance.index_select(1, second)
+    jump[before].masked_scatter_(covered, (difference * both).sum(0) / 2)
+    jump.view(-1).index_fill_(0, crossings.cells[0, crossings.horizontal == (dim == 1)], 0)
+    force = jump.clone()  # half of the jump times the upstream gradients of both
+    force.narrow(dim, 1, steps).add_(jump.narrow(dim, 0, steps))
+    return fragments.of_image(force)
 
 
 def _by_silhouettes(

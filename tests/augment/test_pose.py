@@ -197,3 +197,10 @@ def test_near_the_start_descent_fools_an_imagenet_network_as_often_as_random_and
     assert result.success.sum() == fooled >= max(at_random.sum(), on_grid.sum())
     lines = augment.save(result, tmp_path, verify=["mitsuba"])
     assert [line["versions"]["mitsuba"]["success"] for line in lines] == result.success.tolist()
+
+
+def test_a_scene_with_outlines_takes_the_samples_of_their_documented_accuracy_unless_a_number_is_given():
+    def samples(**options) -> int:
+        return augment.build_scene([("solid:pear", "pear")], 8, rasterizer="numpy", **options).settings.samples
+
+    assert (samples(silhouettes=True), samples(), samples(silhouettes=True, samples=3)) == (8, 2, 3)

@@ -179,3 +179,16 @@ def test_quoted_text_is_read_as_it_is(text):
 )
 def test_a_name_stays_text_whatever_it_looks_like_to_hydra(argument, override):
     assert as_override(argument) == override
+
+
+def test_commands_that_need_outlines_take_the_samples_of_their_documented_accuracy():
+    def samples(kind: type, command: str, *overrides: str) -> int:
+        return read_settings(kind, compose(command, overrides)).renderer.image(8).samples
+
+    attack = AttackExperimentSettings, "attack", "scene.meshes=[solid:orange]"
+    assert samples(*attack, "attack=lighting") == 2
+    assert samples(*attack, "attack=pose") == 8
+    assert samples(*attack, "attack=geometry", "renderer.silhouettes=true") == 8
+    assert samples(*attack, "attack=pose", "renderer.samples=4") == 4
+    train = ExperimentSettings, "train", "run=here", "renderer.silhouettes=true"
+    assert samples(*train, "renderer.samples=null") == 8
