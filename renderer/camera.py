@@ -145,7 +145,9 @@ class OrthographicCamera(Camera):
 
     def project(self, points: np.ndarray) -> np.ndarray:
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
-        return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
+        rows = (self.axes() * scale[:, None]) @ points.T
+        rows += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
+        return rows.T
 
     def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
         return torch.ones_like(back), back
@@ -181,7 +183,7 @@ class PerspectiveCamera(Camera):
         scale = 2 / self.width * (self.distance / depths)
         before = self.distance - self.near
         depth = 2 * self.far / (self.far - self.near) * ((before - back) / depths) - 1
-        return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth], axis=1)
+        return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth]).T
 
     def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
         w = 1 - back / self.distance

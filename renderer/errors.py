@@ -107,5 +107,8 @@ def _short(value: object) -> str:
 def _largest(tensor: Tensor) -> float:
     if not tensor.numel():
         return 0.0
-    low, high = torch.aminmax(tensor.detach())  # both are NaN where anything is
+    values = tensor.detach()
+    if values.ndim == 2 and not values.is_contiguous():
+        values = values.T  # which aminmax would otherwise copy, where its columns lie side by side in memory
+    low, high = torch.aminmax(values)  # both are NaN where anything is
     return max(-low.item(), high.item())

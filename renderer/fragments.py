@@ -214,7 +214,8 @@ def build_fragments(
     fragments; that is no error. InputError: NaN, or a perspective camera that the mesh is not all in front of.
     """
     require_finite(vertices=torch.from_numpy(vertices))
-    points = np.stack([camera.project(vertices) for camera in cameras])
+    rows = np.stack([camera.project(vertices).T for camera in cameras])  # each coordinate side by side in memory
+    points = rows.swapaxes(1, 2)
     closed = closed and bool((points[..., 2] >= -1).all())
     ids = rasterizer.rasterize(points, faces, settings.size * settings.samples, closed=closed)
     depths = [camera.depths(vertices) for camera in cameras]
@@ -234,9 +235,13 @@ def _fragments(
     by_pixel = within.swapaxes(1, 2).reshape(-1).view(ids.dtype)
     hits = np.flatnonzero(by_pixel >= 0)
     visible, face = _compact(by_pixel[hits], len(faces))
-    counts = np.bincount(hits // samples**2, minlength=size**2)
-    pixels = np.flatnonzero(counts > 0)
-    counts = counts[pixels]
+    if samples == 1:  # a sample is a pixel
+        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits), dtype=np.int64)
+    else:
+        counts = np.bincount(hits // samples**2, minlength=size**2)
+        pixels = np.flatnonzero(counts > 0)
+        counts = counts[pixels]
+        pixel = np.repeat(np.arange(len(pixels)), counts)
     corners = np.ascontiguousarray(faces.take(visible, axis=0).T)
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
@@ -250,7 +255,7 @@ def _fragments(
         corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
         facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        pixel=torch.from_numpy(np.repeat(np.arange(len(pixels)), counts)),
+        pixel=torch.from_numpy(pixel),
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
@@ -263,8 +268,10 @@ def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     values = values.astype(np.intp)  # once, instead of in each of the two lookups
     present = np.zeros(count, dtype=bool)
     present[values] = True
-    position = np.cumsum(present) - 1
-    return np.flatnonzero(present), position.take(values)
+    distinct = np.flatnonzero(present)
+    place = np.empty(count, dtype=np.intp)  # only the entries of distinct values are ever touched
+    place[distinct] = np.arange(len(distinct))
+    return distinct, place.take(values)
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
 ROUNDING = 64 * torch.finfo(torch.float64).eps  # of a sum of areas
+FEW = 2  # vertices of the mesh per corner of faces: with more, sums are taken over these faces' vertices alone
 SLIVER = 1 / 16  # sine of a corner's angle below which plain float64 would lose more than some 64 of its ulps
 
 
@@ -85,8 +86,13 @@ class _AreaVectors(torch.autograd.Function):
         shape, dtype = ctx.vertices
         by_second, by_third = _cross(second, upstream), _cross(upstream, first)
         corners = torch.cat([-by_second - by_third, by_second, by_third], dim=1)
-        gradient = upstream.new_zeros(shape[::-1]).index_add_(1, faces.T.flatten(), corners)
-        return (gradient / scale).T.to(dtype), None
+        corners, index = corners.div_(scale), faces.T.flatten()
+        if shape[0] < FEW * len(index):
+            return upstream.new_zeros(shape[::-1]).index_add_(1, index, corners).T.to(dtype), None
+        touched, index = index.unique(return_inverse=True)
+        sums = corners.new_zeros(3, len(touched)).index_add_(1, index, corners)
+        gradient = torch.zeros(shape[::-1], dtype=dtype, device=sums.device)
+        return gradient.index_copy_(1, touched, sums.to(dtype)).T, None
 
 
 def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:

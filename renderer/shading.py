@@ -28,7 +28,7 @@ from renderer.errors import require_bounded
 from renderer.fragments import Fragments
 from renderer.gloss import SampleGloss, at_samples, toward_camera
 from renderer.light import harmonics
-from renderer.normals import area_vectors, vertex_normals
+from renderer.normals import FEW, area_vectors, vertex_normals
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -197,8 +197,14 @@ def normals_in_sight(
     """`vertex_normals`, in float32 or wider, of the vertices of faces in sight; the others touch no sample."""
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     near[fragments.corners.T.flatten()] = True
-    around = faces[near.index_select(0, faces.T.flatten()).view(3, -1).any(0)]
-    return vertex_normals(vertices.to(torch.promote_types(vertices.dtype, torch.float32)), around)
+    first, second, third = near.index_select(0, faces.flatten()).view(-1, 3).T
+    around = faces[first | second | third]
+    vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
+    if len(vertices) < FEW * around.numel():
+        return vertex_normals(vertices, around)
+    own, around = around.unique(return_inverse=True)
+    of_own = vertex_normals(vertices.index_select(0, own), around)
+    return torch.zeros_like(vertices, requires_grad=False).index_copy(0, own, of_own)
 
 
 def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:

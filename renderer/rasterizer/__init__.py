@@ -37,11 +37,14 @@ class Rasterizer:
 
     def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
         """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
-        if not np.isfinite(points).all():
+        low, high = points.min(initial=0), points.max(initial=0)
+        if not (np.isfinite(low) and np.isfinite(high)):
             raise ValueError("points hold NaN or infinity")
         limit = SPAN / resolution
+        if max(-low, high) > limit:
+            points = np.clip(points, -limit, limit)
         module = import_module(f"renderer.rasterizer.{self.name}")
-        return module.rasterize(np.clip(points, -limit, limit), faces, resolution, closed)
+        return module.rasterize(points, faces, resolution, closed)
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:

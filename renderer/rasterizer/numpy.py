@@ -63,9 +63,16 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
     Before they are snapped, positions are float32 numbers, from a multiply-add that rounds once, as GPUs have it.
     """
     half = resolution / 2
-    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]]) + half
-    positions = np.rint(window.astype(np.float32) * SUBSAMPLES).astype(np.int64) - SUBSAMPLES // 2
-    return positions, (points[:, 2] + 1) / 2 * FAR
+    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
+    window += half
+    snapped = window.astype(np.float32)
+    snapped *= SUBSAMPLES
+    positions = np.rint(snapped, out=snapped).astype(np.int64)
+    positions -= SUBSAMPLES // 2
+    depths = points[:, 2] + 1
+    depths /= 2
+    depths *= FAR
+    return positions, depths
 
 
 def _cull(corners: np.ndarray, resolution: int, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -100,12 +100,15 @@ class RayHits(NamedTuple):
 
 
 class Rays:
-    """Rays among the faces of one mesh. InputError, when the first ray is cast, where Embree is not installed.
-    offset: how far above its surface a ray starts."""
+    """Rays among the faces of one mesh. InputError, when the first ray is cast, where Embree is not installed."""
 
     def __init__(self, mesh: Mesh):
-        self.offset = OFFSET * float(np.abs(mesh.vertices).max())
         self._mesh = mesh
+
+    @cached_property
+    def offset(self) -> float:
+        """How far above its surface a ray starts."""
+        return OFFSET * float(np.abs(self._mesh.vertices).max())
 
     def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
         """Blocks of a view's pixels that may see another surface, in directions (D, 3) of a `sphere`.
