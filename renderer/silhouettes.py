@@ -101,8 +101,9 @@ def _by_surface(
     positions: Tensor, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
 ) -> Tensor:
     """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
-    right = _forces_along(1, fragments, crossings, grid, radiance, upstream)
-    down = _forces_along(0, fragments, crossings, grid, radiance, upstream)
+    upstream = upstream.index_select(1, fragments.pixel)
+    level = fragments.image_of_samples((radiance * upstream).sum(0), torch.nan)
+    right, down = (_forces_along(dim, fragments, crossings, grid, level, radiance, upstream) for dim in (1, 0))
     moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
     part = fragments.select(moving)
     forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
@@ -116,12 +117,18 @@ def _by_surface(
 
 
 def _forces_along(
-    dim: int, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
+    dim: int,
+    fragments: Fragments,
+    crossings: Crossings,
+    grid: Tensor,
+    level: Tensor,
+    radiance: Tensor,
+    upstream: Tensor,
 ) -> Tensor:
-    """(S,) the gradient by the places of samples along columns (dim 0) or rows (dim 1) of all samples of the image."""
+    """(S,) the gradient by the places of samples along columns (dim 0) or rows (dim 1) of all samples of the image.
+
+    level: radiance times upstream gradient, (3, S) both, as an image of samples, NaN where nothing is covered."""
     samples, steps = fragments.samples, len(grid) - 1
-    upstream = upstream.index_select(1, fragments.pixel)
-    level = fragments.image_of_samples((radiance * upstream).sum(0), torch.nan)
     jump = torch.zeros_like(level)  # from a sample to the next one
     torch.sub(level.narrow(dim, 0, steps), level.narrow(dim, 1, steps), out=jump.narrow(dim, 0, steps))
     jump.nan_to_num_(0)  # one of them is background
