@@ -70,13 +70,13 @@ def render(
     light: (degree + 1)² coefficients (`load_light`), in whose dtype and on whose device the images are computed; None
     for no environment light. lights: lamps and projectors, alone for full white power, or with coefficients (size, 3);
     they cast shadows and do not bounce. background: see `renderer.image.as_background`; one for all views, or an image
-    for each. vertices: in place of the mesh's. albedo: linear in [0, 1], in place of the mesh's colors per face, or of
-    its only texture. albedo_scale multiplies the albedo, also beyond 1. gloss: in place of the mesh's. samples: per
-    pixel side; None is 2, or 8 with silhouettes. encoding: linear or srgb. normals: flat or smooth. shadows: that the mesh casts on itself. bounces: of
-    light between its surfaces, shadows included. rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold
-    visibility constant; those by vertices, albedo and gloss also hold shadows and bounces of environment light
-    constant. silhouettes: gradients by vertices, and by fields of the cameras that are tensors of one number, also see
-    how outlines and surfaces move in the image.
+    for each. vertices: in place of the mesh's. albedo: linear in [0, 1], in place of the mesh's colors per face, or
+    of its only texture. albedo_scale multiplies the albedo, also beyond 1. gloss: in place of the mesh's. samples:
+    per pixel side; None is 2, or 8 with silhouettes. encoding: linear or srgb. normals: flat or smooth. shadows: that
+    the mesh casts on itself. bounces: of light between its surfaces, shadows included. rasterizer: auto, opengl,
+    numba or numpy. Gradients by vertices hold visibility constant; those by vertices, albedo and gloss also hold
+    shadows and bounces of environment light constant. silhouettes: gradients by vertices, and by fields of the
+    cameras that are tensors of one number, also see how outlines and surfaces move in the image.
     InputError: NaN, shapes that do not fit, unknown choices, arguments of other types, albedo beyond [0, 1].
 
     >>> light = renderer.load_light("grace").requires_grad_()
