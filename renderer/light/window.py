@@ -1,0 +1,86 @@
+"""The window that cuts a light off after a degree without ringing.
+
+A window multiplies the coefficients of band l by w_l, which is the convolution of the light with the kernel
+
+    k(cos θ) = Σ_l (2l + 1) / 4π w_l P_l(cos θ).
+
+Where the kernel is nowhere negative, light that is nowhere negative stays so, and w_0 = 1 keeps its mean. Of such
+kernels, the one here gives a point source the irradiance of the smallest error, Σ_l (2l + 1) A_l² (1 - w_l)², in which
+A_l are the factors of diffuse surfaces (`harmonics.lambertian_factors`). As they vanish in the odd bands from the third
+on, SMALLEST takes the place of smaller ones; it raises the error by less than 10⁻⁴ of it.
+
+This is a convex quadratic program with a constraint for each angle. The exchange method (Hettich and Kortanek 1993,
+"Semi-infinite programming", section 7) solves it at some angles and adds those where the kernel is negative.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numpy.polynomial import legendre
+from scipy.optimize import nnls
+from torch import Tensor
+
+from renderer.light.harmonics import bands, lambertian_factors, per_degree
+
+SMALLEST = 1e-3  # factor of a band, of that of the first
+_ROUNDS = 100  # thirteen are usual
+_DEPTH = 1e-9  # of a dip below zero that is left, of the kernel's largest value
+
+
+@per_degree
+def nonnegative_window(degree: int) -> Tensor:
+    """The best non-negative window of a degree, by which each coefficient of a light is multiplied.
+
+    The rms irradiance error of a point source is 0.17, 0.073 and 0.039 of its rms irradiance at degrees 6, 12 and 19.
+
+    Args:
+        degree: of the light, from 0 to 20.
+
+    Returns:
+        ((degree + 1)²,) float64 factors from 0 to 1, the same for all coefficients of a band, and 1 for the first.
+    """
+    if degree == 0:
+        return torch.ones(1, dtype=torch.float64)
+    l = np.arange(degree + 1)
+    weight = np.sqrt(2 * l + 1) * irradiance_weights(degree)[l**2].numpy()
+    cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
+    for _ in range(_ROUNDS):
+        factors = _best_factors(cosines, weight)
+        series = (2 * l + 1) * factors
+        turning = legendre.legroots(legendre.legder(series))
+        candidates = np.concatenate([turning.real.clip(-1, 1), [-1.0, 1.0]])
+        values = legendre.legval(candidates, series)
+        negative = candidates[values < -_DEPTH * values.max()]
+        if not len(negative):
+            break
+        cosines = np.concatenate([cosines, negative])
+    factors[1:] /= max(1 - values.min(), 1)  # towards the constant kernel 1, until no dip is left
+    return torch.from_numpy(factors)[bands(degree)]
+
+
+@per_degree
+def irradiance_weights(degree: int) -> Tensor:
+    """The factors ((degree + 1)²,) of diffuse surfaces, of that of the first coefficient, at least SMALLEST."""
+    factors = lambertian_factors(degree)
+    return (factors / factors[0]).abs().clamp(min=SMALLEST)
+
+
+def _best_factors(cosines: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The factors (degree + 1,) whose kernel is not negative at the cosines (N,), by least distance programming.
+
+    For y = weight (w - 1), the smallest |y| with G y ≥ h is -r_j / r_(last), of the residual r of |[Gᵀ; hᵀ] u - f| with
+    u ≥ 0 and f = (0, ..., 0, 1) (Lawson and Hanson 1974, chapter 23).
+    """
+    degree = len(weight) - 1
+    kernel = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1)
+    sides = kernel[:, 1:] / weight[1:]
+    least = -kernel.sum(1)  # of sides · y, since w = 1 + y / weight
+    scale = np.abs(least).max()
+    dual = np.vstack([sides.T, least / scale])
+    goal = np.zeros(degree + 1)
+    goal[degree] = 1
+    multipliers, _ = nnls(dual, goal)
+    residual = dual @ multipliers - goal
+    change = -residual[:degree] / residual[degree] * scale
+    return np.concatenate([[1.0], 1 + change / weight[1:]])
