@@ -154,8 +154,10 @@ def lamps(scene: Scene, settings: StepSettings) -> Parameter:
 def _light(
     scene: Scene, settings: StepSettings, name: str, part: tuple[slice, Any], nonnegative: bool = True
 ) -> Parameter:
-    """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
-    is not to be negative, the nearest light that can be emitted, and so is every light from there on.
+    """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own. Where light is
+    not to be negative, the start is `project_nonnegative` of it, which keeps its mean. A step then ends in the nearest
+    light, in coefficients, that can be emitted and lies within the norm-ball; its mean may differ from what the step
+    asked for, since within a ball there need not be such a light of that mean.
 
     part: the coefficients of the basis among the scene's, and the basis.
     """
@@ -164,7 +166,7 @@ def _light(
 
     def possible(values: Tensor, within: Ball | None = None) -> Tensor:
         of_lights = None if within is None else within.unflatten(-1, 3)
-        return basis.project_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+        return basis.nearest_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
 
     def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return _relit(conditions, where, values.unflatten(1, (-1, 3)))

@@ -72,12 +72,18 @@ class Harmonics:
         """(N, size) from unit directions (N, 3), per unit of each coefficient."""
         return basis(directions, self.degree)
 
-    def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """The nearest coefficients (..., size, 3) of light that can be emitted.
-        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted."""
+    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
+        """Coefficients (..., size, 3) of light that can be emitted, of the same mean and the most alike irradiance."""
         from renderer.light.nonnegative import project_nonnegative  # scipy's optimizers take long to import
 
-        return project_nonnegative(coefficients, within)
+        return project_nonnegative(coefficients)
+
+    def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        """The nearest coefficients (..., size, 3) of light that can be emitted, whose mean may be another.
+        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted."""
+        from renderer.light.nonnegative import nearest_nonnegative
+
+        return nearest_nonnegative(coefficients, within)
 
 
 HARMONICS = Harmonics()
@@ -106,8 +112,12 @@ class LocalBasis(ABC):
     def size(self) -> int:
         """How many functions there are."""
 
-    def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """As `Harmonics.project_nonnegative`."""
+    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
+        """The nearest coefficients that can be emitted: each light shows on its own where it is clamped."""
+        return self.nearest_nonnegative(coefficients)
+
+    def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        """As `Harmonics.nearest_nonnegative`."""
         return nearest_in_box(coefficients, 0, self.power, within)
 
     @abstractmethod

@@ -1,10 +1,18 @@
-"""The nearest light that something could emit: harmonics whose radiance is nowhere negative.
+"""Light that something could emit, in place of light that is negative somewhere.
 
-Of coefficients v (K,), the projection x solves the quadratic program with a constraint for every direction ω,
+Both functions solve quadratic programs with a constraint for every direction ω: Y(ω) · x ≥ 0.
 
-    min |x − v|² / 2    such that    Y(ω) · x ≥ 0 for all ω,
+`project_nonnegative` makes a given light physical. It keeps the mean, x₀ = v₀, and minimizes the error of irradiance,
+Σ A_l² (x − v)². In bands that do not reach a diffuse surface, half of the smallest factor stands for A_l
+(`window.irradiance_weights`), so that of lights of the same irradiance the nearest one is taken. Convolving the light of
+a map with a non-negative kernel also gives a light that satisfies the constraints, so that no such window has a smaller
+error. (Without a fixed mean, nearest coefficients raise the whole sky to fill the dips beside a bright source.)
 
-and optionally low ≤ x ≤ high (a ball in the maximum norm). With the harmonics of finitely many directions as rows of
+`nearest_nonnegative` returns an attack's step into the possible lights. Of coefficients v (K,), it solves
+
+    min |x − v|² / 2,
+
+optionally with low ≤ x ≤ high (a ball in the maximum norm). With the harmonics of finitely many directions as rows of
 R, and multipliers μ ≥ 0, its Karush-Kuhn-Tucker conditions are
 
     x = v + Rᵀ μ,    R x ≥ 0,    μ · R x = 0,
@@ -32,35 +40,98 @@ from torch import Tensor
 
 from renderer.light.basis import Ball
 from renderer.light.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
+from renderer.light.program import shortest
+from renderer.light.window import irradiance_weights, nonnegative_window
 from renderer.normals import tangent_axes
 
 Array = NDArray[Any]
 
 TOLERANCE = 1e-4  # of a light's largest radiance, that it may dip below zero
 _DEPTH = TOLERANCE / 10  # of dips that are looked for: in a flat valley, a deeper one may lie between two found ones
+_DIM = 1e-6  # of a light's norm: below it, a dip is the rounding of the input
 _ROUNDS = 50  # seven are usual
+_SOLUTIONS = 4  # of the program whose mean is kept
 _ON_SPHERE = 1e-7  # of the radius
 _STEPS = 10  # Newton steps on t; two are usual
 _TINY = 1e-300
-_SUBDIVISIONS = 4  # of the grid: nodes are 0.07 radians apart
+_SUBDIVISIONS = 4, 5  # of the grid: nodes are 0.07 radians apart, or half of that above degree _COARSE
+_COARSE = 10
 _CANDIDATES = 0.04, 1e-3  # of the largest radiance, above zero and above the neighbors: nodes that may be near a dip
+_LOWEST = 0.04, 0.0  # the same with fewer nodes, which is enough where many dips are left at once
 _LARGEST_STEP = 0.1  # in radians
 _NEWTON_STEPS = 2  # down to the bottom of a dip
 
 
-def project_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
-    """The lights (..., (degree + 1)², C) of nowhere negative radiance that are nearest in coefficients.
+def project_nonnegative(lights: Tensor) -> Tensor:
+    """The lights of nowhere negative radiance and of the same mean whose irradiance is the most alike.
 
-    within: for lights (A, (degree + 1)², C), a ball to lie in, whose centers are such lights. The radiance of each
-    channel is nowhere below -`TOLERANCE` of its largest; channels that were in order stay to the bit. Computed in
-    float64, without a graph.
+    Args:
+        lights: (..., (degree + 1)², C) coefficients, of which each channel is a light of its own.
+
+    Returns:
+        Coefficients of the same shape and type, computed in float64, without a graph. The radiance of each channel is
+        nowhere below -`TOLERANCE` of its largest. The first coefficient is the given one, and zero where that is
+        negative. Channels whose radiance is nowhere negative stay to the bit.
+    """
+    channels, of_light = np.unique(_by_channel(lights)[:, 0], axis=0, return_inverse=True)
+    negative, _ = _dips(channels, _dim(channels), _DEPTH, _LOWEST)
+    physical = lights.detach().mT.flatten(0, -2).clone()
+    for channel in np.unique(negative):
+        of_mean = torch.from_numpy(_with_mean_kept(channels[channel])).to(physical)
+        physical[torch.from_numpy(of_light.reshape(-1) == channel)] = of_mean
+    return physical.view(lights.mT.shape).mT
+
+
+def _with_mean_kept(light: Array) -> Array:
+    """The light (K,) of nowhere negative radiance whose mean is the same and whose irradiance is the most alike."""
+    mean, dim = light[0], _dim(light[None])
+    of_mean = np.concatenate([[max(mean, 0.0)], 0 * light[1:]])
+    if mean <= dim:
+        return of_mean
+    degree = math.isqrt(len(light)) - 1
+    weights, window = (of_degree(degree).numpy() for of_degree in (irradiance_weights, nonnegative_window))
+    _, harmonics, _ = _grid(degree, _SUBDIVISIONS[0])
+    rows, nearest = harmonics.T, light
+    for number in range(_ROUNDS):
+        _, bottoms = _dips(nearest[None], dim, _DEPTH, _LOWEST)
+        if not len(bottoms):
+            break
+        if number < _SOLUTIONS:
+            rows = np.concatenate([rows, bottoms])
+            change = shortest(rows[:, 1:] / weights[1:], -rows @ light)
+            nearest = np.concatenate([[mean], light[1:] + change / weights[1:]])
+        else:
+            windowed = _raised(_raised(window * light, of_mean, rows), of_mean, bottoms)
+            nearest = _raised(nearest, windowed, bottoms)
+    return nearest
+
+
+def _raised(light: Array, bright: Array, rows: Array) -> Array:
+    """The light (K,) that is mixed with as much of a brighter one as makes it not negative where rows (R, K) are."""
+    radiance, added = rows @ light, rows @ (bright - light)
+    negative = radiance < 0
+    return light + (bright - light) * (-radiance[negative] / added[negative]).max(initial=0)
+
+
+def nearest_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
+    """The lights of nowhere negative radiance that are nearest in coefficients.
+
+    Their mean is not kept: it may exceed that of `lights`, and often does where these have deep dips.
+
+    Args:
+        lights: (..., (degree + 1)², C) coefficients, of which each channel is a light of its own.
+        within: for lights (A, (degree + 1)², C), a ball to lie in, whose centers are lights of nowhere negative
+            radiance. One of norm "l2" holds a light's channels together.
+
+    Returns:
+        Coefficients of the same shape and type, computed in float64, without a graph. The radiance of each channel is
+        nowhere below -`TOLERANCE` of its largest; channels that were in order stay to the bit.
     """
     programs = dipping = _programs(lights, within)
     for _ in range(_ROUNDS):
         nearest = np.concatenate([program.nearest for program in dipping])
         original = np.concatenate([program.original for program in dipping])
-        dim = 1e-6 * np.linalg.norm(original, axis=1)  # below it, a dip is the rounding of the input
-        owner, rows = _dips(nearest, dim, _DEPTH)
+        owner, rows = _dips(nearest, _dim(original), _DEPTH)
         channels = len(nearest) // len(dipping)
         indices = np.unique(owner // channels)
         for index in indices:
@@ -83,6 +154,11 @@ def _programs(lights: Tensor, within: Ball | None) -> "list[_Program]":
     shape = len(lights), lights.shape[2], lights.shape[1]
     of_lights = zip(original.reshape(shape), _by_channel(within.center).reshape(shape), strict=True)
     return [_Program(light, center=center, radius=within.radius) for light, center in of_lights]
+
+
+def _dim(channels: Array) -> Array:
+    """(R,) the largest radiance of channels (R, K) that counts as none."""
+    return _DIM * np.linalg.norm(channels, axis=1)
 
 
 def _by_channel(lights: Tensor) -> Array:
@@ -166,14 +242,17 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
     return nearest.clip(low, high), rows[multipliers[: len(rows)] > 0]
 
 
-def _dips(lights: Array, dim: Array, depth: float) -> tuple[Array, Array]:
+def _dips(
+    lights: Array, dim: Array, depth: float, candidates: tuple[float, float] = _CANDIDATES
+) -> tuple[Array, Array]:
     """(the light (D,), of (R, K), and the harmonics (D, K) in the direction of the bottom) of each of D dips.
-    depth: the least depth of a dip, of the light's largest radiance. dim: (R,) largest radiance that counts as none."""
+    depth: the least depth of a dip, of the light's largest radiance. dim: (R,) largest radiance that counts as none.
+    candidates: how far above zero, and above its neighbors, a node of the grid is that may be near a dip."""
     degree = math.isqrt(lights.shape[1]) - 1
-    directions, harmonics, neighbors = _grid(degree)
+    directions, harmonics, neighbors = _grid(degree, _SUBDIVISIONS[degree > _COARSE])
     radiance = lights @ harmonics
     largest = np.abs(radiance).max(1)
-    near_zero, near_lowest = (factor * largest for factor in _CANDIDATES)
+    near_zero, near_lowest = (factor * largest for factor in candidates)
     owner, node = np.nonzero(radiance < np.where(largest > dim, near_zero, -np.inf)[:, None])
     for neighbor in neighbors:
         lower = radiance[owner, node] <= radiance[owner, neighbor[node]] + near_lowest[owner]
@@ -232,11 +311,11 @@ def _derivatives(degree: int) -> Array:
 
 
 @per_degree
-def _grid(degree: int) -> tuple[Array, Array, Array]:
+def _grid(degree: int, subdivisions: int) -> tuple[Array, Array, Array]:
     """(directions (N, 3), harmonics (K, N), indices (6, N) of the neighbors) of an icosphere's vertices."""
     from trimesh.creation import icosphere  # trimesh takes half a second
 
-    sphere = icosphere(_SUBDIVISIONS)
+    sphere = icosphere(subdivisions)
     around = [[*near, *near[:1]][:6] for near in sphere.vertex_neighbors]  # twelve vertices have five
     directions = np.array(sphere.vertices)
     return directions, np.ascontiguousarray(_harmonics(directions, degree).T), np.array(around).T
