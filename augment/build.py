@@ -1,16 +1,19 @@
 """A scene from meshes in one call, its backgrounds, and the settings of scene, renderer and local lights."""
 
+from __future__ import annotations
+
 import math
 import reprlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from augment.degree import degree_of_scene, reached_gloss, warn_of_cut_light
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from augment.utils import progress
@@ -23,17 +26,14 @@ from renderer.errors import (
     require_choice,
     require_range,
 )
-from renderer.gloss import smoothest
 from renderer.image import ImageSettings, samples_per_side
 from renderer.io.images import read_image
-from renderer.light.basis import with_local_lights
+from renderer.light.basis import Basis, with_local_lights
 from renderer.light.harmonics import MAX_DEGREE, degree_of
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light, read_light
 from renderer.mesh import MOST_VERTICES, Mesh, normalize, require_mesh, subdivide
-from renderer.microfacets import degree_for
 from renderer.rasterizer import NAMES, Rasterizer, choose
-from renderer.transfer import DEGREE
 from renderer.validation import (
     as_list,
     as_tensor,
@@ -43,6 +43,10 @@ from renderer.validation import (
     require_kind,
     require_whole,
 )
+
+if TYPE_CHECKING:
+    from augment.attacks.attack import AttackSettings
+    from augment.variation import VariationSettings
 
 
 @dataclass
@@ -109,8 +113,8 @@ class SceneSettings:
     azimuth: of the first view, degrees off +x towards +y. width: of the image in world units; a mesh spans [-1, 1].
     fov: degrees between the image's sides, as of a camera at that distance; None for parallel rays. vertices: subdivide
     meshes until they have more. light: what `renderer.load_light` takes or, in Python, coefficients. degree: of such a
-    light; None for 6 or, where gloss is smoother than that shows, for what it needs. exposure: multiplies it.
-    projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
+    light; None for 6 or, where gloss is or becomes smoother than that shows, for what it needs. exposure: multiplies
+    it. projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
     """
 
     meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
@@ -179,6 +183,8 @@ def build_scene(
     shared: bool = False,
     scene: SceneSettings | None = None,
     renderer: RendererSettings | None = None,
+    attack: AttackSettings | None = None,
+    vary: VariationSettings | None = None,
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> Scene:
@@ -186,7 +192,8 @@ def build_scene(
 
     meshes: pairs of a file, solid:NAME or `Mesh`, and the name of its class; or `ObjectSettings`. shared: the views of
     an example share one light, shape or color; otherwise each view is an example. scene, renderer: all further choices
-    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence.
+    (their own `meshes` and `views` are ignored). attack, vary: what the scene will go through, by whose least roughness
+    the degree of the light is chosen. options: fields of scene or renderer, which take precedence.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
 
     >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
@@ -209,14 +216,18 @@ def build_scene(
     read = (_object(member, shown.vertices) for member in progress(meshes, "reading meshes"))
     objects = [on_ground(item, shown.ground) for item in read]
     environment: Any = shown.light
-    if isinstance(environment, str | Path):
-        environment = load_light(environment, _degree(objects, shown.degree))
+    named = isinstance(environment, str | Path)
+    degree = None
+    if named:
+        reached = reached_gloss(objects, attack and attack.material, vary and vary.gloss)
+        degree = degree_of_scene(reached, shown.degree)
+        environment = load_light(environment, degree)
+        warn_of_cut_light(str(shown.light), environment)
     else:
         environment = as_tensor("light", environment)
         degree_of(environment)
         require_bounded(light=environment)
-    local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
-    basis, lights = with_local_lights(environment * shown.exposure, local)
+    basis, lights = _lights(shown, environment, degree)
     fov = None if shown.fov is None else math.radians(shown.fov)
     return Scene.grid(
         objects,
@@ -227,6 +238,7 @@ def build_scene(
         choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
         shared=shared,
         basis=basis,
+        lights_of_degree=partial(_lights, shown, shown.light) if named and shown.degree is None else None,
     )
 
 
@@ -257,15 +269,12 @@ def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObj
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
-def _degree(objects: Sequence[SceneObject], given: int | None) -> int:
-    """Of the light: the given one, or what shows the objects' gloss, at least 6. It is told where gloss takes more."""
-    roughness, name = min(((smoothest(item.mesh), item.name) for item in objects), default=(1.0, ""))
-    needed = max(DEGREE, degree_for(roughness))
-    if needed > (given or DEGREE):
-        choice = f"degree={DEGREE} takes less time, but" if given is None else f"degree={given}"
-        told = f"{name} has gloss of roughness {roughness:.2g}, which takes light of degree {needed}"
-        warnings.warn(f"{told}: {choice} shows rings around highlights", stacklevel=3)
-    return needed if given is None else given
+def _lights(shown: SceneSettings, environment: Tensor | str | Path, degree: int | None) -> tuple[Basis, Tensor]:
+    """The basis and the lights (size, 3) of the settings, of coefficients or of a named light of a degree."""
+    if isinstance(environment, str | Path):
+        environment = load_light(environment, degree)
+    local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
+    return with_local_lights(environment * shown.exposure, local)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:

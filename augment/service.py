@@ -14,12 +14,13 @@ from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from augment import utils
-from augment.attacks.attack import AttackSettings, logits_of
+from augment.attacks.attack import AttackSettings, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import AttackProblem
 from augment.build import Shown, build_scene
 from augment.classifiers.adapter import NetworkCall
+from augment.degree import with_needed_degree
 from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
 from augment.utils import Phases, as_found, generator, stream_seed
@@ -221,6 +222,11 @@ class AugmentationService:
             raise InputError(
                 f"{source} is None, and arm={self.settings.arm} needs examples: give a scene, or images for a folder"
             )
+        attack = self.settings.attack
+        if self.scene is not None and self.settings.renders:
+            self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
+            if not attack.allow_negative:
+                warn_of_changed_light(self.scene, attack.problem(self.scene).scene)
 
     @classmethod
     def from_meshes(
@@ -253,9 +259,10 @@ class AugmentationService:
         named = [(mesh, str(label)) for mesh, label in members]
         paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
         paper["backgrounds"] = [0.0, 0.25, 0.5, 0.75, 1.0]
-        scene = build_scene(named, size, **paper | of_scene)
+        settings = settings or AugmentationSettings()
+        scene = build_scene(named, size, attack=settings.attack, vary=settings.vary, **paper | of_scene)
         labels = torch.tensor([int(label) for label in scene.labels], device=scene.lights.device)
-        settings = replace(settings or AugmentationSettings(), examples=len(scene))
+        settings = replace(settings, examples=len(scene))
         return cls(settings, scene, labels, seed, Phases(labels.device))
 
     def __len__(self) -> int:

@@ -263,6 +263,7 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
         console.info("rasterizer: %s", rasterizer.description)
         options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
+            options |= {"attack": settings.augment.attack, "vary": settings.augment.vary}
             scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
     if len(studied) == len(data.classes) and (labels < 0).any():

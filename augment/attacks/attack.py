@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,10 +26,13 @@ from augment.attacks.parameters import (
     lighting,
 )
 from augment.classifiers.adapter import Classifier, class_index, require_classifier
+from augment.degree import NOTICED, with_needed_degree
 from augment.losses import logit_gap
 from augment.scene import Conditions, Scene
 from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
+from renderer.light.basis import parts_of
+from renderer.light.harmonics import irradiance_error
 from renderer.validation import (
     as_list,
     is_whole,
@@ -52,8 +56,9 @@ class AttackSettings:
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
     view. rounded: the classifier gets images of 8 bits. eot: descend on the mean over random transformations.
-    allow_negative: any coefficients of light. If False, the light is first projected to the nearest one that something
-    can emit (of harmonics: radiance nowhere negative) and stays there, whatever is attacked.
+    allow_negative: any coefficients of light. If False, the light is first made one that something can emit (of
+    harmonics: radiance nowhere negative, of the same mean and the most alike irradiance), whatever is attacked. Each
+    step on the light then ends in the nearest such coefficients, whose mean may differ from what the step asked for.
     batch_size: images per pass through the classifier, fewer where memory runs out.
     """
 
@@ -216,7 +221,9 @@ def attack(
     require_flag("force", force)
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
+    scene = with_needed_degree(scene, settings.material)
     problem, model = settings.problem(scene), settings.preprocessed_model(classifier)
+    warn_of_changed_light(scene, problem.scene)
     images_before = problem.images(problem.start)
     before = logits_of(model, images_before, settings.batch_size)
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
@@ -233,6 +240,26 @@ def attack(
     return AttackResult(
         problem, classifier, goal, settings, seed, images_before, images, before, after, descent, phases.take()
     )
+
+
+def warn_of_changed_light(given: Scene, physical: Scene) -> None:
+    """Warn where making light physical changes its irradiance by more than 5 %.
+
+    Measured is the rms over normals and channels of the error of irradiance of the environment light, relative to the
+    rms irradiance of the given one (`irradiance_error`); the largest of all examples.
+
+    Args:
+        given: The scene before `AttackSettings.problem`.
+        physical: The scene of that problem.
+    """
+    where, harmonics = parts_of(given.basis)[0]
+    if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
+        return
+    error = float(irradiance_error(physical.lights[:, where], given.lights[:, where]).max())
+    if error > NOTICED:
+        told = f"the light is negative in places, and without that its irradiance is off by {error:.0%} (rms)"
+        advice = "a higher scene.degree is closer, and attack.allow_negative=true leaves the light as it is"
+        warnings.warn(f"{told} in {harmonics}: {advice}", stacklevel=3)
 
 
 def target_labels(

@@ -289,7 +289,7 @@ def material(scene: Scene, settings: MaterialSettings) -> Parameter:
     units = settings.roughness, settings.metallic, settings.strength, math.radians(settings.hue)
     attacked = torch.tensor(units).to(scene.lights)
     unit = torch.where(attacked > 0, attacked, 1)
-    pairs = [_initial_gloss(item) for item in scene.objects]
+    pairs = [initial_gloss(item) for item in scene.objects]
     mean = torch.stack([rows[mask].mean(0) for rows, mask in pairs]).to(unit)
     if all(mask.all() and (rows == rows[0]).all() for rows, mask in pairs):
         pairs = [(rows[:1], mask[:1]) for rows, mask in pairs]
@@ -313,8 +313,15 @@ def material(scene: Scene, settings: MaterialSettings) -> Parameter:
     return Parameter("material", settings, start, apply, domain, None if used.all() else used)
 
 
-def _initial_gloss(item: SceneObject) -> tuple[Tensor, Tensor]:
-    """What an object's faces begin with, (F, 3), and which are its own, (F,) bool."""
+def initial_gloss(item: SceneObject) -> tuple[Tensor, Tensor]:
+    """Return what an attack on the material begins with: a matte object's own faces have VARNISH.
+
+    Args:
+        item: The object, whose mesh has F faces.
+
+    Returns:
+        Roughness, metallic and strength of all faces (F, 3), and which faces are the object's own, (F,) bool.
+    """
     own, gloss = torch.from_numpy(item.own_faces), item.mesh.gloss
     rows = torch.tensor([[1.0, 0, 0]]).expand(len(own), 3) if gloss is None else torch.from_numpy(gloss)
     matte = not rows[own, 1:].any()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -220,6 +221,23 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
     return torch.nonzero(lambertian_factors(degree)).squeeze(1)
+
+
+def irradiance_error(lights: Float[Tensor, "*batch K channels"], given: Float[Tensor, "*batch J channels"]) -> Tensor:
+    """Compute by how much irradiance differs: rms over normals and channels, relative to the rms irradiance given.
+
+    Args:
+        lights: Coefficients of lights, shape (..., (degree + 1)², C).
+        given: What they stand for, of as many channels; its degree may be another.
+
+    Returns:
+        Errors of shape (...), float64; 0 where both are dark.
+    """
+    size = max(lights.shape[-2], given.shape[-2])
+    factors = lambertian_factors(math.isqrt(size) - 1)[:, None].to(given.device)
+    after, before = (F.pad(light.double(), (0, 0, 0, size - light.shape[-2])) * factors for light in (lights, given))
+    error, norm = (light.square().sum((-2, -1)).sqrt() for light in (after - before, before))
+    return torch.where(error > 0, error / norm, error)
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:

@@ -4,9 +4,11 @@ Both functions solve quadratic programs with a constraint for every direction ω
 
 `project_nonnegative` makes a given light physical. It keeps the mean, x₀ = v₀, and minimizes the error of irradiance,
 Σ A_l² (x − v)². In bands that do not reach a diffuse surface, half of the smallest factor stands for A_l
-(`window.irradiance_weights`), so that of lights of the same irradiance the nearest one is taken. Convolving the light of
-a map with a non-negative kernel also gives a light that satisfies the constraints, so that no such window has a smaller
-error. (Without a fixed mean, nearest coefficients raise the whole sky to fill the dips beside a bright source.)
+(`window.irradiance_weights`), so that the nearest of lights of the same irradiance is taken. Convolving the light of a
+map with a non-negative kernel also gives a light that satisfies the constraints, so that no such window has a smaller
+error. (Without a fixed mean, nearest coefficients raise the whole sky to fill the dips beside a bright source.) The
+program is solved at a grid's directions and in the dips that are found; dips that are left after a few solutions are
+filled with the windowed light.
 
 `nearest_nonnegative` returns an attack's step into the possible lights. Of coefficients v (K,), it solves
 
@@ -50,7 +52,7 @@ TOLERANCE = 1e-4  # of a light's largest radiance, that it may dip below zero
 _DEPTH = TOLERANCE / 10  # of dips that are looked for: in a flat valley, a deeper one may lie between two found ones
 _DIM = 1e-6  # of a light's norm: below it, a dip is the rounding of the input
 _ROUNDS = 50  # seven are usual
-_SOLUTIONS = 4  # of the program whose mean is kept
+_SOLUTIONS = 4  # of the program that keeps the mean
 _ON_SPHERE = 1e-7  # of the radius
 _STEPS = 10  # Newton steps on t; two are usual
 _TINY = 1e-300

@@ -22,6 +22,7 @@ from renderer.image import decode, encode
 from renderer.io.files import write_whole
 from renderer.io.images import read_image, write_image
 from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
+from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
 from renderer.mesh import Mesh
@@ -162,10 +163,10 @@ def write_laboratory(settings: LabSettings) -> int:
 
 
 def _read_environment(path: Path) -> np.ndarray:
-    """Radiance (H, W, 3) of a map, or of a built-in light, of which negative radiance is left out; InputError where no
-    light of a map comes from above, and as `read_panorama`."""
+    """Radiance (H, W, 3) of a map, or of a built-in light that is made physical; InputError where no light of a map
+    comes from above, and as `read_panorama`."""
     if str(path) in PROBES:
-        return to_map(load_light(str(path)), PROBE_HEIGHT).clamp(min=0).numpy()
+        return to_map(HARMONICS.project_nonnegative(load_light(str(path))), PROBE_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
     if not radiance[: len(radiance) // 2].max() > 0:
         raise InputError(f"environments: {path} is dark above: give a map with light from above the horizon")
