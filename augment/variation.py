@@ -38,7 +38,7 @@ DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, ar
 @dataclass
 class VarnishSettings:
     """[least, most] roughness and strength of a varnish on each object, as of `renderer.Gloss`, each uniform; of
-    strength 0, which is the default, none. Below a roughness of 0.34, light of degree 6 shows rings of its series."""
+    strength 0, which is the default, none. The least roughness decides the degree of the light."""
 
     roughness: list[float] = field(default_factory=lambda: [0.4, 0.8])
     strength: list[float] = field(default_factory=lambda: list(NONE))

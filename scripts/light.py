@@ -10,7 +10,9 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from renderer.errors import InputError, require_range
-from renderer.light.environment import negative_fraction, to_map, write_map
+from renderer.light.basis import Harmonics
+from renderer.light.environment import to_map, write_map
+from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.presets import load_light
 from train.results import require_replaceable
 from train.settings import keyed
@@ -19,7 +21,7 @@ from train.settings import keyed
 @dataclass
 class Settings:
     light: str = MISSING  # grace | eucalyptus | st_peters | uniform | a map (.npy, .hdr, .exr) | coefficients (.json)
-    out: str = MISSING  # the map's file, .hdr, .exr or .npy, in which negative radiance becomes 0
+    out: str = MISSING  # the map's file, .hdr, .exr or .npy, without negative radiance, of the same mean
     height: int = 256  # rows; there are twice as many columns
     overwrite: bool = False  # replace a file that exists
 
@@ -33,12 +35,14 @@ def main(settings: Settings) -> None:
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
     require_replaceable(out, "out", settings.overwrite)
-    radiance = to_map(load_light(settings.light, degree=None), settings.height)
+    light = load_light(settings.light, degree=None)
+    physical = Harmonics(degree_of(light)).project_nonnegative(light)
+    radiance = to_map(physical, settings.height).clamp(min=0)
     with keyed("out"):
-        write_map(out, radiance.clamp(min=0))  # negative light is refused where maps are read
+        write_map(out, radiance)  # negative light is refused where maps are read
     print(
         f"{out}: {radiance.shape[1]} × {radiance.shape[0]} texels, radiance {radiance.min():.3g} to "
-        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of its power is negative and stored as 0"
+        f"{radiance.max():.3g}; without negative radiance, irradiance is off by {irradiance_error(physical, light):.2%}"
     )
 
 
