@@ -219,7 +219,7 @@ def build_scene(
     named = isinstance(environment, str | Path)
     degree = None
     if named:
-        reached = reached_gloss(objects, attack and attack.material, vary and vary.gloss)
+        reached = reached_gloss(objects, attack.material if attack else None, vary.gloss if vary else None)
         degree = degree_of_scene(reached, shown.degree)
         environment = load_light(environment, degree)
         warn_of_cut_light(str(shown.light), environment)

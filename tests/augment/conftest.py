@@ -120,6 +120,7 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
             classifier.size,
             **{
                 "rasterizer": "numpy",
+                "degree": 6,
                 "width": 2.4,
                 "normals": "flat",
                 "silhouettes": "pose" in steps,

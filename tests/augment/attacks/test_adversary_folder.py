@@ -67,7 +67,7 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""
     choices = {"shared": True, "rasterizer": "numpy", "encoding": encoding, "width": 2.4}
-    scene = augment.build_scene([(textured(), "orange")], 24, views=2, **choices)
+    scene = augment.build_scene([(textured(), "orange")], 24, views=2, degree=6, **choices)
     done = attacked(kinds, scene)
     write_adversary(adversary_of(done), tmp_path)
     found = reload(tmp_path)
@@ -84,7 +84,9 @@ def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(
     size = (1, 1, 2) if kind in PAINTED else (4, 4, 2)
     texels = np.random.default_rng(1).integers(150, 255, size, dtype=np.uint8)
     item = on_ground(SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2))
-    scene = replace(augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0), objects=[item])
+    scene = replace(
+        augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6), objects=[item]
+    )
     done = attacked({kind}, scene)
     write_adversary(adversary_of(done), tmp_path)
     limit = 1 / 255 if kind in PAINTED else 1e-5
@@ -97,7 +99,7 @@ def test_props_and_table_are_never_attacked_not_after_they_are_read_back_either(
     """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
     item = on_ground(with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2))
-    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0)
+    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6)
     scene = replace(scene, objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]
     assert painted[item.own_faces].any() and not painted[~item.own_faces].any()
