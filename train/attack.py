@@ -227,7 +227,8 @@ def build_attacked(
     Raises:
         InputError: If a setting of the scene does not fit, which the message names.
     """
-    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device, "attack": settings.attack}
+    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
+    options["attack"] = settings.attack
     options["rasterizer"] = chosen_rasterizer(settings.renderer)
     with keyed("scene", vars(scene)):
         return build_scene([item], size, scene.views, shared=settings.attack.shared, **options)
