@@ -5,8 +5,14 @@ is white, and m times Schlick's with F0 = ρ and F90 = 1, which has the metal's 
 
     ρ (diffuse + colored) + white.
 
-The diffuse part is (1 - m) (1 - s E(n·v)), where s E is what the coat on it reflects of an even sky, so that no energy
-is created (Albedo scaling: Kulla and Conty 2017).
+The diffuse part lies below the coat. With E(μ), the fraction of a beam that the coat reflects (`coat_albedo`), and its
+mean E_avg = 2 ∫ E(μ) μ dμ, the diffuse part of light from direction l, seen from direction v, is
+
+    (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
+
+(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). It is reciprocal, and together with the coat
+a white surface reflects each beam entirely: s E(n·l) + (1 - s E(n·l)) = 1. Of environment light, the coat lets the
+irradiance Σ (A_l - s B_l) U_lm Y_lm(n) through, with the B_l of `coat_bands`.
 """
 
 from __future__ import annotations
@@ -23,9 +29,21 @@ from torch import Tensor
 from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import unit
+from renderer.light.harmonics import bands, lambertian_factors, unit
 from renderer.mesh import Mesh, require_mesh
-from renderer.microfacets import DIELECTRIC, EDGE, LEAST, SCHLICK, ViewFrame, lobe_functions, reflectance
+from renderer.microfacets import (
+    DIELECTRIC,
+    EDGE,
+    LEAST,
+    SCHLICK,
+    ViewFrame,
+    along,
+    coat_albedo,
+    coat_bands,
+    coat_mean,
+    lobe_functions,
+    reflectance,
+)
 from renderer.validation import as_tensor, require_flag
 
 if TYPE_CHECKING:
@@ -105,10 +123,42 @@ class SampleGloss(NamedTuple):
         colored, white = self.lobes((normals * toward).sum(1).clamp(0, 1), 0)
         return colored if colored is None else colored[0] * constant, white[0] * constant
 
+    def entering(self, cosine: Tensor) -> Tensor:
+        """Compute 1 - s E(μ), the fraction of light from a direction that passes the coat. Differentiable.
+
+        Args:
+            cosine: Cosine μ between normal and direction, any shape; negative ones count as 0.
+
+        Returns:
+            The fraction, of the shape of `cosine`.
+        """
+        return 1 - self.strength * coat_albedo(cosine.clamp(0, 1), self.roughness)
+
+    def entering_bands(self, degree: int) -> Tensor:
+        """Compute A_l - s B_l, by which environment light below the coat becomes irradiance. Differentiable.
+
+        Args:
+            degree: Degree of the light.
+
+        Returns:
+            A factor for each coefficient of the light, shape ((degree + 1)², S), or (..., 1) of an even gloss.
+        """
+        reflected = coat_bands(degree).to(self.roughness) @ along(self.roughness)
+        factors = lambertian_factors(degree).to(self.roughness)
+        return factors[:, None] - self.strength * reflected[bands(degree)]
+
     def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
-        """(S,) the fraction of the albedo that is left below the coat: of a dielectric, what that does not reflect."""
-        _, coat = self._replace(metallic=torch.zeros_like(self.metallic)).even(normals, toward)
-        return (1 - self.metallic) * (1 - coat)
+        """Compute (1 - m) (1 - s E(n·v)) / (1 - s E_avg), by which the light below the coat is seen. Differentiable.
+
+        Args:
+            normals: Unit normals, shape (S, 3).
+            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+
+        Returns:
+            Factors of albedo and of the light that passes the coat, shape (S,).
+        """
+        leaving = self.entering((normals * toward).sum(1))
+        return (1 - self.metallic) * leaving / (1 - self.strength * coat_mean(self.roughness))
 
     def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, Tensor]:
         """(colored, white, world): radiance (K, S) per unit coefficient of environment light of K = (degree + 1)², in

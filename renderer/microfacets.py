@@ -126,11 +126,66 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
     cosine: n·v (S,). roughness: (S,) or (1,), at least LEAST. Differentiable.
     """
     table = _table(max(degree, USUAL)).to(cosine)[list(terms), : (degree + 1) * (degree + 2) // 2]
-    across = _chebyshev(4 * cosine / (cosine + 1) - 1, table.shape[-1])
-    along = _chebyshev((2 * roughness - 1 - LEAST) / (1 - LEAST), NODES)
+    across = _across(cosine, table.shape[-1])
+    of_roughness = along(roughness)
     if len(roughness) == 1:
-        return torch.einsum("tmrc,r->tmc", table, along[:, 0]) @ across
-    return table.flatten(2) @ (along[:, None] * across).flatten(0, 1)
+        return torch.einsum("tmrc,r->tmc", table, of_roughness[:, 0]) @ across
+    return table.flatten(2) @ (of_roughness[:, None] * across).flatten(0, 1)
+
+
+def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
+    """Compute E(μ), the fraction of a beam that a dielectric coat reflects into all directions.
+
+    The coat is reciprocal, so E is also the fraction of an even sky that a camera sees in the coat. Differentiable.
+
+    Args:
+        cosine: Cosine μ between normal and direction, in [0, 1], any shape.
+        roughness: Roughness of the same shape, or (1,), at least `LEAST`.
+
+    Returns:
+        E, in [0, 1], of the shape of `cosine`.
+    """
+    table = _coat_table().to(cosine)
+    across = _across(cosine.flatten(), table.shape[1])
+    return ((table.T @ along(roughness.flatten())) * across).sum(0).view_as(cosine)
+
+
+@per_degree
+def coat_bands(degree: int) -> Tensor:
+    """Return the zonal coefficients of E(μ) μ, the irradiance that a dielectric coat of strength 1 reflects.
+
+    The coefficient of band l is B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, as π, 2π/3, π/4, ... are those of μ.
+    Each B_l is a polynomial of the roughness. With U_lm of the light, the coat reflects Σ B_l U_lm Y_lm(n).
+
+    Args:
+        degree: Degree of the light.
+
+    Returns:
+        Coefficients in Chebyshev polynomials of the roughness (`along`), shape (degree + 1, NODES), float64.
+    """
+    node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(degree + 64))
+    cosine = (node + 1) / 2
+    table = _coat_table()
+    reflected = table @ _across(cosine, table.shape[1]) * cosine  # (NODES, N)
+    polynomials = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))  # (N, degree + 1)
+    return math.pi * (polynomials.T * weight) @ reflected.T
+
+
+def coat_mean(roughness: Tensor) -> Tensor:
+    """Compute E_avg = 2 ∫ E(μ) μ dμ, which a dielectric coat reflects of an even sky on average. Differentiable.
+
+    Args:
+        roughness: Roughness, shape (S,), at least `LEAST`.
+
+    Returns:
+        E_avg, in [0, 1], shape (S,).
+    """
+    return (coat_bands(0).to(roughness) @ along(roughness))[0] / math.pi
+
+
+def along(roughness: Tensor) -> Tensor:
+    """Compute the Chebyshev polynomials of roughness (S,), shape (NODES, S). Differentiable."""
+    return _chebyshev((2 * roughness - 1 - LEAST) / (1 - LEAST), NODES)
 
 
 @cache
@@ -208,6 +263,16 @@ def _chebyshev(x: Tensor, count: int) -> Tensor:
     return torch.stack(rows)
 
 
+def _across(cosine: Tensor, count: int) -> Tensor:
+    """Compute Chebyshev polynomials of a cosine (S,), shape (count, S), whose nodes lie closer near 0."""
+    return _chebyshev(4 * cosine / (cosine + 1) - 1, count)
+
+
+def _coat_table() -> Tensor:
+    """Return the coefficients of E in the products of `_table`, shape (NODES, 2 USUAL + 4), float64."""
+    return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
+
+
 @per_degree
 def _table(degree: int) -> Tensor:
     """(3 terms, M functions, NODES, 2 degree + 4) float64: coefficients of π c in products of Chebyshev polynomials of
@@ -228,21 +293,28 @@ def _table(degree: int) -> Tensor:
 
 
 def _lobes(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
-    """(3, M, N) π c_lm sin^m θ at N cosines, by quadrature over the half vectors on one side of the plane."""
+    """Compute π c_lm sin^m θ at N cosines, shape (3 terms, M, N), by quadrature over half vectors.
+
+    The half vectors on one side of the plane of n and v have azimuth φ and polar angle θ, tan θ = α tan ψ. Nodes are
+    even in φ and Gauss-Legendre's in ψ, up to the angle at which the light comes from below the horizon.
+    """
     node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(QUADRATURE[0]))
-    fraction, squared = (node[:, None] + 1) / 2, roughness**4  # of ∫ D (n·h) dh, which is 1
     azimuth = math.pi * (torch.arange(QUADRATURE[1], dtype=torch.float64) + 0.5) / QUADRATURE[1]
-    z = ((1 - fraction) / (1 + (squared - 1) * fraction)).sqrt().expand(-1, len(azimuth))
-    radius = (1 - z**2).sqrt()
-    half = torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], -1).flatten(0, 1)
+    alpha = roughness**2
     sines = (1 - cosines**2).sqrt()
-    toward = torch.stack([-sines, 0 * sines, cosines], dim=1)
-    facing = toward @ half.T
+    toward = torch.stack([-sines, 0 * sines, cosines], dim=1)  # (N, 3)
+    steepest = (math.pi / 2 - torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])) / 2  # (N, azimuths)
+    last = (steepest.tan() / alpha).atan()[:, None]
+    angle = last * (node[:, None] + 1) / 2  # ψ (N, nodes, azimuths)
+    polar = (alpha * angle.tan()).atan()
+    half = torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], -1).flatten(1, 2)
+    # The solid angle of a half vector is sin θ dθ dφ, and that of light is 4 (v·h) times it.
+    per_angle = alpha * (polar.cos() / angle.cos()) ** 2
+    measure = (last * weight[:, None] / 2 * per_angle * polar.sin()).flatten(1) * (2 * math.pi / QUADRATURE[1])
+    facing = (toward[:, None] * half).sum(-1)
     light = 2 * facing[..., None] * half - toward[:, None]
-    density = squared / (half[:, 2] ** 2 * (squared - 1) + 1) ** 2 / math.pi * half[:, 2]
-    measure = weight.repeat_interleave(len(azimuth)) / 2 / len(azimuth) / density * 4 * facing.clamp(min=0)  # of light
     values = reflectance(half.new_tensor([[0.0, 0, 1]]), toward[:, None], light, roughness)
-    values = values * light[..., 2].clamp(min=0) * measure
+    values = values * light[..., 2].clamp(min=0) * measure * 4 * facing
     ahead = torch.stack([cosines, 0 * sines, sines], dim=1)  # normal to v, in its plane with n
     directions = torch.stack([(light * ahead[:, None]).sum(2), light[..., 1], (light * toward[:, None]).sum(2)])
     harmonics = torch.stack(select_rows(directions, [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]))

@@ -28,6 +28,7 @@ from renderer.errors import require_bounded
 from renderer.fragments import Fragments
 from renderer.gloss import SampleGloss, at_samples, toward_camera
 from renderer.light import harmonics
+from renderer.microfacets import along, coat_bands
 from renderer.normals import FEW, area_vectors, vertex_normals
 
 if TYPE_CHECKING:
@@ -81,16 +82,65 @@ def glossy_radiance(
         shaded = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
     toward = toward_camera(fragments, vertices.to(wide))
     albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(shaded)
+    below = albedo * gloss.diffuse(shaded, toward)[:, None]
     blocks = []
     for first in range(0, len(shaded), BLOCK):
         some = slice(first, first + BLOCK)
         seen = shaded[some], at_samples(toward, some)
         colored, white, world = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
         in_view = (world.T @ light).T
-        blocks.append(in_view @ white if colored is None else in_view @ white + albedo[some].T * (in_view @ colored))
+        shine = in_view @ white
+        if colored is not None:
+            shine = shine + albedo[some].T * (in_view @ colored)
+        lost = _coat_irradiance(shaded[some].T, light, gloss.at(some))
+        blocks.append(shine - below[some].T * lost)
     shine = torch.cat([light.new_zeros(3, 0), *blocks], dim=1) / fragments.samples**2
-    diffuse = radiance(fragments, vertices, light, albedo * gloss.diffuse(shaded, toward)[:, None], normals)
+    diffuse = radiance(fragments, vertices, light, below, normals)
     return diffuse + shine.new_zeros(3, len(fragments.pixels)).index_add(1, fragments.pixel, shine).to(diffuse)
+
+
+def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
+    """Compute the irradiance (3, S) that the coat reflects at samples with unit normals (3, S)."""
+    degree = harmonics.degree_of(light)
+    reflected = coat_bands(degree).to(light)[harmonics.bands(degree)]  # (K, nodes)
+    of_roughness = along(gloss.roughness)  # (nodes, S) or (nodes, 1)
+    if len(gloss.roughness) == 1:
+        return gloss.strength * _Series.apply(normals, (reflected @ of_roughness) * light)
+    lights = (reflected[..., None] * light[:, None]).flatten(1)  # (K, nodes × 3)
+    by_node = _Series.apply(normals, lights).unflatten(0, (-1, 3))  # (nodes, 3, S)
+    return gloss.strength * (by_node * of_roughness[:, None]).sum(0)
+
+
+class _Series(torch.autograd.Function):
+    """Σ c_k Y_k(n) of coefficients (K, C) at unit normals (3, N), shape (C, N), by the polynomials of `_Irradiance` for
+    both parities."""
+
+    @staticmethod
+    def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
+        degree = math.isqrt(len(coefficients)) - 1
+        value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
+        slope = normals.new_zeros(3, coefficients.shape[1], 1)
+        for power in range(max(degree - 1, 1), degree + 1):
+            slopes = _slopes(power).to(coefficients)[..., : len(coefficients)]  # (3, J, K)
+            by_axis = slopes @ coefficients[: slopes.shape[2]]
+            part = by_axis.mT @ harmonics.monomials(normals, power - 1)  # (3, C, N)
+            value = value + (part * normals[:, None]).sum(0) / power
+            slope = slope + part
+        ctx.save_for_backward(normals, slope)
+        ctx.degree = degree
+        return value.expand(-1, normals.shape[1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        normals, slope = ctx.saved_tensors
+        by_normal = by_coefficient = None
+        if ctx.needs_input_grad[0]:
+            by_normal = (slope * upstream).sum(1)
+        if ctx.needs_input_grad[1]:
+            rows = harmonics.select_rows(normals, range((ctx.degree + 1) ** 2))
+            by_coefficient = torch.stack(rows) @ upstream.T
+        return by_normal, by_coefficient
 
 
 def irradiance(

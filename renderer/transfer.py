@@ -526,9 +526,9 @@ def _glossy_box_filter(
         seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
         part = gloss.at(some)
         colored, white, world = part.transfer(*seen, basis.degree)
-        rows = basis.irradiance(seen[0]) * part.diffuse(*seen)[:, None]
+        rows = basis.radiance(seen[0]) * part.entering_bands(basis.degree).T * part.diffuse(*seen)[:, None]
         for channel, weight in zip(block, weights[some].T, strict=False):
-            channel[basis.nonzero] = _over_pixels(rows * weight[:, None], at, pixels).to(dtype)
+            channel.copy_(_over_pixels(rows * weight[:, None], at, pixels))
             if colored is not None:
                 channel += world @ _over_pixels((colored * weight).T, at, pixels)
         block[1 if colors == 1 else slice(None)] += world @ _over_pixels(white.T, at, pixels) / fragments.samples**2

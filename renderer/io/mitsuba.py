@@ -25,7 +25,6 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.gloss import SampleGloss
 from renderer.image import ImageSettings, decode, encode, to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
@@ -35,7 +34,7 @@ from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
-from renderer.microfacets import LEAST
+from renderer.microfacets import LEAST, coat_mean
 from renderer.normals import corner_normals
 
 Scene = dict[str, Any]
@@ -319,10 +318,8 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
 
 
 def _kept(gloss: np.ndarray) -> float:
-    """The fraction of the albedo that a gloss (3,) reflects of an even sky, as metal or below the coat; the mean over a
-    sphere in view."""
-    cosine = ((torch.arange(64, dtype=torch.float64) + 0.5) / 64).sqrt()
-    toward = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], dim=1)
+    """Compute the fraction of the albedo that a gloss (3,) reflects of an even sky, as metal or below the coat, on
+    average over all directions."""
     roughness, metallic, strength = torch.from_numpy(gloss).double()[:, None]
-    below = SampleGloss(roughness.clamp(min=LEAST), metallic, strength).diffuse(toward.new_tensor([[0, 0, 1]]), toward)
-    return float(metallic + below.mean())
+    below = 1 - strength * coat_mean(roughness.clamp(min=LEAST))
+    return float(metallic + (1 - metallic) * below)

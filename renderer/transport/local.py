@@ -83,13 +83,15 @@ def local_radiance(
 
 
 def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
-    """(E, C) radiance per irradiance along paths: the albedo (S, C), and what gloss makes of it."""
+    """Compute the radiance per irradiance along E paths, shape (E, C), of the albedo (S, C) and of the gloss."""
     values, gloss, point = albedo[paths.point], surface.gloss, paths.point
     if gloss is None:
         return values
     directions = unit((paths.source - surface.points[point]).T).T
-    colored, white = gloss.at(point).along(surface.normals[point], at_samples(surface.toward, point), directions)
-    diffuse = gloss.diffuse(surface.normals, surface.toward)[point]
+    normals = surface.normals[point]
+    shine = gloss.at(point)
+    colored, white = shine.along(normals, at_samples(surface.toward, point), directions)
+    diffuse = gloss.diffuse(surface.normals, surface.toward)[point] * shine.entering((normals * directions).sum(1))
     return values * (diffuse + colored)[:, None] + white[:, None]
 
 

@@ -127,10 +127,13 @@ class Transport:
                 change = self._sky.new_zeros(len(weights), self._sky.shape[1], len(fragments.pixels))
             if gloss is not None:
                 colored, white = self._lobes(gloss, surface, hits.sample)
+                cosine = torch.einsum("bdi,di->bd", surface.normals[hits.sample], self._directions)
+                entering = gloss.at(hits.sample).entering(cosine)
             for channel, added in enumerate(change):
                 reflected = diffuse[channel][hits.sample]
                 if gloss is not None:
-                    reflected = reflected + weights[channel][hits.sample] * colored + white / fragments.samples**2
+                    shine = weights[channel][hits.sample] * colored + white / fragments.samples**2
+                    reflected = reflected * entering + shine
                 blocked = hits.weight * reflected
                 added[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:

@@ -2,20 +2,23 @@
 
 import math
 from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from renderer.camera import orbit_cameras
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
-from renderer.light.basis import Harmonics
-from renderer.light.harmonics import bands, basis
-from renderer.light.local import Lamps
+from renderer.light.basis import Harmonics, LightPaths, LocalBasis
+from renderer.light.harmonics import bands, basis, lambertian_factors
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import load_light
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import KEPT, LEAST, degree_for, reflectance
 from renderer.rasterizer import choose
@@ -23,7 +26,7 @@ from renderer.rendering import Shading, precompute_transfer, render, view_radian
 from renderer.shading import normals_in_sight
 from renderer.shapes import solid, sphere
 from renderer.transfer import build_operators
-from renderer.transport.local import LocalLightView
+from renderer.transport.local import LocalLightView, _reflectance
 from renderer.transport.rays import Rays
 
 ROUGHNESS = [0.2, 0.3, 0.5, 0.8]
@@ -109,11 +112,135 @@ def test_an_even_sky_is_never_exceeded():
     gloss = SampleGloss(LEAST + (1 - LEAST) * rough, metallic, strength)
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
     colored, white, _ = gloss.transfer(UP.expand_as(views), views, 0)
-    diffuse = gloss.diffuse(UP.expand_as(views), views)
+    diffuse = gloss.diffuse(UP.expand_as(views), views) * gloss.entering_bands(0)[0] / math.pi
     reflected = diffuse + (colored + white)[0] * math.sqrt(4 * math.pi) / math.pi
     assert diffuse.min() >= 0 and reflected.max() <= 1 + 1e-12
     dielectric = metallic == 0
     torch.testing.assert_close(reflected[dielectric], torch.ones_like(reflected[dielectric]))
+
+
+# A floor that fills the image from every side above it
+FLOOR = Mesh.plain(
+    np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]]), np.array([[0, 1, 2], [0, 2, 3]]), np.ones(3)
+)
+GLOSSES = [(0.0, 1.0), (0.0, 0.4), (1.0, 1.0), (0.5, 0.7)]  # metallic and strength
+
+
+def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
+    """Directions (N, 3) with y > 0 and twice their solid angles, closest together towards +x and the horizon, where
+    lobes of grazing light are narrow."""
+    (node, weight), (around, step) = (np.polynomial.legendre.leggauss(count) for count in (100, 50))
+    root, fraction = (node[:, None] + 1) / 2, (around + 1) / 2
+    z, azimuth = root**2, math.pi * fraction**3
+    radius = np.sqrt(1 - z**2)
+    directions = np.stack(np.broadcast_arrays(radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=-1)
+    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
+    return directions.reshape(-1, 3), solid_angles.ravel()
+
+
+@cache
+def coat_albedo_by_quadrature(cosine: float, roughness: float) -> float:
+    """The fraction of a beam that a dielectric reflects, from glTF's formulas."""
+    directions, solid_angles = half_hemisphere()
+    return float(gltf_reflectance(cosine, directions, roughness, math.nan) * directions[:, 2] @ solid_angles) / math.pi
+
+
+def expected_reflectance(light: np.ndarray, cosine: float, roughness: float, metallic: float, strength: float):
+    """π f of a white surface for light from directions (N, 3), after Kulla and Conty (2017)."""
+    node, weight = np.polynomial.legendre.leggauss(12)
+    of_nodes = [coat_albedo_by_quadrature((x + 1) / 2, roughness) for x in node]
+    mean = 1 - strength * float((weight / 2) @ (of_nodes * (node + 1)))
+    leaving = 1 - strength * coat_albedo_by_quadrature(cosine, roughness)
+    heights, ring = np.unique(light[:, 2], return_inverse=True)
+    entering = 1 - strength * np.array([coat_albedo_by_quadrature(z, roughness) for z in heights])[ring]
+    coat = strength * gltf_reflectance(cosine, light, roughness, math.nan)
+    metal = gltf_reflectance(cosine, light, roughness, 1.0)
+    return metallic * metal + (1 - metallic) * (coat + leaving * entering / mean)
+
+
+def from_aside(polar: float, azimuth: float = 0.0) -> np.ndarray:
+    return np.array([math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar)])
+
+
+def local_reflectance(basis: LocalBasis, coefficient: float, irradiance: float, camera: Camera, gloss: Gloss) -> float:
+    """π f of the floor at the origin, in the light of a basis with one coefficient for all functions."""
+    settings = ImageSettings(1, 1)
+    [operator] = build_operators(FLOOR, [camera], settings, choose("numpy"), basis=basis, dtype=UP.dtype, gloss=gloss)
+    return float(operator.radiance(UP.new_full((basis.size, 3), coefficient))[0, 0]) / irradiance
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize(("metallic", "strength"), GLOSSES)
+def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty_and_reciprocally(roughness, metallic, strength):
+    """A floor, at two pairs of directions, of which one is grazing; each pair also the other way round."""
+    gloss = Gloss(roughness, metallic, strength)
+    for polar, other, azimuth in ((0.4, 1.0, 2.0), (1.45, 0.6, 2.8)):
+        for seen, lit in ((polar, other), (other, polar)):
+            light, camera = from_aside(lit, azimuth), OrthographicCamera(seen, 0.0, 1e-3)
+            flat = np.array([from_aside(lit, azimuth + math.pi)])  # `toward` looks from -x
+            expected = expected_reflectance(flat, math.cos(seen), roughness, metallic, strength)[0]
+            lamp, projector = Lamps((tuple(4 * light),)), Projector(1, lit, azimuth, 4.0)
+            of_lamp = local_reflectance(lamp, 16.0, math.cos(lit), camera, gloss)
+            of_projector = local_reflectance(projector, 1.0, math.cos(lit), camera, gloss)
+            assert of_lamp == pytest.approx(expected, rel=2e-3) and of_projector == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.3, 0.5, 0.75, 1.0])
+def test_no_beam_of_a_lamp_is_reflected_with_more_than_its_energy(roughness):
+    """Into all directions, from nearly grazing angles on, by a white surface. Varnish reflects all of it."""
+    directions, solid_angles = half_hemisphere()
+    views = torch.from_numpy(directions)
+    measure = torch.from_numpy(directions[:, 2] * solid_angles) / math.pi
+    for polar in (0.0, 0.8, 1.2, 1.4, 1.5, 1.55):
+        beam = torch.from_numpy(from_aside(polar, math.pi)).expand_as(views)
+        for metallic, strength in GLOSSES:
+            gloss = SampleGloss(double(roughness), double(metallic), double(strength))
+            surface = SimpleNamespace(gloss=gloss, normals=UP.expand_as(views), toward=views, points=0 * views)
+            nothing = torch.zeros(len(views), dtype=torch.int64)
+            paths = LightPaths(torch.arange(len(views)), nothing, beam, beam[:, 2])
+            reflected = float(_reflectance(surface, views.new_ones(len(views), 1), paths)[:, 0] @ measure)
+            assert reflected <= 1 + 1e-4
+            if metallic == 0:
+                assert reflected >= 1 - 2e-3
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize(("metallic", "strength"), GLOSSES)
+def test_environment_light_is_reflected_reciprocally_and_with_no_more_than_its_energy(roughness, metallic, strength):
+    """By a white floor. All beams reflect the energy Σ e_l Y_l0: of varnish the irradiance, A_l Y_l0, in closed form.
+    The operators of all views, projected on harmonics, are a symmetric matrix."""
+    node, weight = np.polynomial.legendre.leggauss(40)
+    cosines, zonal = (node + 1) / 2, [l * (l + 1) for l in range(7)]
+    cameras = [OrthographicCamera(math.acos(cosine), 0.3, 1.0) for cosine in cosines]
+    gloss, settings = Gloss(roughness, metallic, strength), ImageSettings(1, 1)
+    given = {"basis": Harmonics(6), "dtype": UP.dtype, "gloss": gloss}
+    operators = build_operators(FLOOR, cameras, settings, choose("numpy"), **given)
+    seen = torch.stack([operator.by_channel[0, zonal, 0] for operator in operators])  # (views, 7)
+    above = torch.tensor([[0.0, 0.0, 1.0]], dtype=UP.dtype)
+    measure = torch.from_numpy(weight * cosines)  # 2 cosine dcosine: the mean over the hemisphere's irradiance
+    reflected, irradiance = measure @ seen, (basis(above, 6) * lambertian_factors(6))[0, zonal]
+    views = torch.stack([0 * measure, (1 - torch.from_numpy(cosines) ** 2).sqrt(), torch.from_numpy(cosines)], dim=1)
+    matrix = (basis(views, 6)[:, zonal] * measure[:, None]).T @ seen
+    torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=4e-3)
+    if metallic == 0:
+        torch.testing.assert_close(reflected, irradiance, rtol=0, atol=2e-3)
+    assert reflected[0] <= irradiance[0] * (1 + 1e-4)
+
+
+@pytest.mark.parametrize("strength", [0.5, 1.0])
+def test_the_part_of_the_sky_that_a_wall_leaves_is_reflected_as_by_kulla_and_conty(strength):
+    """At the foot of a wall without end, which hides half of an even sky."""
+    wall = np.array([[0.05, -99.0, 0], [0.05, 99, 0], [0.05, 99, 99], [0.05, -99, 99]])
+    corner = Mesh.plain(np.concatenate([FLOOR.vertices, wall]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]))
+    white = replace(corner, corner_colors=np.ones_like(corner.corner_colors))
+    camera, sky = OrthographicCamera(0.7, math.pi, 1e-3), load_light("uniform", 6).double() * math.pi
+    settings, given = ImageSettings(1, 1, shadows=True), {"basis": Harmonics(6), "dtype": UP.dtype}
+    [operator] = build_operators(white, [camera], settings, choose("numpy"), gloss=Gloss(1.0, 0.0, strength), **given)
+    light, solid_angles = hemisphere(24)
+    free = light[:, 0] < 0  # on the camera's side, as `toward` looks
+    reflectance = expected_reflectance(light, math.cos(0.7), 1.0, 0.0, strength)
+    expected = float((reflectance * light[:, 2] * solid_angles)[free].sum())
+    assert float(operator.radiance(sky)[0, 0]) == pytest.approx(expected, rel=0.02)
 
 
 def positive_light(degree: int) -> torch.Tensor:
