@@ -138,7 +138,7 @@ class SampleGloss(NamedTuple):
         """Compute A_l - s B_l, by which environment light below the coat becomes irradiance. Differentiable.
 
         Args:
-            degree: Degree of the light.
+            degree: Degree of the light, at most `DIFFUSE_DEGREE`.
 
         Returns:
             A factor for each coefficient of the light, shape ((degree + 1)², S), or (..., 1) of an even gloss.
@@ -160,12 +160,21 @@ class SampleGloss(NamedTuple):
         leaving = self.entering((normals * toward).sum(1))
         return (1 - self.metallic) * leaving / (1 - self.strength * coat_mean(self.roughness))
 
-    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, Tensor]:
-        """(colored, white, world): radiance (K, S) per unit coefficient of environment light of K = (degree + 1)², in
-        the axes of the view, and the matrix (K, K) to those of the world; differentiable. None for no color."""
+    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, ViewFrame]:
+        """Compute the radiance per unit coefficient of environment light, along the axes of a view. Differentiable.
+
+        Args:
+            normals: Unit normals, shape (S, 3).
+            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+            degree: Degree of the light.
+
+        Returns:
+            What is multiplied by the albedo, shape (K, S), K = (degree + 1)², or None for no color; what is not, of the
+            same shape; and the frame of the view, which turns coefficients into those of the world (`to_world`).
+        """
         frame = ViewFrame.of(normals, toward)
         colored, white = self.lobes(frame.cosine, degree)
-        return colored if colored is None else frame.harmonics(colored), frame.harmonics(white), frame.world(degree)
+        return colored if colored is None else frame.harmonics(colored), frame.harmonics(white), frame
 
     def along(self, normals: Tensor, toward: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """(colored, white) radiance (...) per irradiance from directions (..., 3); all unit vectors. Differentiable."""

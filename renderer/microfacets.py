@@ -100,7 +100,7 @@ class ViewFrame(NamedTuple):
         return self.normals[2].clamp(0, 1)
 
     def harmonics(self, lobes: Tensor) -> Tensor:
-        """(K, S) coefficients of lobes (M, S), as of `lobe_functions`, for light in the view's axes (`world`)."""
+        """(K, S) coefficients of lobes (M, S), as of `lobe_functions`, for light in the view's axes (`to_world`)."""
         degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
         function, m = (index.to(lobes.device) for index in _functions(degree))
         rows = lobes.index_select(0, function) * _circular(self.normals[0], self.normals[1], degree).index_select(
@@ -112,12 +112,22 @@ class ViewFrame(NamedTuple):
         rows = _about_z(_by_band(cycle, rows), sine_y, cosine_y)
         return _about_z(_by_band(cycle, rows), sine_x, cosine_x)
 
-    def world(self, degree: int) -> Tensor:
-        """(K, K): coefficients of the world's axes, of those of `harmonics`."""
-        cycle, count = _cycle(degree).to(self.axis), (degree + 1) ** 2
-        rows = cycle if self.tilt is not None else torch.eye(count).to(self.axis)
-        sine, cosine, *azimuth = self.axis[:, None]
-        return _about_z(cycle.T @ _about_z(cycle @ rows, sine, cosine), *azimuth)
+    def to_world(self, rows: Tensor) -> Tensor:
+        """Turn coefficients (K, P) along the axes of `harmonics` into those along the world's axes."""
+        cycle = _cycle(math.isqrt(len(rows)) - 1)
+        if self.tilt is not None:
+            rows = _by_band(cycle, rows)
+        sine, cosine, *azimuth = self.axis[:, None].to(rows)
+        rows = _about_z(_by_band(cycle, rows), sine, cosine)
+        return _about_z(_by_band(cycle.T, rows), *azimuth)
+
+    def from_world(self, rows: Tensor) -> Tensor:
+        """Turn coefficients (K, P) along the world's axes into those along the axes of `harmonics`."""
+        cycle = _cycle(math.isqrt(len(rows)) - 1)
+        sine, cosine, sine_azimuth, cosine_azimuth = self.axis[:, None].to(rows)
+        rows = _by_band(cycle, _about_z(rows, -sine_azimuth, cosine_azimuth))
+        rows = _by_band(cycle.T, _about_z(rows, -sine, cosine))
+        return rows if self.tilt is None else _by_band(cycle.T, rows)
 
 
 def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:

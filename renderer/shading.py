@@ -87,8 +87,8 @@ def glossy_radiance(
     for first in range(0, len(shaded), BLOCK):
         some = slice(first, first + BLOCK)
         seen = shaded[some], at_samples(toward, some)
-        colored, white, world = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
-        in_view = (world.T @ light).T
+        colored, white, frame = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
+        in_view = frame.from_world(light).T
         shine = in_view @ white
         if colored is not None:
             shine = shine + albedo[some].T * (in_view @ colored)
@@ -101,7 +101,8 @@ def glossy_radiance(
 
 def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
     """Compute the irradiance (3, S) that the coat reflects at samples with unit normals (3, S)."""
-    degree = harmonics.degree_of(light)
+    degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
+    light = light[: (degree + 1) ** 2]
     reflected = coat_bands(degree).to(light)[harmonics.bands(degree)]  # (K, nodes)
     of_roughness = along(gloss.roughness)  # (nodes, S) or (nodes, 1)
     if len(gloss.roughness) == 1:
@@ -222,7 +223,7 @@ def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> 
 
 def _even(degree: int) -> int:
     """The degree of the homogeneous polynomial that holds the even bands from 2 on."""
-    return max(degree - degree % 2, 2)
+    return max(min(degree, harmonics.DIFFUSE_DEGREE) - degree % 2, 2)
 
 
 @harmonics.per_degree

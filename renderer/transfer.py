@@ -32,6 +32,7 @@ from renderer.image import (
     encode,
     encode_gradient,
 )
+from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
@@ -47,7 +48,7 @@ DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
 BLOCK = 2**12  # pixels filtered at a time: their sums stay in the processor's cache
-GLOSSY = 2**14  # samples with gloss, of which more numbers are computed
+GLOSSY = 2**20  # coefficients of samples with gloss at a time, of which more numbers are computed
 
 
 @dataclass(frozen=True)
@@ -521,17 +522,19 @@ def _glossy_box_filter(
     """`_box_filter` (C, K, P) with what gloss adds, for all K coefficients. One channel is followed by white."""
     fragments, colors = surface.fragments, albedo.shape[1]
     filtered = torch.zeros(colors + (colors == 1), basis.size, len(fragments.pixels), dtype=dtype)
-    weights = albedo / fragments.samples**2
-    for some, at, block in _blocks(fragments.pixel, filtered, max(1, GLOSSY // fragments.samples**2)):
+    weights, degree = albedo / fragments.samples**2, min(basis.degree, harmonics.DIFFUSE_DEGREE)
+    pixels_at_once = max(1, GLOSSY // (basis.size * fragments.samples**2))
+    for some, at, block in _blocks(fragments.pixel, filtered, pixels_at_once):
         seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
         part = gloss.at(some)
-        colored, white, world = part.transfer(*seen, basis.degree)
-        rows = basis.radiance(seen[0]) * part.entering_bands(basis.degree).T * part.diffuse(*seen)[:, None]
+        colored, white, frame = part.transfer(*seen, basis.degree)
+        rows = harmonics.basis(seen[0], degree) * part.entering_bands(degree).T * part.diffuse(*seen)[:, None]
         for channel, weight in zip(block, weights[some].T, strict=False):
-            channel.copy_(_over_pixels(rows * weight[:, None], at, pixels))
+            channel[: rows.shape[1]] = _over_pixels(rows * weight[:, None], at, pixels).to(dtype)
             if colored is not None:
-                channel += world @ _over_pixels((colored * weight).T, at, pixels)
-        block[1 if colors == 1 else slice(None)] += world @ _over_pixels(white.T, at, pixels) / fragments.samples**2
+                channel += frame.to_world(_over_pixels((colored * weight).T, at, pixels))
+        shine = frame.to_world(_over_pixels(white.T, at, pixels)) / fragments.samples**2
+        block[1 if colors == 1 else slice(None)] += shine
     return filtered
 
 

@@ -27,10 +27,11 @@ from renderer.validation import as_tensor, require_whole
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
-MAX_DEGREE = 20
 MAX_QUADRATURE = 10**4  # degree of a quadrature, whose directions are as many as its square
 MAX_TEXELS = 10**6  # texels on a side of an environment map
 ORTHONORMAL = 1e-3  # largest error of a product of rotation and its inverse, also of one that is written by hand
+MAX_DEGREE = 40  # of lights: gloss of roughness 0.2 shows so much
+DIFFUSE_DEGREE = 20  # of what reaches diffuse surfaces; the bands above are worth 0.015 of a beam's irradiance at most
 Constant = TypeVar("Constant")
 
 
@@ -208,12 +209,13 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
 def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """What a diffuse surface keeps of each coefficient: irradiance = Σ A_l U_lm Y_lm(n).
 
-    A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
+    A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8). Those
+    beyond `DIFFUSE_DEGREE` are taken for zero.
     """
-    factors = [math.pi, 2 * math.pi / 3]
-    for l in range(2, degree + 1):
+    factors = [math.pi, 2 * math.pi / 3, *[0.0] * (degree - 1)]
+    for l in range(2, min(degree, DIFFUSE_DEGREE) + 1):
         even = 2 * math.pi * (-1) ** (l // 2 - 1) / ((l + 2) * (l - 1)) * (math.comb(l, l // 2) / 2.0**l)
-        factors.append(0.0 if l % 2 else even)
+        factors[l] = 0.0 if l % 2 else even
     return torch.tensor(factors, dtype=torch.float64)[bands(degree)]
 
 

@@ -77,8 +77,8 @@ def test_lobes_are_those_of_the_reflectance_by_quadrature(roughness, most, apart
     for metallic, f0, f90 in ((1.0, 1.0, 0.0), (1.0, 0.0, 1.0), (0.0, math.nan, 1.0)):
         gloss, ours = SampleGloss(double(roughness), double(metallic), double(1.0)), []
         for seen in torch.cat([toward(cosine) for cosine in views]).split(1 if apart else 3):
-            colored, white, world = gloss.transfer((UP @ turn.T).expand_as(seen), seen @ turn.T, 6)
-            ours.append((world @ (colored if f0 == 1 else white)).T)
+            colored, white, frame = gloss.transfer((UP @ turn.T).expand_as(seen), seen @ turn.T, 6)
+            ours.append(frame.to_world(colored if f0 == 1 else white).T)
         for cosine, row in zip(views, torch.cat(ours), strict=True):
             lobe = gltf_reflectance(cosine, directions, roughness, f0, f90) * directions[:, 2] * solid_angles
             exact = torch.from_numpy(lobe) @ harmonics
