@@ -46,6 +46,7 @@ ABOVE = renderer.OrthographicCamera(math.pi / 3, 0.4, 2.2)
 ASIDE = renderer.OrthographicCamera(1.4, 2.5, 2.6, 0.2, -0.1)
 NEAR = renderer.PerspectiveCamera(1.1, -0.7, 2.2, distance=4.0)
 RING = renderer.orbit_cameras(3, 2.2, fov=math.radians(40))
+VARNISHED_METAL = renderer.Gloss(roughness=0.4, metallic=0.3, strength=0.8)
 
 # name: (mesh, cameras, light, keywords of `render`, differentiated arguments)
 RENDERS = {
@@ -60,6 +61,7 @@ RENDERS = {
     "textured": ("tent", NEAR, "grace", {"encoding": "srgb"}, ("light", "albedo")),
     "flat_gradients": ("sweet_pepper:0", ABOVE, "grace", {"normals": "flat"}, ("light", "vertices", "albedo")),
     "smooth_gradients": ("peach:0", NEAR, "eucalyptus", {"encoding": "srgb"}, ("light", "vertices", "albedo")),
+    "gloss_gradients": ("apple:1", NEAR, "grace", {"gloss": VARNISHED_METAL}, ("light", "vertices", "albedo")),
     "bounces_gradients": ("lamp:0", ABOVE, "uniform", {"bounces": 1}, ("light", "vertices", "albedo")),
 }
 # name: (mesh, cameras, keywords of `precompute_transfer`)
