@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from augment import utils
-from augment.attacks.attack import AttackSettings, logits_of, warn_of_changed_light
+from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import AttackProblem
@@ -66,7 +66,8 @@ class RandomLightSettings:
 @dataclass
 class TrainingAttackSettings(AttackSettings):
     """Unless parameters are named, the attack of the paper's appendix C on all coefficients of the light: 30 steps of
-    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images.
+    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images. Successes
+    count without noise, too.
 
     step, step_size: of that attack on the light, as in `StepSettings`.
     """
@@ -76,6 +77,7 @@ class TrainingAttackSettings(AttackSettings):
     allow_negative: bool = True
     margin: float = 0.0
     rounded: bool = False
+    sensor_noise: float = 0.0
     batch_size: int = 128
 
     @property
@@ -384,20 +386,34 @@ class AugmentationService:
             restarts=restarts,
             seed=stream_seed(self.seed, number),
         )
+        with as_found(model), self.phases("attack_classifier"):
+            fooled = fooled_in_views(
+                attack.preprocessed_model(model),
+                result.images,
+                result.predicted,
+                shard,
+                goal.of(shard),
+                attack,
+                stream_seed(self.seed, number),
+            )
+        success = fooled.all(1) | result.success_before  # as no attack was needed there
+        success = utils.merged(success, shard, len(self.labels), self.world_size)
         shards = [getattr(result, item.name) for item in fields(result)]
         result = DescentResult(*(utils.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
         if self.settings.warm_start:
             self._last_values = result.values
         diagnostics = {
             "attack_success_before": _mean(result.success_before),
-            "attack_success": _mean(result.success),
+            "attack_success": _mean(success),
             "steps": _mean(result.steps),
             "used_all_steps": _mean(result.steps == attack.max_steps * (1 + attack.restarts)),
             "loss_before": -_mean(result.cost_before),
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
-        new_success = result.success & ~result.success_before
+        if attack.sensor_noise:
+            diagnostics["attack_success_without_noise"] = _mean(result.success)
+        new_success = success & ~result.success_before
         examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
         return Renders(result.images[:, 0], self.labels, diagnostics | _changes(problem, result.values), examples)
 

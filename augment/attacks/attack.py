@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.eot import EOTSettings, Rounded
+from augment.attacks.eot import EOTSettings, Rounded, stored
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import (
     PARAMETERS,
@@ -43,12 +43,16 @@ from renderer.validation import (
 )
 
 LEAST_LIKELY = "least_likely"  # in place of a target class
+MOST_NOISE = 255.0  # steps of 8 bits: the whole range of values
+UNSTEADY = ("pose", "material")  # whose adversaries often end where noise still decides
+NOISE_MARGIN = 1.0  # times the range of the leads with noise and without
 
 
 @dataclass
 class AttackSettings:
     """What an attack changes, and how it descends. The defaults are careful: the light stays physically possible, and a
-    success survives being stored with 8 bits; the paper has allow_negative=True, margin=0 and rounded=False.
+    success survives a camera's noise and 8 bits; the paper has allow_negative=True, margin=0, rounded=False and
+    sensor_noise=0.
 
     lighting, skylight, projector, lamps, positions (of lamps), geometry, pose, material, albedo, pixels: norm-ball and
     steps of each parameter; None leaves it as it is.
@@ -56,6 +60,10 @@ class AttackSettings:
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
     view. rounded: the classifier gets images of 8 bits. eot: descend on the mean over random transformations.
+    sensor_noise: a success counts if it remains in each of three images that a camera stores, with Gaussian noise of
+    this standard deviation before they are rounded to 8 bits, in steps of 8 bits (1/255); 0 counts without noise. It is
+    counted once, at the end. noise_margin: an example also goes on until its least lead, with such noise and without, is
+    this many times the range of these leads; None is 1 where pose or material is attacked, and 0 otherwise.
     allow_negative: any coefficients of light. If False, the light is first made one that something can emit (of
     harmonics: radiance nowhere negative, of the same mean and the most alike irradiance), whatever is attacked. Each
     step on the light then ends in the nearest such coefficients, whose mean may differ from what the step asked for.
@@ -77,6 +85,8 @@ class AttackSettings:
     restarts: int = 0
     margin: float = 2.0
     rounded: bool = True
+    sensor_noise: float = 1.0
+    noise_margin: float | None = None
     eot: EOTSettings = field(default_factory=EOTSettings)
     allow_negative: bool = False
     batch_size: int = 32
@@ -86,6 +96,8 @@ class AttackSettings:
         require_range("max_steps", self.max_steps, 0, 10**6)
         require_range("restarts", self.restarts, 0, 10**6)
         require_range("margin", self.margin, 0, FACTOR)
+        require_range("sensor_noise", self.sensor_noise, 0, MOST_NOISE)
+        require_range("noise_margin", self.noise_margin, 0, FACTOR)
         require_range("batch_size", self.batch_size, 1, 10**6)
         if self.lighting and self.skylight:
             raise InputError("lighting and skylight both set the light: choose one of them")
@@ -97,6 +109,15 @@ class AttackSettings:
     def parameters(self) -> dict[str, StepSettings]:
         """The settings of the parameters to change, by name."""
         return {name: settings for name in PARAMETERS if (settings := getattr(self, name)) is not None}
+
+    @property
+    def lead_over_noise(self) -> float:
+        """The `noise_margin` in use: 0 where the noise is not to be asked about."""
+        if not self.sensor_noise:
+            return 0.0
+        if self.noise_margin is not None:
+            return self.noise_margin
+        return NOISE_MARGIN if any(name in UNSTEADY for name in self.parameters) else 0.0
 
     def require_parameters(self) -> None:
         """InputError where nothing is to be changed."""
@@ -122,8 +143,10 @@ class AttackResult:
 
     images_before, images: (E, V, 3, size, size), not rounded, with the shadows and bounces of each shape in its own
     colors. logits_before, logits: (E, V, C), of the preprocessed images. success: (E,) bool, whether the goal is
-    reached in every view by these logits; success_with_margin: by `settings.margin` or more. descent: where the descent
-    ended; while shape and colors change, it holds shadows and bounces fixed. seconds: of the descent.
+    reached in every view, as `fooled_in_views` counts it; success_without_noise: by these logits alone;
+    success_with_margin: a success that also leads by `settings.margin` or more in these logits. descent: where the
+    descent ended, whose own success is by its images alone; while shape and colors change, it holds shadows and bounces
+    fixed. seconds: of the descent.
     """
 
     problem: AttackProblem
@@ -135,6 +158,7 @@ class AttackResult:
     images: Tensor
     logits_before: Tensor
     logits: Tensor
+    success_in_views: Tensor
     descent: DescentResult
     seconds: dict[str, float]
 
@@ -145,19 +169,19 @@ class AttackResult:
 
     @property
     def success(self) -> Tensor:
-        """(E,) bool: whether the criterion is met in every view."""
+        """(E,) bool: whether the criterion is met in every view, also with the noise of a sensor."""
         return self.success_in_views.all(1)
+
+    @property
+    def success_without_noise(self) -> Tensor:
+        """(E,) bool: whether the criterion is met in every view, by the images as the classifier gets them."""
+        return self.goal.reached(self.logits.argmax(2))
 
     @property
     def success_with_margin(self) -> Tensor:
         """(E,) bool: whether the logits lead by `settings.margin`, too, in every view."""
         gaps = logit_gap(self.logits, self.goal.source, self.goal.target)
         return self.success & (gaps >= self.settings.margin).all(1)
-
-    @property
-    def success_in_views(self) -> Tensor:
-        """(E, V) bool: whether the criterion is met in each view."""
-        return self.goal.reached_in_views(self.logits.argmax(2))
 
     @property
     def success_before(self) -> Tensor:
@@ -237,8 +261,9 @@ def attack(
         descent = descend(model, problem, goal, settings, phases, restarts=restarts, seed=seed)
         images = final_images(problem, descent.values, problem.everything, descent.images)
     after = logits_of(model, images, settings.batch_size)
+    fooled = fooled_in_views(model, images, after.argmax(2), problem.everything, goal, settings, seed)
     return AttackResult(
-        problem, classifier, goal, settings, seed, images_before, images, before, after, descent, phases.take()
+        problem, classifier, goal, settings, seed, images_before, images, before, after, fooled, descent, phases.take()
     )
 
 
@@ -307,6 +332,47 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     flat = images.flatten(0, 1)
     logits = BatchSize(batch_size).map(lambda part: model(flat[part]), len(flat))
     return torch.cat([*progress(logits, "predictions")]).unflatten(0, images.shape[:2])
+
+
+def fooled_in_views(
+    model: nn.Module,
+    images: Tensor,
+    predicted: Tensor,
+    examples: Tensor,
+    goal: Goal,
+    settings: AttackSettings,
+    seed: int,
+) -> Tensor:
+    """Which views count as a success: this alone decides it, for attacks, their checks, sweeps, transfers and files.
+
+    A view counts if it reaches the goal as it is and in each of the images that a camera stores of it, as
+    `augment.attacks.eot.stored` makes them. An example has the same noise wherever it is counted under a seed, so that
+    a search with many tries does not draw the noise again.
+
+    Args:
+        model: images (N, 3, H, W) in [0, 1] to logits, with its preprocessing.
+        images: (A, V, 3, H, W) in [0, 1], without noise.
+        predicted: (A, V) int64, the classes of these images.
+        examples: (A,) int64, the examples' numbers, on which their noise depends.
+        goal: of these A examples.
+        settings: of the attack; with `sensor_noise=0`, the images as they are decide.
+        seed: of the noise.
+
+    Returns:
+        (A, V) bool, on the device of `predicted`.
+    """
+    fooled = goal.reached_in_views(predicted)
+    rows = torch.nonzero(fooled.any(1)).squeeze(1)
+    if not settings.sensor_noise or not len(rows):
+        return fooled
+    rows_of_images = rows.to(images.device)
+    noisy_images = stored(
+        images[rows_of_images], settings.sensor_noise, examples.to(rows.device)[rows], seed, "sensor noise"
+    )
+    for noisy in noisy_images:
+        classes = logits_of(model, noisy, settings.batch_size).argmax(2).to(fooled.device)
+        fooled[rows] &= goal.of(rows).reached_in_views(classes)
+    return fooled
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:

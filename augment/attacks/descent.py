@@ -9,7 +9,8 @@ where step() scales the gradient (`augment.attacks.norm_ball.StepSettings`) and 
 the physically possible. The length is 1; with `shorten`, a step that did not lower the cost is undone and tried at half
 its length. One forward pass gives the cost, the gradient and the predictions. An example is a success once the
 criterion is met in every view by the image as the preprocessed classifier gets it; it leaves the batch once its
-logits also lead by `margin` there. Until then, the success of lowest cost is kept.
+logits also lead by `margin` there and, where the settings ask for it, by as much as a sensor's noise changes. Until
+then, the success of lowest cost is kept. Whether it counts is decided after the descent, by `fooled_in_views`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.eot import ExpectationOverTransformations
+from augment.attacks.eot import ExpectationOverTransformations, stored
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.utils import BatchSize, Phases, as_found, generator, progress
 
@@ -62,8 +63,8 @@ class DescentResult:
     """The end of a descent, per example; all tensors lie on the values' device.
 
     values, images: of the step that reached the margin, else of the success of lowest cost, else of the last step that
-    was accepted. success_at: the first step that was a success (meaningless without one); with a margin, descent goes
-    on from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first one was exactly zero.
+    was accepted. success: without noise. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first
+    one was exactly zero.
     """
 
     values: Float[Tensor, "E D"]
@@ -71,7 +72,6 @@ class DescentResult:
     steps: Int[Tensor, " E"]
     success_before: Bool[Tensor, " E"]
     success: Bool[Tensor, " E"]
-    success_at: Int[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
     cost: Float[Tensor, " E"]
     predicted: Int[Tensor, "E V"]
@@ -95,7 +95,8 @@ def descend(
 
     model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. goal: of
     the examples. examples: (A,), some of the problem's. start: (A, D) instead of the problem's. restarts: further
-    starts (A, D); one replaces an example's result only if it succeeds; steps add up. seed: of `settings.eot`.
+    starts (A, D); one replaces an example's result only if it succeeds; steps add up. seed: of `settings.eot` and of
+    the noise that a lead is compared with.
     """
     phases = phases or Phases()
     examples = torch.arange(len(problem.start), device=problem.start.device) if examples is None else examples
@@ -106,7 +107,8 @@ def descend(
     whole: dict[str, Tensor] = {}
 
     def run(rows: Tensor, begin: Tensor) -> DescentResult:
-        return _descend_once(model, problem, examples[rows], begin[rows], goal.of(rows), settings, expectation, phases)
+        chosen = examples[rows], begin[rows], goal.of(rows)
+        return _descend_once(model, problem, *chosen, settings, expectation, phases, seed)
 
     for rows in progress(rounds, "groups of examples") if len(rounds) > 1 else rounds:
         best = run(rows, start)
@@ -116,7 +118,6 @@ def descend(
                 break
             again = run(rows[left], restart)
             better = left[again.success]
-            best.success_at[better] = (best.steps[left] + again.success_at)[again.success]
             best.steps[left] += again.steps
             for name in ("values", "images", "success", "cost", "predicted"):
                 getattr(best, name)[better] = getattr(again, name)[again.success]
@@ -138,11 +139,12 @@ def _descend_once(
     settings: AttackSettings,
     expectation: ExpectationOverTransformations,
     phases: Phases,
+    seed: int,
 ) -> DescentResult:
     """Of examples (A,) from a start (A, D). Only examples that go on are rendered."""
     values = start.detach().clone()
     active = torch.arange(len(values), device=values.device)
-    steps, success_at, success = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
+    steps, success = torch.zeros_like(active), torch.zeros_like(active).bool()
     kept_cost, position_cost = values.new_full((2, len(values)), torch.inf)
     candidate, position, position_gradient = values.clone(), values.clone(), torch.zeros_like(values)
     length = values.new_ones(len(values), 1)
@@ -160,13 +162,17 @@ def _descend_once(
                 images, cost_before, success_before = shown.clone(), cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (gap >= settings.margin)
+            if settings.lead_over_noise:
+                with phases("attack_classifier"):
+                    leading = done.nonzero()[:, 0]
+                    of_leading = shown[leading], examples[active[leading]], active_goal.of(leading)
+                    done[leading] = _leads_over_noise(model, *of_leading, settings, seed)
             # The next step starts from an accepted one; with `shorten`, from none that raised the cost.
             accepted = done | (cost < position_cost[active]) if settings.shorten else torch.ones_like(done)
             # Kept is what would be returned if this step were the last one.
             better = done | torch.where(success[active], reached & (cost < kept_cost[active]), reached | accepted)
             masks = torch.stack([accepted, better, ~done]).cpu()  # at once, since the host waits here for a GPU
             on, rows, left = (mask.nonzero()[:, 0].to(values.device, non_blocking=True) for mask in masks)
-            success_at[active] = torch.where(reached & ~success[active], step, success_at[active])
             length[active] /= 2 - accepted[:, None].to(length)
             moved, kept = active[on], active[rows]
             position[moved], position_gradient[moved] = candidate[moved], gradient[on]
@@ -180,8 +186,27 @@ def _descend_once(
             candidate[active] = problem.project(stepped, examples[active])
             steps[active] += 1
     return DescentResult(
-        values, images, steps, success_before, success, success_at, cost_before, kept_cost, predicted, zero_gradient
+        values, images, steps, success_before, success, cost_before, kept_cost, predicted, zero_gradient
     )
+
+
+@torch.no_grad()
+def _leads_over_noise(
+    model: nn.Module, images: Tensor, examples: Tensor, goal: Goal, settings: AttackSettings, seed: int
+) -> Tensor:
+    """Whether images (A, V, 3, H, W) lead by more than noise changes, in every view, (A,) bool: whether the smallest lead
+    of their logits, with noise and without, is `settings.lead_over_noise` times the range of these leads. The draws of
+    noise are not those by which a success is counted."""
+    if not len(images):
+        return examples.new_zeros(0, dtype=torch.bool)
+    noisy_images = stored(images, settings.sensor_noise, examples, seed, "noise margin")
+    leads = []
+    for shown in (images, *noisy_images):
+        flat = shown.flatten(0, 1)
+        logits = torch.cat([model(part) for part in flat.split(settings.batch_size)])
+        leads.append(logit_gap(logits.unflatten(0, shown.shape[:2]), goal.source, goal.target))
+    smallest, largest = torch.stack(leads).aminmax(dim=0)
+    return (smallest >= settings.lead_over_noise * (largest - smallest)).all(1)
 
 
 def _classifier_pass(

@@ -1,7 +1,8 @@
-"""The image as a classifier gets it: rounded to 8 bits, or under random transformations, as of an unsteady camera."""
+"""The image as a classifier gets it: rounded to 8 bits, with the noise of a sensor, or under random transformations, as
+of an unsteady camera."""
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,12 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
+from augment.utils import generator
 from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
 from renderer.validation import require_field_types
+
+NOISE_DRAWS = 3  # of the sensor's noise, all of which an adversary must survive
 
 
 @dataclass
@@ -47,6 +51,28 @@ class Rounded(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         return self.model(straight_through(images, lambda exact: to_unit(to_bytes(exact)).to(exact)))
+
+
+def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) -> Iterator[Tensor]:
+    """Images as a camera stores them, in each of `NOISE_DRAWS` draws of its noise.
+
+    A sensor adds its noise before the values are rounded, and so does this. An example's noise depends on the key and
+    on its number alone: not on the other examples, nor on the device, and no other random stream changes.
+
+    Args:
+        images: (A, V, 3, H, W) in [0, 1].
+        deviation: the standard deviation of the Gaussian noise, in steps of 8 bits (1/255).
+        examples: (A,) int64, the numbers of the examples.
+        key: of the random stream, such as the seed of an attack; see `augment.utils.stream_seed`.
+
+    Yields:
+        (A, V, 3, H, W) in [0, 1], of 8 bits, with values of the images' type.
+    """
+    draws = [generator(*key, example) for example in examples.tolist()]
+    for _ in range(NOISE_DRAWS):
+        noise = [torch.randn(images.shape[1:], generator=draw) for draw in draws]
+        noisy = images + deviation / 255 * torch.stack(noise).to(images)
+        yield to_unit(to_bytes(clamp(noisy))).to(images)
 
 
 class ExpectationOverTransformations:

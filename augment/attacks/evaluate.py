@@ -1,8 +1,10 @@
 """The worth of an attack's result: random search, more steps, success by radius, and transfer."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.attack import (
     AttackResult,
     final_images,
+    fooled_in_views,
     logits_of,
     predictions,
     require_result,
@@ -27,47 +30,123 @@ from augment.utils import generator, progress
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.validation import as_list, require_number
 
-GROWTH = (1, 3, 10)
-CHECKED = {"success", "random_search", "cost_fell", "zero_gradient"}  # results of `check` that `warnings` reads
+GROWTH = (3, 10)  # times as many steps as the attack had
+CHECKED = {  # results of `check` that `warnings` reads
+    "success",
+    "success_without_noise",
+    "random_search",
+    "cost_fell",
+    "zero_gradient",
+}
 OF_MESH, OF_VIEW = ("geometry", "pose", "material", "albedo", "pixels"), ("pixels",)  # that no other mesh or view has
 
 
 def check(result: AttackResult) -> dict[str, Any]:
-    """Compare an attack with as many random draws as it has steps, and with descents of 1, 3 and 10 times as many.
+    """Compare an attack with as many random draws as it has steps, and with descents of 3 and 10 times as many.
 
-    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. Returns
-    fractions of the examples and mean costs. cost_fell: of the examples without success before. success,
-    success_with_margin, random_search, success_by_steps: of the clean-correct examples.
+    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. A success
+    counts as in the result, with the noise of a sensor; it also counts for all longer descents. Returns fractions of
+    the examples and mean costs. cost_fell: of the examples without success before. success, success_with_margin,
+    random_search, success_by_steps, and NAME_without_noise of these but the second: of the clean-correct examples.
 
     >>> checks = augment.check(result)
     >>> checks["success"], checks["cost"] < checks["cost_before"]
     (1.0, True)
     """
     require_result(result)
-    descent, settings, problem, clean = result.descent, result.settings, result.problem, result.clean_correct
+    descent, problem, clean = result.descent, result.problem, result.clean_correct
     open_cases = ~result.success_before
-    fell = (descent.cost < descent.cost_before) | result.success
-    longest = replace(settings, max_steps=settings.max_steps * max(GROWTH))
-    end = descend(result.preprocessed_model, problem, result.goal, longest, seed=result.seed)
-    success = _confirmed(result, problem, end.success, end.values, problem.everything, end.images)
-    limits = [settings.max_steps * factor for factor in GROWTH]
+    fell = (descent.cost < descent.cost_before) | result.success_without_noise
     draw = partial(problem.sample, generator(result.seed, "random search"), descent.values)
-    random = _success_by_draws(result, result.success_before, draw)
+    random = _success_by_draws(result, Successes.before(result), draw)
+    by_steps = _success_by_steps(result)
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
         "cost_fell": _fraction(fell[open_cases]) if open_cases.any() else 1.0,
         "zero_gradient": _fraction(descent.zero_gradient),
         "success": _fraction(result.success[clean]),
+        "success_without_noise": _fraction(result.success_without_noise[clean]),
         "success_with_margin": _fraction(result.success_with_margin[clean]),
-        "random_search": _fraction(random[clean]),
-        "success_by_steps": {limit: _fraction((success & (end.success_at <= limit))[clean]) for limit in limits},
+        "random_search": _fraction(random.counted[clean]),
+        "random_search_without_noise": _fraction(random.without_noise[clean]),
+        "success_by_steps": {steps: _fraction(found.counted[clean]) for steps, found in by_steps.items()},
+        "success_by_steps_without_noise": {
+            steps: _fraction(found.without_noise[clean]) for steps, found in by_steps.items()
+        },
     }
+
+
+@dataclass(frozen=True)
+class Successes:
+    """Which of E examples are a success, (E,) bool each: counted as `fooled_in_views` does, and without noise."""
+
+    counted: Tensor
+    without_noise: Tensor
+
+    @staticmethod
+    def before(result: AttackResult) -> Successes:
+        """Those before any step, which nothing goes on with."""
+        return Successes(result.success_before.clone(), result.success_before.clone())
+
+    def clone(self) -> Successes:
+        return Successes(self.counted.clone(), self.without_noise.clone())
+
+    @property
+    def left(self) -> Tensor:
+        """The numbers of the examples that are not counted."""
+        return torch.nonzero(~self.counted).squeeze(1)
+
+    def add(
+        self,
+        result: AttackResult,
+        problem: AttackProblem,
+        values: Tensor,
+        examples: Tensor,
+        images: Tensor,
+    ) -> None:
+        """Count examples (A,) under values (A, D), by the images (A, V, 3, H, W) that the problem rendered of them.
+
+        Where these show a success, the final images decide; see `final_images`.
+        """
+        reached = result.goal.of(examples).reached(_predicted(result, images))
+        rows = torch.nonzero(reached).squeeze(1)
+        if not len(rows):
+            return
+        chosen = examples[rows]
+        goal = result.goal.of(chosen)
+        final = final_images(problem, values[rows], chosen, images[rows])
+        predicted = _predicted(result, final)
+        fooled = fooled_in_views(
+            result.preprocessed_model, final, predicted, chosen, goal, result.settings, result.seed
+        )
+        self.without_noise[chosen] |= goal.reached(predicted)
+        self.counted[chosen] |= fooled.all(1)
+
+
+def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
+    """By number of steps, the successes of descents from the start; examples that count already are left out."""
+    settings, problem = result.settings, result.problem
+    found = Successes(result.success, result.success_without_noise)
+    by_steps = {settings.max_steps: found}
+    for factor in GROWTH:
+        longer = replace(settings, max_steps=factor * settings.max_steps)
+        found = found.clone()
+        left = found.left
+        if len(left):
+            goal = result.goal.of(left)
+            model = result.preprocessed_model
+            end = descend(model, problem, goal, longer, examples=left, seed=result.seed)
+            found.add(result, problem, end.values, left, end.images)
+        by_steps[longer.max_steps] = found
+    return by_steps
 
 
 def warnings(checks: Mapping[str, Any]) -> list[str]:
     """Reasons to doubt an attack with these results of `check`."""
+    lost = checks["success_without_noise"] - checks["success"]
     reasons = {
+        "most successes do not survive a sensor's noise, a larger attack.margin helps": lost > checks["success"],
         "random search does as well or better": 0 < checks["success"] <= checks["random_search"],
         "the cost rose in some examples": checks["cost_fell"] < 1,
         "some first gradients are exactly zero": checks["zero_gradient"] > 0,
@@ -75,31 +154,18 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
     return [warning for warning, holds in reasons.items() if holds]
 
 
-def _success_by_draws(result: AttackResult, success: Tensor, draw: Callable[[], Tensor]) -> Tensor:
-    """`success` (E,), or whether any of as many draws (E, D) as the attack had steps is one."""
-    success = success.clone()
+def _success_by_draws(result: AttackResult, found: Successes, draw: Callable[[], Tensor]) -> Successes:
+    """What was found, with what as many draws (E, D) as the attack had steps add to it."""
+    found = found.clone()
     for _ in progress(range(result.settings.max_steps), "random search"):
-        left = torch.nonzero(~success).squeeze(1)
+        left = found.left
         if not len(left):
             break
         values = draw()[left]
         with torch.no_grad():
             images = result.problem.render(values, left)
-        reached = result.goal.of(left).reached(_predicted(result, images))
-        success[left] = _confirmed(result, result.problem, reached, values, left, images)
-    return success
-
-
-def _confirmed(
-    result: AttackResult, problem: AttackProblem, success: Tensor, values: Tensor, examples: Tensor, images: Tensor
-) -> Tensor:
-    """`success` (A,) of images that the problem rendered, if the final images confirm it; see `final_images`."""
-    rows = torch.nonzero(success).squeeze(1)
-    rendered = images[rows]
-    final = final_images(problem, values[rows], examples[rows], rendered)
-    if final is rendered:
-        return success
-    return success.index_put((rows,), result.goal.of(examples[rows]).reached(_predicted(result, final)))
+        found.add(result, result.problem, values, left, images)
+    return found
 
 
 def _predicted(result: AttackResult, images: Tensor) -> Tensor:
@@ -116,7 +182,8 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     scales: factors of radii and steps or, without a radius, the radii. A success at one radius counts at all larger
     radii; only the rest is attacked again, from where it ended at the radius before, for `max_steps` more steps, and
     gets as many uniform draws. Returns for each scale, ascending: radii, by parameter; adversarial and random, (N,)
-    bool of the N clean-correct examples, whether a descent or a random search succeeds.
+    bool of the N clean-correct examples, whether a descent or a random search succeeds, which counts as in the result,
+    with the noise of a sensor; adversarial_without_noise and random_without_noise.
 
     >>> small, large = augment.success_by_radius(result, [0.001, 1])
     >>> small["radii"], small["adversarial"], large["adversarial"]
@@ -131,8 +198,8 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
         require_range("scales", scale, 1 / FACTOR, FACTOR)
     settings, problem, goal, clean = result.settings, result.problem, result.goal, result.clean_correct
     draws = generator(result.seed, "sweep")
-    values, success = problem.start.clone(), result.success_before.clone()
-    random, rows = success.clone(), []
+    values, found = problem.start.clone(), Successes.before(result)
+    random, rows = found.clone(), []
     for scale in progress(sorted(set(scales)), "radii"):
         balls: dict[str, Any] = {
             name: replace(steps, radius=scale)
@@ -141,7 +208,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
             for name, steps in settings.parameters.items()
         }
         scaled = replace(settings, **balls).problem(problem.scene)
-        left = torch.nonzero(~success).squeeze(1)
+        left = found.left
         if len(left):
             end = descend(
                 result.preprocessed_model,
@@ -153,10 +220,13 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
                 seed=result.seed,
             )
             values[left] = end.values
-            success[left] = _confirmed(result, scaled, end.success, end.values, left, end.images)
+            found.add(result, scaled, end.values, left, end.images)
         random = _success_by_draws(result, random, partial(scaled.sample, draws))
-        radii = {name: ball.radius for name, ball in balls.items()}
-        rows.append({"radii": radii, "adversarial": success[clean].cpu(), "random": random[clean].cpu()})
+        row: dict[str, Any] = {"radii": {name: ball.radius for name, ball in balls.items()}}
+        for method, successes in (("adversarial", found), ("random", random)):
+            row[method] = successes.counted[clean].cpu()
+            row[f"{method}_without_noise"] = successes.without_noise[clean].cpu()
+        rows.append(row)
     return rows
 
 
@@ -171,8 +241,9 @@ def transfer(
 
     Returns a dict for each, for JSON. network, azimuth or mesh: which. clean_correct, success: A times whether every
     view is classified correctly before the attack, and whether the goal is reached in every view after it, which counts
-    only of the clean-correct. predicted_before, confidence_before, predicted, confidence: A × V. Added pixels and the
-    background are resized for another network. InputError: as `require_transferable`, and a class that one lacks.
+    only of the clean-correct, and as in the result with the noise of a sensor; success_without_noise: by the images as
+    they are. predicted_before, confidence_before, predicted, confidence: A × V. Added pixels and the background are
+    resized for another network. InputError: as `require_transferable`, and a class that one lacks.
 
     >>> larger = augment.Classifier(result.classifier.function, size=12, classes=["orange", "other"])
     >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])
@@ -201,12 +272,25 @@ def transfer(
         if result.goal.target is not None:
             names = [[attacked.classes[index] for index in result.goal.target[example]] for example in chosen]
             target = labels(names, classifier)
-        logits_before, logits_after = logits(before, classifier), logits(after, classifier)
+        images_after = rendered(after, classifier)
+        logits_before = logits(rendered(before, classifier), classifier)
+        logits_after = logits(images_after, classifier)
         predicted_before = predictions(logits_before, classifier.classes)
+        goal = Goal(source, target)
+        success = fooled_in_views(
+            result.settings.preprocessed_model(classifier),
+            images_after,
+            logits_after.argmax(2),
+            torch.tensor(chosen, dtype=torch.long),
+            goal,
+            result.settings,
+            result.seed,
+        )
         return {
             kind: name,
             "clean_correct": (logits_before.argmax(2) == source).all(1).tolist(),
-            "success": Goal(source, target).reached(logits_after.argmax(2)).tolist(),
+            "success": success.all(1).tolist(),
+            "success_without_noise": goal.reached(logits_after.argmax(2)).tolist(),
             **{f"{key}_before": values for key, values in predicted_before.items()},
             **predictions(logits_after, classifier.classes),
         }
@@ -215,13 +299,17 @@ def transfer(
         indices = [classifier.label(name) for views in names for name in views]
         return torch.tensor(indices).long().view(-1, scene.views)
 
-    def logits(adversaries: Sequence[Adversary], classifier: Classifier) -> Tensor:
+    def rendered(adversaries: Sequence[Adversary], classifier: Classifier) -> Tensor:
         if not adversaries:
-            return torch.empty(0, scene.views, len(classifier.classes))
+            return result.images.new_empty(0, scene.views, 3, classifier.size, classifier.size)
         renders = [adversary.render(scene.rasterizer) for adversary in progress(adversaries, "transfer")]
-        images = torch.stack(renders).to(result.images)
-        model, batch_size = result.settings.preprocessed_model(classifier), result.settings.batch_size
-        return logits_of(model, images, batch_size).cpu()
+        return torch.stack(renders).to(result.images)
+
+    def logits(images: Tensor, classifier: Classifier) -> Tensor:
+        if not len(images):
+            return torch.empty(0, scene.views, len(classifier.classes))
+        model = result.settings.preprocessed_model(classifier)
+        return logits_of(model, images, result.settings.batch_size).cpu()
 
     return [
         *(elsewhere("network", other.name, partial(_resized, size=other.size), other) for other in classifiers),

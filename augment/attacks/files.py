@@ -10,7 +10,13 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
-from augment.attacks.attack import AttackResult, logits_of, predictions, require_result
+from augment.attacks.attack import (
+    AttackResult,
+    fooled_in_views,
+    logits_of,
+    predictions,
+    require_result,
+)
 from augment.attacks.eot import as_jpeg
 from augment.attacks.evaluate import CHECKED, warnings
 from augment.utils import progress
@@ -41,7 +47,8 @@ def save(
     checks: as `augment.check` returns them, for the last line. verify: "reload", "mitsuba" or both render the
     adversaries again from these folders; Mitsuba's illumination is direct, and concave meshes shade themselves in it.
     Returns the examples' lines. Their `versions` are the predictions of the images as floats, with 8 bits, as JPEG and
-    as rendered again, and the differences of pixel values. See `augment.reload`.
+    as rendered again, and the differences of pixel values. `success` is with the noise of a sensor, also of the
+    versions, and `success_without_noise` by the images as they are. See `augment.reload`.
 
     >>> [line] = augment.save(result, "adversaries")
     >>> sorted(path.name for path in Path("adversaries").iterdir())
@@ -93,6 +100,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
         "success": bool(result.success[example]),
+        "success_without_noise": bool(result.success_without_noise[example]),
         "success_with_margin": bool(result.success_with_margin[example]),
         "success_in_views": result.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
@@ -120,10 +128,22 @@ def _versions(result: AttackResult, folders: Sequence[Path], verify: Sequence[st
     for name, version in versions.items():
         images = version.to(result.images)
         logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
-        success, differences = result.goal.reached(logits.argmax(2)), (images - result.images).abs().flatten(1)
+        predicted = logits.argmax(2)
+        success = fooled_in_views(
+            result.preprocessed_model,
+            images,
+            predicted,
+            result.problem.everything,
+            result.goal,
+            result.settings,
+            result.seed,
+        ).all(1)
+        without_noise = result.goal.reached(predicted)
+        differences = (images - result.images).abs().flatten(1)
         numbers[name] = [
             {
                 "success": bool(success[example]),
+                "success_without_noise": bool(without_noise[example]),
                 **predictions(logits[example], result.classifier.classes),
                 "largest_difference": float(difference.max()),
                 "mean_difference": float(difference.mean()),

@@ -128,7 +128,8 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
                 **(scene or {}),
             },
         )
-        defaults = {"allow_negative": True, "margin": 0.0, "rounded": False, "max_steps": 8}
+        defaults = {"allow_negative": True, "margin": 0.0, "rounded": False, "sensor_noise": 0.0}
+        defaults["max_steps"] = 8
         settings = augment.AttackSettings(**steps, **defaults | settings)
         return augment.attack(classifier, shown, target, settings, seed=seed, force=force)
 
