@@ -66,8 +66,8 @@ class RandomLightSettings:
 @dataclass
 class TrainingAttackSettings(AttackSettings):
     """Unless parameters are named, the attack of the paper's appendix C on all coefficients of the light: 30 steps of
-    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images. Successes
-    count without noise, too.
+    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images, which
+    count without noise.
 
     step, step_size: of that attack on the light, as in `StepSettings`.
     """

@@ -17,12 +17,21 @@ import torch
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary, reload
-from augment.attacks.attack import AttackResult, AttackSettings, attack, logits_of, predictions
+from augment.attacks.attack import (
+    AttackResult,
+    AttackSettings,
+    attack,
+    fooled_in_views,
+    logits_of,
+    predictions,
+)
+from augment.attacks.descent import Goal
 from augment.attacks.evaluate import check, require_transferable, success_by_radius, transfer, warnings
 from augment.attacks.files import LINES, require_renderers, save
 from augment.attacks.search import find_scene
 from augment.build import LampsSettings, ProjectorSettings, RendererSettings, SceneSettings, build_scene
 from augment.classifiers import Classifier, load_classifier
+from augment.losses import NO_CLASS
 from augment.objects import ObjectSettings, load_object, on_ground
 from augment.scene import Scene
 from augment.utils import generator
@@ -39,6 +48,7 @@ from train.tables import Table, format_fraction, fraction
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
 NAMES = {"float": "computed", "reload": "rendered again from the saved files", "mitsuba": "rendered by Mitsuba"}
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
+WITHOUT_NOISE = "_without_noise"  # ends the keys of what counts without a sensor's noise
 LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
 
@@ -137,8 +147,7 @@ def run(settings: AttackExperimentSettings) -> None:
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     if adversary is not None:
         images = adversary.render(chosen_rasterizer(settings.renderer)).to(device)
-        logits = logits_of(settings.attack.preprocessed_model(classifier), images[None], len(images))[0]
-        print(format_reloaded(adversary, images, logits, classifier.classes))
+        print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
         if not settings.attack.parameters:
             return
     others = load_others(settings, classifier, device)
@@ -266,26 +275,38 @@ def format_attack(
     heading = f"{name}: {parameters} against {result.classifier.name}"
     text = [f"{heading}: {_success(result)}{median} ({result.seconds['attack']:.1f} s)"]
     if checks is not None:
-        by_steps = ", ".join(f"{rate:.0%} in {steps}" for steps, rate in checks["success_by_steps"].items())
+        without = checks[f"success_by_steps{WITHOUT_NOISE}"]
+        by_steps = ", ".join(
+            f"{_rate_of_both(rate, without[steps], result.settings)} in {steps}"
+            for steps, rate in checks["success_by_steps"].items()
+        )
+        search = (checks[f"random_search{end}"] for end in ("", WITHOUT_NOISE))
         text += [
             "log-probability of the right class over all views (less a target's): {cost_before:.2f} before, {cost:.2f} "
             "after; lower in {cost_fell:.0%}, without a gradient at the start in {zero_gradient:.0%}".format(**checks),
-            f"random changes of the same size, one for each step, succeed on {checks['random_search']:.0%}; "
-            f"attacks of more steps: {by_steps}",
+            "random changes of the same size, one for each step, succeed on "
+            f"{_rate_of_both(*search, result.settings)}; attacks of more steps: {by_steps}",
             *(f"warning: {warning}" for warning in warnings(checks)),
         ]
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
     for version in adversaries[0]["versions"] if adversaries else ():
         numbers = [line["versions"][version] for line in adversaries]
+        as_they_are = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
+        without_noise = f" ({as_they_are} without noise)" if result.settings.sensor_noise else ""
         by_margin = [line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]]
         largest = 255 * max(line["largest_difference"] for line in numbers)
         mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
         text.append(
             f"images as {NAMES.get(version, version)}: {sum(line['success'] for line in numbers)} of {len(numbers)} "
-            f"still succeed, {sum(by_margin)} of the {len(by_margin)} with the margin; pixels differ by "
+            f"still succeed{without_noise}, {sum(by_margin)} of the {len(by_margin)} with the margin; pixels differ by "
             f"{mean:.3g}/255 on average, {largest:.3g}/255 at most"
         )
     return "\n".join(text)
+
+
+def _rate_of_both(rate: float, without_noise: float, settings: AttackSettings) -> str:
+    """A fraction of successes and, where a sensor's noise counts, that without it."""
+    return f"{rate:.0%}" + (f" ({without_noise:.0%} without noise)" if settings.sensor_noise else "")
 
 
 def _success(result: AttackResult) -> str:
@@ -296,19 +317,30 @@ def _success(result: AttackResult) -> str:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
     views, wrong = result.success_in_views[clean], int((~clean).sum())
     text, by_margin = f"success on {format_fraction(rate)} examples", int(result.success_with_margin[clean].sum())
+    if result.settings.sensor_noise:
+        text += f" with a sensor's noise, {int(result.success_without_noise[clean].sum())} without"
     text += f", {by_margin} with the margin of {result.settings.margin:g}" if result.settings.margin else ""
     text += f", {int(views.sum())} of {views.numel()} views" if views.shape[1] > 1 else ""
     return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
 
 
-def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:
-    """A line per view: the classification, by logits (V, C), of images (V, 3, size, size) that were rendered anew."""
+def format_reloaded(
+    adversary: Adversary, images: Tensor, classifier: Classifier, settings: AttackSettings, seed: int
+) -> str:
+    """A line per view: how images (V, 3, size, size) that were rendered anew are classified, also with noise."""
+    model = settings.preprocessed_model(classifier)
+    logits = logits_of(model, images[None], len(images))
+    predicted = logits.argmax(2)
+    goal = Goal(torch.full_like(predicted, NO_CLASS), predicted)  # to be classified as without noise
+    same = fooled_in_views(model, images[None], predicted, torch.zeros(1).long(), goal, settings, seed)
     largest = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
-    rows = zip(*predictions(logits, classes).values(), largest.tolist(), strict=True)
+    rows = zip(*predictions(logits[0], classifier.classes).values(), same[0].tolist(), largest.tolist(), strict=True)
+    noise = {True: ", and so with a sensor's noise", False: ", but not always with a sensor's noise"}
     return "\n".join(
-        f"view {view}: {adversary.shown.label} is classified as {predicted} ({confidence:.1%}); "
+        f"view {view}: {adversary.shown.label} is classified as {name} ({confidence:.1%})"
+        f"{noise[steady] if settings.sensor_noise else ''}; "
         f"values differ from the saved image's by {difference:.3g}/255 at most"
-        for view, (predicted, confidence, difference) in enumerate(rows)
+        for view, (name, confidence, steady, difference) in enumerate(rows)
     )
 
 
@@ -317,12 +349,20 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     lines, rows = [], []
     for found in transfers:
         clean = found["clean_correct"]
-        rate = fraction(sum(s for s, correct in zip(found["success"], clean, strict=True) if correct), sum(clean))
+        rate = fraction(_count_correct(found["success"], clean), sum(clean))
         kind = next(iter(found))
         lines.append(json.dumps({kind: found[kind], **rate, **found}) + "\n")
-        rows.append([f"{kind} {found[kind]}", f"{rate['n']} of {len(clean)}", format_fraction(rate)])
+        without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
+        numbers = [f"{rate['n']} of {len(clean)}", format_fraction(rate), without_noise]
+        rows.append([f"{kind} {found[kind]}", *map(str, numbers)])
     write_whole(path, "".join(lines))
-    return str(Table("", ["adversaries shown to", "correct before", "success"], rows))
+    header = ["adversaries shown to", "correct before", "success", "without noise"]
+    return str(Table("", header, rows))
+
+
+def _count_correct(success: Sequence[bool], clean: Sequence[bool]) -> int:
+    """How many of the examples that were correct before are a success."""
+    return sum(hit for hit, correct in zip(success, clean, strict=True) if correct)
 
 
 def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
@@ -330,8 +370,12 @@ def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for row in sweep:
         radii = " + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())
-        rows.append([radii, *(format_fraction(_rate(row[method])) for method in METHODS)])
-    return str(Table("", ["radius", *METHODS.values()], rows))
+        counts = (format_fraction(_rate(row[method])) for method in METHODS)
+        without_noise = (str(int(row[method + WITHOUT_NOISE].sum())) for method in METHODS)
+        cells = [cell for pair in zip(counts, without_noise, strict=True) for cell in pair]
+        rows.append([radii, *cells])
+    titles = [title for method in METHODS.values() for title in (method, "without noise")]
+    return str(Table("", ["radius", *titles], rows))
 
 
 def _rate(success: Tensor) -> dict[str, Any]:
@@ -339,18 +383,20 @@ def _rate(success: Tensor) -> dict[str, Any]:
 
 
 def write_sweeps(sweeps: Mapping[str, Sequence[Mapping[str, Any]]], norms: Mapping[str, str], out: Path) -> None:
-    """sweep.csv, a line per mesh (and all of several), method and radius, with the success rate on examples that were
-    correct before and its 95 % Wilson interval; and sweep.png, of the last mesh or of all. norms: by parameter."""
+    """sweep.csv, a line per mesh (and all of several), method (also without noise) and radius, with the success rate on
+    examples that were correct before and its 95 % Wilson interval; and sweep.png, of the last mesh or of all. norms: by
+    parameter."""
+    methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
     if len(sweeps) > 1:
         pooled = [
-            {"radii": rows[0]["radii"], **{method: torch.cat([row[method] for row in rows]) for method in METHODS}}
+            {"radii": rows[0]["radii"], **{method: torch.cat([row[method] for row in rows]) for method in methods}}
             for rows in zip(*sweeps.values(), strict=True)
         ]
         sweeps = {**sweeps, "all": pooled}
     records = [
         {"mesh": mesh, "method": method, **row["radii"], **_rate(row[method])}
         for mesh, sweep in sweeps.items()
-        for method in METHODS
+        for method in methods
         for row in sweep
     ]
     text = io.StringIO()

@@ -194,9 +194,9 @@ def _descend_once(
 def _leads_over_noise(
     model: nn.Module, images: Tensor, examples: Tensor, goal: Goal, settings: AttackSettings, seed: int
 ) -> Tensor:
-    """Whether images (A, V, 3, H, W) lead by more than noise changes, in every view, (A,) bool: whether the smallest lead
-    of their logits, with noise and without, is `settings.lead_over_noise` times the range of these leads. The draws of
-    noise are not those by which a success is counted."""
+    """Whether images (A, V, 3, H, W) lead by more than noise changes, in every view, (A,) bool: whether the smallest
+    lead of their logits, with noise and without, is `settings.lead_over_noise` times the range of these leads. The
+    draws of noise are not those by which a success is counted."""
     if not len(images):
         return examples.new_zeros(0, dtype=torch.bool)
     noisy_images = stored(images, settings.sensor_noise, examples, seed, "noise margin")

@@ -44,8 +44,8 @@ OF_MESH, OF_VIEW = ("geometry", "pose", "material", "albedo", "pixels"), ("pixel
 def check(result: AttackResult) -> dict[str, Any]:
     """Compare an attack with as many random draws as it has steps, and with descents of 3 and 10 times as many.
 
-    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. A success
-    counts as in the result, with the noise of a sensor; it also counts for all longer descents. Returns fractions of
+    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. A
+    success counts as in the result, with the noise of a sensor, and also for all longer descents. Returns fractions of
     the examples and mean costs. cost_fell: of the examples without success before. success, success_with_margin,
     random_search, success_by_steps, and NAME_without_noise of these but the second: of the clean-correct examples.
 

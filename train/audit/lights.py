@@ -15,7 +15,15 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.attack import AttackResult, AttackSettings, attack, logits_of, predictions
+from augment.attacks.attack import (
+    AttackResult,
+    AttackSettings,
+    attack,
+    fooled_in_views,
+    logits_of,
+    predictions,
+)
+from augment.attacks.descent import Goal
 from augment.attacks.evaluate import success_by_radius
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import SkylightSettings
@@ -101,24 +109,30 @@ def _correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
 
 
 def adversaries(classifier: Classifier, views: Views, kind: str, further: bool = False) -> AttackResult:
-    """An attack within a kind's largest radius, by signed steps of a quarter of it, until the classifier errs; or all
-    of FURTHER steps, however surely it errs."""
+    """An attack within a kind's largest radius, by signed steps of a quarter of it, until the classifier errs by more
+    than a sensor's noise changes; or all of FURTHER steps, however surely it errs."""
     radius = KINDS[kind].radii[-1]
     changed = {kind: (SkylightSettings if kind == "skylight" else StepSettings)("linf", radius, "sign", radius / 4)}
-    options: dict[str, Any] = {"max_steps": FURTHER, "margin": FACTOR} if further else {"max_steps": STEPS, "margin": 0}
+    options: dict[str, Any] = {"max_steps": STEPS, "margin": 0.0, "noise_margin": 1.0}
+    if further:
+        options = {"max_steps": FURTHER, "margin": FACTOR}
     settings = AttackSettings(**(options | changed), batch_size=BATCH)
     return attack(classifier, views.scene(classifier.size, kind), settings=settings, seed=views.seed, force=True)
 
 
 def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
     """n: views; correct: of these, before. adversarial, random: at each radius, how many of the correct ones a descent
-    or random draws turn wrong, and the draws alone. The adversaries at the largest radius are kept in out/KIND.npz for
-    `transfers`; one is written to out/KIND.png; predicted: its classes."""
+    or random draws turn wrong, and the draws alone, with the noise of a sensor; adversarial_without_noise and
+    random_without_noise. The adversaries at the largest radius are kept in out/KIND.npz for `transfers`; one is written
+    to out/KIND.png; predicted: its classes."""
     result, radii = adversaries(classifier, views, kind), KINDS[kind].radii
     clean, by_radius = result.clean_correct, success_by_radius(result, [radius / radii[-1] for radius in radii])
-    by_radius[-1]["adversarial"] |= result.success[clean].cpu()  # from the start, not from where smaller radii ended
-    counts: dict[str, Any] = {"adversarial": [int((row["adversarial"] | row["random"]).sum()) for row in by_radius]}
-    counts["random"] = [int(row["random"].sum()) for row in by_radius]
+    largest, counts = by_radius[-1], dict[str, Any]()
+    for end, success in (("", result.success), ("_without_noise", result.success_without_noise)):
+        adversarial, random = f"adversarial{end}", f"random{end}"
+        largest[adversarial] |= success[clean].cpu()  # from the start, not from where smaller radii ended
+        counts[adversarial] = [int((row[adversarial] | row[random]).sum()) for row in by_radius]
+        counts[random] = [int(row[random].sum()) for row in by_radius]
     wrong = clean & result.success
     kept = io.BytesIO()
     np.savez(kept, wrong=wrong.cpu(), values=result.descent.values.cpu())
@@ -135,8 +149,8 @@ def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path)
 
 
 def transfers(attacked: Classifier, other: Classifier, views: Views, out: Path) -> dict[str, dict[str, list[int]]]:
-    """[successes, n] by kind of adversaries, those that `success_by_light` kept in `out` and further ones, rendered at
-    the size of another classifier, which is right before in `n`."""
+    """[successes, n, successes without noise] by kind of adversaries, those that `success_by_light` kept in `out` and
+    further ones, rendered at the size of another classifier, which is right before in `n`."""
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, further=True)
@@ -145,8 +159,14 @@ def transfers(attacked: Classifier, other: Classifier, views: Views, out: Path) 
             found["first"] = torch.from_numpy(kept["wrong"]), torch.from_numpy(kept["values"])
         problem = result.settings.problem(views.scene(other.size, kind))
         right, counts[kind] = _correct(other, problem.scene, problem.images(problem.start)), {}
+        goal = Goal(torch.full_like(result.goal.source, other.label(problem.scene.labels[0])))
+        model = result.settings.preprocessed_model(other)
         for name, (wrong, values) in found.items():
             both = wrong.to(right) & right
-            lost = both & ~_correct(other, problem.scene, problem.images(values.to(problem.start)))
-            counts[kind][name] = [int(lost.sum()), int(both.sum())]
+            images = problem.images(values.to(problem.start))
+            predicted = logits_of(model, images, BATCH).argmax(2)
+            of_all = problem.everything, goal, result.settings, result.seed
+            lost = both & fooled_in_views(model, images, predicted, *of_all).all(1)
+            lost_without_noise = both & goal.reached(predicted)
+            counts[kind][name] = [int(part.sum()) for part in (lost, both, lost_without_noise)]
     return counts

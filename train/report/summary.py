@@ -242,7 +242,8 @@ def _spread(metrics: Sequence[Metric]) -> str:
 
 def read_attack(folder: Path) -> dict[str, Any]:
     """An attack's folder; rows: number, label, predictions before and after, and outcome of each example; the numbers
-    of successes and of examples that were correct before any step; and its checks by name.
+    of successes, with a sensor's noise and without, and of examples that were correct before any step; and its checks
+    by name. Attacks of earlier versions counted without noise.
 
     InputError naming a file that no attack wrote.
     """
@@ -250,12 +251,20 @@ def read_attack(folder: Path) -> dict[str, Any]:
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         examples = [line for line in lines if "example" in line]
-        correct = [bool(line["success"]) for line in examples if not line["success_before"]]
+        correct = [line for line in examples if not line["success_before"]]
+        successes = sum(bool(line["success"]) for line in correct)
+        without_noise = sum(_without_noise(line) for line in correct)
         checks = next((dict(line["checks"]) for line in lines if "checks" in line), {})
         rows = [_example_row(line) for line in examples]
     except Exception as error:  # JSON of any depth and type raises many kinds
         raise InputError(f"{path} is damaged or was written by no attack ({in_one_line(error)})") from error
-    return {"folder": folder, "rows": rows, "successes": sum(correct), "correct": len(correct), "checks": checks}
+    counts = {"successes": successes, "without_noise": without_noise, "correct": len(correct)}
+    return {"folder": folder, "rows": rows, **counts, "checks": checks}
+
+
+def _without_noise(line: dict[str, Any]) -> bool:
+    """Whether an example's line is of a success without noise; lines of earlier versions have no other."""
+    return bool(line.get("success_without_noise", line["success"]))
 
 
 def _example_row(line: dict[str, Any]) -> tuple[int, str, str, str, str]:
@@ -264,7 +273,8 @@ def _example_row(line: dict[str, Any]) -> tuple[int, str, str, str, str]:
         ", ".join(f"{p:.1%} {name}" for name, p in zip(line[f"predicted{w}"], line[f"confidence{w}"], strict=True))
         for w in ("_before", "")
     )
-    outcome = f"{'success' if line['success'] else 'no success'} in {int(line['steps'])} steps"
+    success = "success" if line["success"] else "success only without noise" if _without_noise(line) else "no success"
+    outcome = f"{success} in {int(line['steps'])} steps"
     return int(line["example"]), label, before, after, "wrong before any step" if line["success_before"] else outcome
 
 

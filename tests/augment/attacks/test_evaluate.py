@@ -59,8 +59,10 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
 
 
 def test_warnings_follow_from_the_numbers():
-    good = {"cost_fell": 1.0, "zero_gradient": 0.0, "success": 0.8, "random_search": 0.5}
-    assert warnings(good) == warnings(good | {"random_search": 0.0, "success": 0.0}) == []
+    good = {"cost_fell": 1.0, "zero_gradient": 0.0, "success": 0.8, "random_search": 0.5, "success_without_noise": 0.9}
+    none = {"random_search": 0.0, "success": 0.0, "success_without_noise": 0.0}
+    assert warnings(good) == warnings(good | none) == []
+    assert len(warnings(good | {"success": 0.4, "random_search": 0.0})) == 1
     assert len(warnings(good | {"cost_fell": 0.9, "zero_gradient": 0.1})) == 2
 
 

@@ -50,6 +50,7 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_co
         differences = (rounded - result.images[example]).abs()
         assert line["versions"]["8 bits"] == {
             "success": predicted == "lime",
+            "success_without_noise": predicted == "lime",
             "predicted": [predicted],
             "confidence": [pytest.approx(by_color(rounded).softmax(1).max().item(), abs=1e-5)],
             "largest_difference": pytest.approx(differences.max().item(), abs=1e-7),

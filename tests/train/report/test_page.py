@@ -62,7 +62,11 @@ def page(finished, made_up_run, tiny, tmp_path_factory) -> Path:
         "example": 0, "label": [HOSTILE], "predicted_before": ["a"], "confidence_before": [0.5], "predicted": ["b"],
         "confidence": [0.5], "success": True, "success_before": False, "steps": 3,
     }  # fmt: skip
-    others = line | {"example": 1, "steps": 0, "success_before": True}, line | {"example": 2, "success": False}
+    others = (
+        line | {"example": 1, "steps": 0, "success_before": True},
+        line | {"example": 2, "success": False},
+        line | {"example": 3, "success": False, "success_without_noise": True},
+    )
     lines = [*map(json.dumps, (line, *others, {"checks": {"random_search": 0.5}}))]
     (attack / "attack.jsonl").write_text("\n".join(lines))
     (folder / "other").mkdir()
@@ -93,10 +97,14 @@ def test_runs_in_every_state_are_shown_or_named(page):
     assert any(alt.startswith("training accuracy") and "unfinished: going 0.75" in alt for alt in parsed.alts)
     assert any(alt.startswith("Renders before and after, epoch ") for alt in parsed.alts)
     assert any(alt.startswith(f"Example 0, {HOSTILE}: success in 3 steps; ") for alt in parsed.alts)
-    sentence = "Attacks succeed on 1 of 2 examples; 1 more were wrong before any step; random search with as many"
+    sentence = (
+        "Attacks succeed on 1 of 3 examples, 2 without a sensor's noise; 1 more were wrong before any step; "
+        "random search with as many"
+    )
     assert f"{sentence} renders succeeds on 50%." in text
     outcomes = [cells[-1] for cells in parsed.rows if cells[1:2] == [HOSTILE]]
-    assert outcomes == ["success in 3 steps", "wrong before any step", "no success in 3 steps"]
+    rest = ["no success in 3 steps", "success only without noise in 3 steps"]
+    assert outcomes == ["success in 3 steps", "wrong before any step", *rest]
     assert text.count(f"<pre>cd {shlex.quote(os.getcwd())}\n{COMMAND}</pre>") == 1
 
 
