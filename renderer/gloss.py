@@ -10,7 +10,7 @@ mean E_avg = 2 ∫ E(μ) μ dμ, the diffuse part of light from direction l, see
 
     (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
 
-(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). It is reciprocal, and together with the coat
+(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). It is reciprocal. Together with the coat,
 a white surface reflects each beam entirely: s E(n·l) + (1 - s E(n·l)) = 1. Of environment light, the coat lets the
 irradiance Σ (A_l - s B_l) U_lm Y_lm(n) through, with the B_l of `coat_bands`.
 """

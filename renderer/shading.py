@@ -205,8 +205,8 @@ def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     def evaluate(unit: Tensor) -> tuple[Tensor, Tensor]:
         slope = torch.addmm(linear, even, harmonics.monomials(unit, degree - 1)).unflatten(0, (3, 3))
         value = torch.addmm(constant, linear.view(3, 3).T, unit, alpha=1 - 1 / degree)
-        for along, component in zip(slope, unit, strict=True):
-            value.addcmul_(along, component, value=1 / degree)
+        for by_axis, component in zip(slope, unit, strict=True):
+            value.addcmul_(by_axis, component, value=1 / degree)
         return value, slope
 
     return evaluate

@@ -45,7 +45,7 @@ from renderer.validation import (
 LEAST_LIKELY = "least_likely"  # in place of a target class
 MOST_NOISE = 255.0  # steps of 8 bits: the whole range of values
 UNSTEADY = ("pose", "material")  # whose adversaries often end where noise still decides
-NOISE_MARGIN = 1.0  # times the range of the leads with noise and without
+NOISE_MARGIN = 2.0  # times the range of the leads with noise and without
 
 
 @dataclass
@@ -63,7 +63,7 @@ class AttackSettings:
     sensor_noise: a success counts if it remains in each of three images that a camera stores, with Gaussian noise of
     this standard deviation before they are rounded to 8 bits, in steps of 8 bits (1/255); 0 counts without noise. It is
     counted once, at the end. noise_margin: an example also goes on until its least lead, with such noise and without,
-    is this many times the range of these leads; None is 1 where pose or material is attacked, and 0 otherwise.
+    is this many times the range of these leads; None is 2 where pose or material is attacked, and 0 otherwise.
     allow_negative: any coefficients of light. If False, the light is first made one that something can emit (of
     harmonics: radiance nowhere negative, of the same mean and the most alike irradiance), whatever is attacked. Each
     step on the light then ends in the nearest such coefficients, whose mean may differ from what the step asked for.

@@ -9,7 +9,7 @@ where step() scales the gradient (`augment.attacks.norm_ball.StepSettings`) and 
 the physically possible. The length is 1; with `shorten`, a step that did not lower the cost is undone and tried at half
 its length. One forward pass gives the cost, the gradient and the predictions. An example is a success once the
 criterion is met in every view by the image as the preprocessed classifier gets it; it leaves the batch once its
-logits also lead by `margin` there and, where the settings ask for it, by as much as a sensor's noise changes. Until
+logits also lead by `margin` there and, where the settings ask for it, by more than a sensor's noise changes. Until
 then, the success of lowest cost is kept. Whether it counts is decided after the descent, by `fooled_in_views`.
 """
 

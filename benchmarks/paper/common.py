@@ -98,7 +98,8 @@ def attack_settings(kind: str, max_steps: int = 30, step: StepSettings | None = 
     """The paper's attack (its appendix C): any light, an end where the network errs. step: another than the paper's."""
     settings = {kind: step or STEPS[kind], "max_steps": max_steps, "allow_negative": True, "margin": 0.0}
     shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
-    return AttackSettings(**{**settings, "rounded": False, "shorten": shorten, **more})
+    as_they_are = {"rounded": False, "sensor_noise": 0.0}
+    return AttackSettings(**{**settings, **as_they_are, "shorten": shorten, **more})
 
 
 def scene_of(subject: SceneObject, size: int, views: Sequence[View]) -> Scene:

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attacks.attack import (
+    NOISE_MARGIN,
     AttackResult,
     AttackSettings,
     attack,
@@ -113,7 +114,7 @@ def adversaries(classifier: Classifier, views: Views, kind: str, further: bool =
     than a sensor's noise changes; or all of FURTHER steps, however surely it errs."""
     radius = KINDS[kind].radii[-1]
     changed = {kind: (SkylightSettings if kind == "skylight" else StepSettings)("linf", radius, "sign", radius / 4)}
-    options: dict[str, Any] = {"max_steps": STEPS, "margin": 0.0, "noise_margin": 1.0}
+    options: dict[str, Any] = {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     if further:
         options = {"max_steps": FURTHER, "margin": FACTOR}
     settings = AttackSettings(**(options | changed), batch_size=BATCH)

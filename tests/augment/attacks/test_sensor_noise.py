@@ -96,7 +96,7 @@ def test_each_view_is_counted_by_itself():
 
 FINE = {  # steps that end close to where the classifier errs
     "lighting": augment.StepSettings(step_size=0.1),
-    "pose": augment.PoseSettings("linf", 1.0, "sign", 0.04),
+    "pose": augment.PoseSettings("linf", 1.0, "sign", 0.02),
     "material": augment.MaterialSettings("linf", 1.0, "sign", 0.2, hue=30.0),
 }
 
@@ -109,8 +109,9 @@ def threshold_of(attacked, parameter: str, scene: dict, share: float) -> float:
 
 
 def small_attack(attacked, parameter: str = "lighting", **settings) -> AttackResult:
-    scene = {"backgrounds": [0.3, 0.4, 0.5, 0.6]}
-    classifier = nervous(threshold_of(attacked, parameter, scene, 0.3))
+    scene = {"backgrounds": [0.3, 0.4, 0.5, 0.6][: 4 if parameter == "lighting" else 2]}
+    share = {"lighting": 0.3, "pose": 0.1, "material": 0.3}[parameter]
+    classifier = nervous(threshold_of(attacked, parameter, scene, share))
     steps = {parameter: FINE[parameter]}
     return attacked(steps, scene, classifier, force=True, max_steps=12, **settings)
 
