@@ -280,7 +280,7 @@ def format_attack(
             f"{_rate_of_both(rate, without[steps], result.settings)} in {steps}"
             for steps, rate in checks["success_by_steps"].items()
         )
-        search = (checks[f"random_search{end}"] for end in ("", WITHOUT_NOISE))
+        search = checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"]
         text += [
             "log-probability of the right class over all views (less a target's): {cost_before:.2f} before, {cost:.2f} "
             "after; lower in {cost_fell:.0%}, without a gradient at the start in {zero_gradient:.0%}".format(**checks),
