@@ -33,9 +33,9 @@ class MeshSettings:
     gloss: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        require_field_types(self)
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
+        require_field_types(self)
         if self.gloss == "file" and self.mesh.startswith("solid:"):
             raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
         if self.gloss not in (None, "file"):

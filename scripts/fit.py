@@ -41,9 +41,7 @@ class Settings:
     mesh: str = MISSING  # a file, or solid:NAME:SEED; upright, as in the photograph
     mask: str | None = None  # an image of the photograph's size, white where the object is
     box: list[int] = field(default_factory=list)  # or [left, top, right, bottom] in pixels, for OpenCV's GrabCut
-    fov: float | None = (
-        None  # degrees between the sides of a square around the object, 1.6 times as wide; null: orthographic
-    )
+    fov: float | None = None  # degrees across a square 1.6 times as wide as the object; null: orthographic
     albedo_scale: float = 1.0  # of the mesh; twice as much halves the light
     encoding: str = "srgb"  # of the photograph, the mesh's colors and the printed attack's images: srgb | linear
     bounces: int = 3  # of the light between the mesh's surfaces; 0: without shadows, too

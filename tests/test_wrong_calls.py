@@ -267,7 +267,7 @@ RENDERING = [
     ),
     *calls_of("albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH),
     *calls_of("gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}),
-    *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, None, 65),
+    *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, 65),
     *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3, ["linear"]),
     *calls_of("normals", lambda x: render(normals=x), "Smooth", None, True, np.ones((4, 3))),
     *calls_of("shadows", lambda x: render(shadows=x), "no", 2, None, [True]),
