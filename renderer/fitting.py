@@ -1,9 +1,9 @@
-"""Estimate the camera and the light of a photograph of a mesh by descent through the renderer.
+"""Estimate the camera and the light of a photograph of a mesh.
 
 All pixels outside the mesh are set to one gray, so that the image shows outline and shading at once. For each camera,
 the best light is the solution of a convex quadratic program: images are linear in the light, and its radiance must not
-be negative. The gradient of the whole by the camera is the gradient at this light (variable projection, Golub and
-Pereyra 1973; the theorem of the envelope extends it to constraints), so descent moves the camera alone.
+be negative. So the differences of the pixels are a function of the camera alone (variable projection, Golub and
+Pereyra 1973), whose squares the Gauss-Newton method minimizes.
 
 Light and albedo appear as their product: an albedo twice as large halves the light.
 """
@@ -21,12 +21,12 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize, nnls
+from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.image import decode, samples_per_side
+from renderer.image import decode
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
 from renderer.rendering import precompute_transfer, render
@@ -38,8 +38,10 @@ if TYPE_CHECKING:
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
-STEPS = 40  # Steps of descent from each camera.
-SAMPLES = samples_per_side(None, silhouettes=True)  # Samples per side of a pixel.
+STEPS = 20  # Steps of descent from each camera.
+LEAST_GAIN = 1e-3  # Relative change of the squared error, or of the camera, at which a descent ends.
+DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)  # Of polar, azimuth, relative width, right and up, in pixels over the image's.
+SAMPLES = 8  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
 PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
 SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.
@@ -163,7 +165,7 @@ class _Target(NamedTuple):
         image = photograph + gray * (1 - mask)
         return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
 
-    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> tuple[float, Tensor, Tensor]:
+    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> tuple[Tensor, Tensor, Tensor]:
         """Fit the light for a camera.
 
         Args:
@@ -172,7 +174,7 @@ class _Target(NamedTuple):
             grid: Subdivisions of the grid of directions in which the light is at least `LEAST_RADIANCE`.
 
         Returns:
-            The squared error with the penalty, the light (49, 3) and the coverage (size²,).
+            The residuals, whose squares sum to the error with the penalty, the light (49, 3) and the coverage (size²,).
         """
         [operator] = precompute_transfer(self.mesh, camera, self.size, samples=SAMPLES, **self.options)
         units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, 3)
@@ -195,12 +197,12 @@ class _Target(NamedTuple):
                 break
             used = brighter
         whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
-        error = (whole.clamp(max=1) - self.image).square().sum() + (penalty * light.T.square()).sum()
-        return float(error), light, coverage
+        residuals = torch.cat([(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * light.T).flatten()])
+        return residuals, light, coverage
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of their best light, which is returned with each."""
-        errors = [(self.fitted(camera)[0], camera) for camera in cameras]
+        errors = [(float(self.fitted(camera)[0].square().sum()), camera) for camera in cameras]
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
@@ -212,31 +214,40 @@ class _Target(NamedTuple):
         return SMOOTH * weight[:, None] * (1 + (band * (band + 1)).square())
 
     def descended(self, camera: Camera) -> Camera:
-        """Return the camera after descent, with numbers for fields."""
+        """Return the camera after descent by the Gauss-Newton method in a trust region.
+
+        The light is fitted anew for each camera (variable projection), and differentiated with it. Differences over
+        half a pixel average the steps that samples make.
+        """
         width = camera.width
 
-        def moved(values: Sequence[Any]) -> Camera:
-            polar, azimuth, wider, right, up = values
-            return replace(
-                camera, polar=polar, azimuth=azimuth, width=width * wider, right=width * right, up=width * up,
-                **({} if isinstance(camera, OrthographicCamera) else {"distance": camera.distance * wider}),
-            )  # fmt: skip
+        def moved(values: np.ndarray) -> Camera:
+            polar, azimuth, wider, right, up = values.tolist()
+            turned = replace(camera, polar=polar, azimuth=azimuth, width=width * wider)
+            if not isinstance(camera, OrthographicCamera):
+                turned = replace(turned, distance=camera.distance * wider)
+            return replace(turned, right=width * right, up=width * up)
 
-        def step(values: np.ndarray) -> tuple[float, np.ndarray]:
-            error, light, _ = self.fitted(moved(values.tolist()))
-            fields = torch.from_numpy(values).requires_grad_()
-            image = self.rendered(moved(fields.unbind()), light, silhouettes=True)
-            (gradient,) = torch.autograd.grad((image - self.image).square().sum(), fields)
-            return error, gradient.numpy()
+        def residuals(values: np.ndarray) -> np.ndarray:
+            return self.fitted(moved(values))[0].numpy()
+
+        def jacobian(values: np.ndarray) -> np.ndarray:
+            steps = np.diag(np.array(DIFFERENCES) / self.size)
+            columns = [(residuals(values + step) - residuals(values - step)) / (2 * step.sum()) for step in steps]
+            return np.stack(columns, axis=1)
 
         start = np.array([camera.polar, camera.azimuth, 1.0, camera.right / width, camera.up / width])
-        bounds = [(0.02, math.pi - 0.02), (None, None), (0.5, 2.0), (-1.0, 1.0), (-1.0, 1.0)]
-        found = minimize(step, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
-        return moved(found.x.tolist())
+        lowest = [0.02, -np.inf, 0.5, -1.0, -1.0]
+        highest = [math.pi - 0.02, np.inf, 2.0, 1.0, 1.0]
+        start = start.clip(lowest, highest)
+        bounds = (lowest, highest)
+        stop = {"ftol": LEAST_GAIN, "xtol": LEAST_GAIN, "max_nfev": STEPS}
+        found = least_squares(residuals, start, jacobian, bounds, x_scale="jac", **stop)
+        return moved(found.x)
 
-    def rendered(self, camera: Camera, light: Tensor, silhouettes: bool = False) -> Tensor:
+    def rendered(self, camera: Camera, light: Tensor) -> Tensor:
         """Render the mesh in linear light, shape (3, size²)."""
-        options = {"samples": SAMPLES, "silhouettes": silhouettes, **self.options}
+        options = {"samples": SAMPLES, **self.options}
         image = render(self.mesh, camera, light, self.size, self.gray, **options)[0]
         return decode(image, self.options["encoding"]).flatten(1)
 

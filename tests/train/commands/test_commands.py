@@ -16,8 +16,8 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.images import read_image
-from renderer.light.environment import to_map
-from renderer.light.harmonics import project
+from renderer.light.environment import read_panorama, to_map
+from renderer.light.harmonics import equirectangular
 from renderer.light.presets import load_light, save_light
 from scripts.fit import grab_cut
 from train.attack import AttackExperimentSettings
@@ -73,15 +73,23 @@ def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_i
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr", ".hdr"])
 def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_read(call, here, capsys, suffix):
-    """1 + 2 z: of its magnitude's integral over z, 2.5, a tenth is negative."""
+    """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z), whose mean square is π² (1 + 16/27)."""
     light = torch.zeros(49, 3)
     light[0], light[2] = math.sqrt(4 * math.pi), 2 * math.sqrt(4 * math.pi / 3)
     save_light(here / "light.json", light)
     assert call("light", "light=light.json", f"out=map{suffix}", "height=64") == 0
-    fraction = float(re.search("([0-9.]+)% of its power is negative", capsys.readouterr().out)[1])
-    assert fraction == pytest.approx(10, abs=0.02)  # by the map's midpoint rule
-    expected, read = project(to_map(light, 64).clamp(min=0), 6), load_light(str(here / f"map{suffix}"))
-    torch.testing.assert_close(read / read[0], (expected / expected[0]).float(), rtol=0, atol=1e-3)
+    printed = float(re.search("irradiance is off by ([0-9.]+)%", capsys.readouterr().out)[1])
+
+    radiance = read_panorama(here / f"map{suffix}")[..., 0].double()
+    directions, solid_angles = equirectangular(*radiance.shape)
+    assert radiance.min() >= 0
+    assert float((radiance * solid_angles).sum()) == pytest.approx(4 * math.pi, rel=0.01)
+    height = torch.linspace(-1, 1, 201, dtype=torch.float64)
+    normals = torch.stack([(1 - height**2).sqrt(), 0 * height, height], dim=1)
+    cosines = (normals @ directions.flatten(0, 1).T).clamp(min=0)
+    irradiance = cosines @ (radiance * solid_angles).flatten()
+    error = (irradiance - math.pi * (1 + 4 / 3 * height)).square().mean().sqrt()
+    assert printed == pytest.approx(100 * float(error) / (math.pi * math.sqrt(1 + 16 / 27)), abs=0.5)
 
 
 WRONG = [
