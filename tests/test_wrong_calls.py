@@ -402,7 +402,7 @@ CAMERAS = [
 LIGHTS = [
     *calls_of("light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
-    *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 21, "6", True, LIGHT),
+    *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41, "6", True, LIGHT),
     *calls_of(
         "coefficients",
         lambda x: renderer.save_light(Path("l.json"), x),
@@ -424,7 +424,7 @@ LIGHTS = [
         torch.ones(2, 3) * NAN,
         1j,
     ),
-    *calls_of("degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 21, "2", None, True),
+    *calls_of("degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2", None, True),
     *calls_of("light", harmonics.degree_of, "grace", None, torch.ones(49), torch.ones(3, 49), 6),
     *calls_of(
         "radiance",
@@ -660,7 +660,7 @@ SCENES = [
         LIGHT * NAN,
         [[1, 2], [3]],
     ),
-    *calls_of("degree", lambda x: scene(degree=x), 2.5, -1, 21, "6"),
+    *calls_of("degree", lambda x: scene(degree=x), 2.5, -1, 41, "6"),
     *calls_of("exposure", lambda x: scene(exposure=x), -1, "bright", None, NAN, [1.0]),
     *calls_of("width", lambda x: scene(width=x), 0, -1.0, "wide", None, NAN),
     *calls_of("polar", lambda x: scene(polar=x), 200.0, "top", None, NAN),

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, spherical_in
 
-from renderer.light.harmonics import MAX_DEGREE, basis, lambertian_factors, project, rotate
+from renderer.light.harmonics import DIFFUSE_DEGREE, MAX_DEGREE, basis, lambertian_factors, project, rotate
 from renderer.shading import irradiance
 
 EPS = np.finfo(np.float64).eps
@@ -33,10 +33,22 @@ def test_autograd_is_right_at_and_beside_the_poles_on_the_equator_and_off_the_sp
 
 def test_lambertian_factors_are_the_legendre_coefficients_of_the_clamped_cosine():
     expected = [
-        2 * math.pi * quad(lambda u, l=l: u * eval_legendre(l, u), 0, 1, epsabs=1e-13)[0] for l in range(MAX_DEGREE + 1)
+        2 * math.pi * quad(lambda u, l=l: u * eval_legendre(l, u), 0, 1, epsabs=1e-13)[0]
+        for l in range(DIFFUSE_DEGREE + 1)
     ]
-    by_coefficient = np.repeat(expected, 2 * np.arange(MAX_DEGREE + 1) + 1)
-    np.testing.assert_allclose(lambertian_factors(MAX_DEGREE), by_coefficient, rtol=0, atol=1e-12)  # quad's own bound
+    by_coefficient = np.repeat(expected, 2 * np.arange(DIFFUSE_DEGREE + 1) + 1)
+    factors = lambertian_factors(MAX_DEGREE)
+    kept = factors[: len(by_coefficient)]
+    np.testing.assert_allclose(kept, by_coefficient, rtol=0, atol=1e-12)  # quad's own bound
+    assert not factors[len(by_coefficient) :].any()
+
+
+def test_the_bands_that_diffuse_surfaces_are_not_shown_change_irradiance_by_no_more_than_a_sixtieth():
+    """A beam lights a surface by Σ (2l + 1) / (4 π) A_l P_l(cos θ), whose true value is cos θ or 0."""
+    cosines = np.linspace(-1, 1, 2001)
+    factors = lambertian_factors(DIFFUSE_DEGREE)[np.arange(DIFFUSE_DEGREE + 1) ** 2].numpy()
+    series = np.polynomial.legendre.legval(cosines, (2 * np.arange(DIFFUSE_DEGREE + 1) + 1) / (4 * math.pi) * factors)
+    assert np.abs(series - cosines.clip(0)).max() < 1 / 60
 
 
 def test_constants_first_computed_in_inference_mode_serve_training_later():
