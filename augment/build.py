@@ -220,8 +220,8 @@ def build_scene(
     degree = None
     if named:
         reached = reached_gloss(objects, attack.material if attack else None, vary.gloss if vary else None)
-        degree = degree_of_scene(reached, shown.degree)
-        environment = load_light(environment, degree)
+        degree = degree_of_scene(reached, shown.degree, views * len(objects) * size**2)
+        environment = load_light(environment, degree, reached.gloss)
         warn_of_cut_light(str(shown.light), environment)
     else:
         environment = as_tensor("light", environment)
@@ -269,10 +269,13 @@ def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObj
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
-def _lights(shown: SceneSettings, environment: Tensor | str | Path, degree: int | None) -> tuple[Basis, Tensor]:
-    """The basis and the lights (size, 3) of the settings, of coefficients or of a named light of a degree."""
+def _lights(
+    shown: SceneSettings, environment: Tensor | str | Path, degree: int | None, roughness: float | None = None
+) -> tuple[Basis, Tensor]:
+    """The basis and the lights (size, 3) of the settings, of coefficients or of a named light of a degree, for surfaces
+    of a roughness."""
     if isinstance(environment, str | Path):
-        environment = load_light(environment, degree)
+        environment = load_light(environment, degree, roughness)
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     return with_local_lights(environment * shown.exposure, local)
 

@@ -14,12 +14,13 @@ from torch import Tensor
 from augment.attacks.parameters import MaterialSettings, initial_gloss
 from augment.objects import SceneObject
 from augment.scene import Scene
+from augment.utils import has_memory
 from renderer.gloss import Gloss, smoothest
 from renderer.light.basis import harmonics_of
 from renderer.light.harmonics import irradiance_error
 from renderer.light.presets import load_light
 from renderer.mesh import select_faces
-from renderer.microfacets import LEAST, degree_for
+from renderer.microfacets import LEAST, degree_for, highlight_error
 from renderer.transfer import DEGREE
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 NOTICED = 0.05  # irradiance error, of the rms irradiance, from which on it is told
 SHADED = 2  # degree: of lower ones, irradiance of a point source is off by 0.42 or more, of 2 by 0.09
+BYTES = 8  # of a pixel's operator for each coefficient of the light: two channels of float32
 COMPARED = 8  # degree, beyond which irradiance of no light is off by NOTICED
 
 
@@ -38,15 +40,23 @@ class Smoothest(NamedTuple):
     verb: str = "has"
 
     @property
+    def gloss(self) -> float | None:
+        """The roughness of the smoothest gloss; None where nothing has gloss."""
+        return self.roughness if self.roughness < 1 else None
+
+    @property
     def degree(self) -> int:
         """The degree of light that shows its gloss; 0 without gloss."""
         return degree_for(self.roughness) if self.roughness < 1 else 0
 
-    def warn(self, choice: str) -> None:
-        """Warn of the rings that a choice shows."""
+    def warn(self, choice: str, degree: int) -> None:
+        """Warn of the error that a choice of a lower degree makes in highlights."""
         told = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
         takes = f"which takes light of degree {self.degree}"
-        warnings.warn(f"{told}, {takes}: {choice} shows rings around highlights", stacklevel=4)
+        error = highlight_error(degree, self.roughness)
+        least = highlight_error(self.degree, self.roughness)
+        shows = f"shows the highlight of a point of light off by {error:.0%} (rms) instead of {least:.0%}"
+        warnings.warn(f"{told}, {takes}: {choice} {shows}", stacklevel=4)
 
 
 def reached_gloss(
@@ -92,30 +102,42 @@ def _reached_roughness(item: SceneObject, material: MaterialSettings | None, var
     return smoothest(gloss.on(mesh))
 
 
-def degree_of_scene(reached: Smoothest, given: int | None) -> int:
+def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
     """The degree of a scene's light: the given one, or the least that shows all gloss, at least 6.
 
-    A warning tells where gloss takes more than 6 or than what is given.
+    A warning tells where gloss takes more than 6, than what is given or than there is memory for.
 
     Args:
         reached: The smoothest surface of the run.
         given: The degree that was asked for.
+        pixels: How many pixels the views of all objects have.
 
     Returns:
-        The degree, from 0 to 20.
+        The degree, from 0 to 40.
     """
     if given is None:
-        if reached.degree > DEGREE:
-            reached.warn(f"degree={DEGREE} takes less time, but")
-        return max(DEGREE, reached.degree)
+        degree = _affordable_degree(reached, pixels)
+        if degree < reached.degree:
+            reached.warn(f"there is memory for degree {degree} alone, which", degree)
+        elif degree > DEGREE:
+            reached.warn(f"degree={DEGREE} takes less time, but", DEGREE)
+        return degree
     if reached.degree > given:
-        reached.warn(f"degree={given}")
+        reached.warn(f"degree={given}", given)
     if given < SHADED:
         sides = "shades all sides of an object alike" if given == 0 else "shades no side of an object right"
         cut = "so do attacks and variations of the light, which keep to it"
         advice = f"give {SHADED} or more, or leave degree out"
         warnings.warn(f"degree={given} {sides} in light that is not even, and {cut}: {advice}", stacklevel=3)
     return given
+
+
+def _affordable_degree(reached: Smoothest, pixels: int) -> int:
+    """The degree that shows all gloss, or the highest from 6 on for whose operators there is memory."""
+    degree = max(DEGREE, reached.degree)
+    while degree > DEGREE and not has_memory(BYTES * (degree + 1) ** 2 * pixels, torch.device("cpu")):
+        degree -= 1
+    return degree
 
 
 def warn_of_cut_light(name: str, light: Tensor) -> None:
@@ -151,14 +173,16 @@ def with_needed_degree(
         The scene itself, where its degree is enough or nothing else is known.
     """
     reached, degree = reached_gloss(scene.objects, material, varnish), harmonics_of(scene.basis).degree
-    if reached.degree <= degree:
+    pixels = sum(map(len, scene.cameras)) * scene.settings.size**2
+    needed = _affordable_degree(reached, pixels)
+    if needed <= degree:
         return scene
     if scene.lights_of_degree is not None:
-        _, built = scene.lights_of_degree(degree)
+        _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
         if scene.lights.shape[1:] == built.shape and (scene.lights == built.to(scene.lights)).all():
-            reached.warn(f"degree={degree} takes less time, but")
-            basis, lights = scene.lights_of_degree(reached.degree)
+            reached.warn(f"degree={degree} takes less time, but", degree)
+            basis, lights = scene.lights_of_degree(needed, reached.gloss)
             return replace(scene, basis=basis, lights=lights.to(scene.lights))
     if scene.lights[:, degree**2 : (degree + 1) ** 2].any():  # it may go on
-        reached.warn(f"degree={degree}")
+        reached.warn(f"degree={degree}", degree)
     return scene

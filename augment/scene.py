@@ -89,7 +89,8 @@ class Scene:
     (size, 3) for all, where attacks begin; images have their dtype and device. basis: of the lights'
     coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered images (A, V, 3, size,
     size) and their examples (A,); see `draw_camera_effects`. one_light: without operators, for views shown once.
-    lights_of_degree: the basis and the lights (size, 3) of another degree, where a name tells what they are.
+    lights_of_degree: the basis and the lights (size, 3) of another degree, and for gloss of a roughness, where a name
+    tells what they are.
 
     >>> from augment.build import build_scene
     >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
@@ -107,7 +108,7 @@ class Scene:
     basis: Basis = HARMONICS
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
     one_light: bool = False
-    lights_of_degree: Callable[[int], tuple[Basis, Tensor]] | None = None
+    lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None
 
     def __post_init__(self) -> None:
         require_kind("settings", self.settings, ImageSettings, "renderer.ImageSettings(size)")

@@ -73,10 +73,16 @@ def _warn_once(images: int) -> None:
 
 def require_memory(name: str, needed: int, device: torch.device) -> None:
     """InputError naming what needs more bytes than are free, before the system ends the process for it."""
-    free = _free(device)
-    if free is not None and needed > free:
+    if not has_memory(needed, device):
+        free = _free(device) or 0
         sizes = f"{needed / 2**30:.1f} GB of memory and {free / 2**30:.1f} GB are free"
         raise InputError(f"{name} need {sizes}: ask for fewer or smaller ones")
+
+
+def has_memory(needed: int, device: torch.device) -> bool:
+    """Tell whether as many bytes are free, or the system does not say."""
+    free = _free(device)
+    return free is None or needed <= free
 
 
 def _free(device: torch.device) -> int | None:

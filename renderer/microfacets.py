@@ -22,21 +22,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.light.harmonics import MAX_DEGREE, bands, per_degree, rotate, select_rows, unit
+from renderer.light.environment import FEWEST_ROWS, to_map
+from renderer.light.harmonics import MAX_DEGREE, bands, lambertian_factors, per_degree, rotate, select_rows, unit
+from renderer.light.window import best_window
 
-LEAST = 0.2  # roughness: of smoother lobes, degree 20 holds less than KEPT
-KEPT = 0.7  # of a lobe's power, the integral of its square
+LEAST = 0.2  # roughness: of smoother lobes, light of degree 40 shows less than a highlight
+AMPLITUDE = 0.1  # of a highlight, that the band of a light's degree may have
+NARROWER = 0.7  # times α, of the lobe whose highlights must not ring
+IRRADIANCE = 10.0  # weight of irradiance beside that of highlights, in the choice of a window
+SMALLEST = 1e-4  # amplitude of a band in `_spectrum`, which is divided by
+NEGLIGIBLE = 1e-3  # amplitude of bands that tables leave out
 INDEX = 1.5  # of refraction, as of varnish
 SCHLICK, EDGE, DIELECTRIC = range(3)  # F0 = 1 and F90 = 0; F0 = 0 and F90 = 1; Fresnel's of INDEX
 USUAL = 6  # degree: lower ones take the first functions of its table
 NODES = 12  # Chebyshev's, in the roughness; in the cosine 2 degree + 4, since mirrors turn by twice the angle
+AT_ONCE = 16  # cosines, in the quadrature of lobes: bounds the memory
 QUADRATURE = (32, 24)  # half vectors: by their distribution, and by azimuth on one side of the plane
 
 
@@ -135,7 +142,11 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
 
     cosine: n·v (S,). roughness: (S,) or (1,), at least LEAST. Differentiable.
     """
-    table = _table(max(degree, USUAL)).to(cosine)[list(terms), : (degree + 1) * (degree + 2) // 2]
+    functions = (degree + 1) * (degree + 2) // 2
+    if degree > USUAL and len(roughness) == 1 and not roughness.requires_grad:
+        of_roughness = _table_at(degree, float(roughness)).to(cosine)[list(terms)]
+        return of_roughness @ _across(cosine, of_roughness.shape[-1])
+    table = _table(max(degree, USUAL)).to(cosine)[list(terms), :functions]
     across = _across(cosine, table.shape[-1])
     of_roughness = along(roughness)
     if len(roughness) == 1:
@@ -199,16 +210,92 @@ def along(roughness: Tensor) -> Tensor:
 
 
 @cache
-def degree_for(roughness: float) -> int:
-    """The least degree that holds KEPT of a lobe's power, seen head-on; at most 20, which roughness LEAST needs."""
+def degree_for(roughness: float, amplitude: float = AMPLITUDE) -> int:
+    """Find the least degree above which no band has more than a fraction of a highlight's amplitude.
+
+    Args:
+        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+        amplitude: Fraction of the amplitude of the band 0, of a mirror's lobe seen head-on.
+
+    Returns:
+        The degree, at most `MAX_DEGREE`.
+    """
+    spectrum = _spectrum(max(roughness, LEAST), MAX_DEGREE)
+    return int(np.count_nonzero(spectrum[1:] > amplitude))
+
+
+def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
+    """Find a window under which highlights of a map's light do not ring.
+
+    A cut-off map rings where it is concentrated, so that its highlights have dark rings around them, or are negative.
+    Of no window, the window for the surface's own lobe and the window for a lobe that is `NARROWER`, this is the first
+    under which the narrower lobe shows nowhere negative radiance. Lobes are narrower at grazing angles.
+
+    Args:
+        coefficients: Those of the map, shape ((degree + 1)², C).
+        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+
+    Returns:
+        Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
+    """
+    degree = math.isqrt(len(coefficients)) - 1
+    lobe = torch.from_numpy(_spectrum(max(roughness, LEAST) * math.sqrt(NARROWER), degree))[bands(degree)]
+    window = torch.ones(len(coefficients), dtype=torch.float64)
+    rows = max(FEWEST_ROWS, 2 * degree)
+    for width in (1.0, NARROWER):
+        if (to_map(coefficients * (window * lobe)[:, None], rows) >= 0).all():
+            break
+        window = highlight_window(degree, roughness, width)
+    return window
+
+
+@cache
+def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
+    """Find the best window under which a lobe is nowhere negative (`best_window`).
+
+    The errors of highlights and of irradiance are weighed.
+
+    Args:
+        degree: Degree of the light.
+        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+        width: Width of the lobe relative to that surface's, as a factor of α.
+
+    Returns:
+        Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
+    """
+    spectrum = _spectrum(max(roughness, LEAST) * math.sqrt(width), degree)
+    diffuse = lambertian_factors(degree)[torch.arange(degree + 1) ** 2].numpy() / math.pi
+    weight = np.hypot(spectrum, IRRADIANCE * diffuse)
+    return best_window(spectrum, np.sqrt(2 * np.arange(degree + 1) + 1) * weight)
+
+
+@cache
+def highlight_error(degree: int, roughness: float) -> float:
+    """Compute how far the highlight of a point of light is off under `highlight_window`.
+
+    Args:
+        degree: Degree of the light.
+        roughness: Roughness of the surface; less than `LEAST` is taken for it.
+
+    Returns:
+        The root mean square error over that of the highlight, of a mirror's lobe seen head-on.
+    """
+    spectrum = _spectrum(max(roughness, LEAST), 4 * MAX_DEGREE)
+    kept = np.zeros_like(spectrum)
+    kept[: degree + 1] = highlight_window(degree, roughness, NARROWER)[np.arange(degree + 1) ** 2].numpy()
+    power = (2 * np.arange(len(spectrum)) + 1) * spectrum**2
+    return math.sqrt(float(power @ (1 - kept) ** 2 / power.sum()))
+
+
+def _spectrum(roughness: float, degree: int) -> np.ndarray:
+    """Compute the amplitude of each band (degree + 1,), over that of band 0, in a mirror's lobe seen head-on."""
     up = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
-    node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(2**9))
-    cosine, weight = (node + 1) / 2, weight / 2
+    node, weight = np.polynomial.legendre.leggauss(2**9 + 4 * degree)
+    cosine = torch.from_numpy((node + 1) / 2)
     light = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], 1)
-    lobe = reflectance(up, up, light, torch.tensor(max(roughness, LEAST)))[SCHLICK] * cosine
-    zonal = torch.stack(select_rows(light.T, [l * (l + 1) for l in range(MAX_DEGREE + 1)])) @ (weight * lobe)
-    held = 2 * math.pi * zonal.square().cumsum(0) / (weight * lobe**2).sum()
-    return min(int((held < KEPT).sum()), MAX_DEGREE)
+    lobe = reflectance(up, up, light, torch.tensor(roughness, dtype=torch.float64))[SCHLICK] * cosine
+    amplitudes = (weight * lobe.numpy()) @ np.polynomial.legendre.legvander(cosine.numpy(), degree)
+    return np.maximum(amplitudes / amplitudes[0], SMALLEST)
 
 
 def _in_view(vectors: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -287,19 +374,35 @@ def _coat_table() -> Tensor:
 def _table(degree: int) -> Tensor:
     """(3 terms, M functions, NODES, 2 degree + 4) float64: coefficients of π c in products of Chebyshev polynomials of
     the roughness and, the faster index, the cosine."""
-    count = 2 * degree + 4
-    angles = [
-        math.pi * (torch.arange(number, dtype=torch.float64) + 0.5) / number for number in (3 * count // 2, NODES)
-    ]
-    x, y = (angle.cos() for angle in angles)
-    cosines, roughness = (x + 1) / (3 - x), (y * (1 - LEAST) + 1 + LEAST) / 2
-    orders = torch.tensor([m for l in range(degree + 1) for m in range(l + 1)])
-    lobes = torch.stack([_lobes(cosines, value, degree) for value in roughness])  # (NODES, 3, M, N)
-    lobes = torch.einsum("kr,rtmn->mntk", torch.linalg.inv(_chebyshev(y, NODES).T), lobes)
+    angles = math.pi * (torch.arange(NODES, dtype=torch.float64) + 0.5) / NODES
+    roughness = (angles.cos() * (1 - LEAST) + 1 + LEAST) / 2
+    fits = torch.stack([_fit(degree, float(value)) for value in roughness])  # (NODES, 3, M, 2 degree + 4)
+    return torch.einsum("kr,rtmc->tmkc", torch.linalg.inv(_chebyshev(angles.cos(), NODES).T), fits).contiguous()
+
+
+@lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _table_at(degree: int, roughness: float) -> Tensor:
+    """(3 terms, M functions, 2 degree + 4) float64: `_table` at one roughness, in less time."""
+    return _fit(degree, roughness)
+
+
+def _fit(degree: int, roughness: float) -> Tensor:
+    """Fit π c at one roughness in Chebyshev polynomials of the cosine, shape (3 terms, M functions, 2 degree + 4).
+
+    Bands without amplitude at this roughness are zero.
+    """
+    count, shown = 2 * degree + 4, max(min(degree, USUAL), min(degree, degree_for(roughness, NEGLIGIBLE)))
+    angles = math.pi * (torch.arange(3 * count // 2, dtype=torch.float64) + 0.5) / (3 * count // 2)
+    x = angles.cos()
+    cosines = (x + 1) / (3 - x)
+    orders = torch.tensor([m for l in range(shown + 1) for m in range(l + 1)])
+    of_roughness = torch.tensor(roughness, dtype=torch.float64)
+    lobes = torch.cat([_lobes(some, of_roughness, shown) for some in cosines.split(AT_ONCE)], dim=2).permute(1, 2, 0)
     # Least squares with the factor sin^m θ, since near 0 the functions are quotients of small numbers.
     factors = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2) * _chebyshev(x, count).T
-    fits = torch.linalg.lstsq(factors, lobes.flatten(2), rcond=1e-9, driver="gelsd").solution
-    return fits.unflatten(2, (3, NODES)).permute(2, 0, 3, 1).contiguous()
+    fits = torch.linalg.lstsq(factors, lobes, rcond=1e-9, driver="gelsd").solution.permute(2, 0, 1)  # (3, M, count)
+    return torch.nn.functional.pad(fits, (0, 0, 0, (degree + 1) * (degree + 2) // 2 - len(orders)))
 
 
 def _lobes(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:

@@ -30,6 +30,7 @@ from renderer.light.harmonics import (
 )
 from renderer.light.local import Projector
 from renderer.mesh import Y_UP_TO_Z_UP
+from renderer.microfacets import window_without_ringing
 from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.validation import as_path, as_tensor, require_kind
 
@@ -52,14 +53,24 @@ _PUBLISHED_PROBES = {
 PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 
 
-def load_light(light: str | Path, degree: int | None = DEGREE) -> Tensor:
-    """Coefficients ((degree + 1)², 3) float32 of a named probe, of `uniform` light, in which a surface shows its
-    albedo, of an environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as
-    `renderer.save_light` writes it).
+def load_light(light: str | Path, degree: int | None = DEGREE, roughness: float | None = None) -> Tensor:
+    """Load environment light by name or from a file.
 
-    A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
-    places, as series are that were written as a map; coefficients stay as they are. degree: None for that of a file of
-    coefficients, or 6. InputError for an unknown name, a missing file, one that holds no light, or a higher degree.
+    A map is scaled to the mean luminance of the grace probe, since maps come in any unit. It may be negative in places,
+    as series are that were written as a map. Coefficients stay as they are.
+
+    Args:
+        light: A named probe; "uniform", in which a surface shows its albedo; the file of an environment map (.npy,
+            .hdr, .exr); or a file of coefficients (.json, as `renderer.save_light` writes it).
+        degree: Degree of the result. None for that of a file of coefficients, and else 6.
+        roughness: Roughness in [0, 1] of the smoothest surface that the light shines on. If it is given, a map is cut
+            off by `renderer.microfacets.window_without_ringing`, which changes maps whose highlights would ring.
+
+    Returns:
+        Coefficients ((degree + 1)², 3), float32.
+
+    Raises:
+        InputError: If the name is unknown, a file is missing or holds no light, or the light has a higher degree.
 
     >>> load_light("grace").shape
     torch.Size([49, 3])
@@ -78,7 +89,7 @@ def load_light(light: str | Path, degree: int | None = DEGREE) -> Tensor:
     elif suffix == ".json":
         coefficients = read_light(Path(light), Harmonics)[1]
     elif suffix in SUFFIXES:
-        coefficients = _read_light_map(Path(light), DEGREE if degree is None else degree)
+        coefficients = _read_light_map(Path(light), DEGREE if degree is None else degree, roughness)
     else:
         files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
         raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
@@ -182,9 +193,11 @@ def mean_luminance(coefficients: Tensor) -> float:
     return float(coefficients[0].cpu().double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
 
 
-def _read_light_map(path: Path, degree: int) -> Tensor:
+def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     """Coefficients ((degree + 1)², 3) float32 of a map, at the grace probe's mean luminance."""
     coefficients = project(read_panorama(path), degree)
+    if roughness is not None:
+        coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} is black: give a map with light in it")

@@ -39,14 +39,28 @@ def nonnegative_window(degree: int) -> Tensor:
     Returns:
         ((degree + 1)²,) float64 factors from 0 to 1, the same for all coefficients of a band, and 1 for the first.
     """
+    weight = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_weights(degree)[np.arange(degree + 1) ** 2].numpy()
+    return best_window(np.ones(degree + 1), weight)
+
+
+def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
+    """Find the window under which a lobe is nowhere negative and nearest to itself.
+
+    Args:
+        spectrum: Positive factors s_l of the lobe in each band, shape (degree + 1,); ones for a point.
+        weight: Weight of w_l - 1 in each band, shape (degree + 1,).
+
+    Returns:
+        Factors w_l of each coefficient, shape ((degree + 1)²,), float64, 1 for the first. They minimize
+        Σ weight_l² (w_l - 1)² such that Σ (2l + 1) s_l w_l P_l is nowhere negative.
+    """
+    degree = len(weight) - 1
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
-    l = np.arange(degree + 1)
-    weight = np.sqrt(2 * l + 1) * irradiance_weights(degree)[l**2].numpy()
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
     for _ in range(_ROUNDS):
-        factors = _best_factors(cosines, weight)
-        series = (2 * l + 1) * factors
+        factors = _best_factors(cosines, weight, spectrum)
+        series = (2 * np.arange(degree + 1) + 1) * spectrum * factors
         turning = legendre.legroots(legendre.legder(series))
         candidates = np.concatenate([turning.real.clip(-1, 1), [-1.0, 1.0]])
         values = legendre.legval(candidates, series)
@@ -67,9 +81,9 @@ def irradiance_weights(degree: int) -> Tensor:
     return weights[: (degree + 1) ** 2]
 
 
-def _best_factors(cosines: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The factors (degree + 1,) of the least error whose kernel is not negative at the cosines (N,); by the change
-    weight (w - 1) of w = 1, which has none."""
-    kernel = legendre.legvander(cosines, len(weight) - 1) * (2 * np.arange(len(weight)) + 1)
+def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
+    """The factors (degree + 1,) of the least error under which the lobe of a spectrum is not negative at the cosines
+    (N,); by the change weight (w - 1) of w = 1, which has none."""
+    kernel = legendre.legvander(cosines, len(weight) - 1) * (2 * np.arange(len(weight)) + 1) * spectrum
     change = shortest(kernel[:, 1:] / weight[1:], -kernel.sum(1))
     return np.concatenate([[1.0], 1 + change / weight[1:]])

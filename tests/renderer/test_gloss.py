@@ -20,7 +20,7 @@ from renderer.light.harmonics import bands, basis, lambertian_factors
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
-from renderer.microfacets import KEPT, LEAST, degree_for, reflectance
+from renderer.microfacets import AMPLITUDE, LEAST, degree_for, highlight_window, reflectance
 from renderer.rasterizer import choose
 from renderer.rendering import Shading, precompute_transfer, render, view_radiance
 from renderer.shading import normals_in_sight
@@ -95,14 +95,27 @@ def test_reflectance_is_that_of_gltf_and_of_fresnel():
             np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-14)
 
 
-def test_degree_for_is_the_least_that_holds_the_fraction_of_a_lobes_power():
+def test_degree_for_is_the_least_above_which_no_band_has_the_amplitude():
     directions, solid_angles = hemisphere(120)
     for roughness in (LEAST, 0.3, 0.6):
-        lobe = gltf_reflectance(1.0, directions, roughness, 1, 0) * directions[:, 2]
-        zonal = torch.from_numpy(lobe * solid_angles) @ basis(torch.from_numpy(directions), 20)
-        held = zonal.square().cumsum(0) / (lobe**2 * solid_angles).sum()
+        lobe = gltf_reflectance(1.0, directions, roughness, 1, 0) * directions[:, 2] * solid_angles
+        amplitudes = lobe @ np.polynomial.legendre.legvander(directions[:, 2], 45)
         degree = degree_for(roughness)
-        assert degree <= 20 and held[degree**2 - 1] < KEPT <= held[(degree + 1) ** 2 - 1]
+        assert degree <= 40 and (amplitudes[degree + 1 :] <= AMPLITUDE * amplitudes[0]).all()
+        assert amplitudes[degree] > AMPLITUDE * amplitudes[0]
+
+
+def test_a_highlight_under_its_window_is_nowhere_negative():
+    """Of lobes seen head-on, at the design's roughness and above, by Legendre series at 2,000 angles."""
+    angles = np.cos(np.linspace(0, math.pi, 2000))
+    directions, solid_angles = hemisphere(160)
+    for roughness in (LEAST, 0.25, 0.5):
+        degree = degree_for(roughness)
+        window = highlight_window(degree, roughness)[torch.arange(degree + 1) ** 2].numpy()
+        lobe = gltf_reflectance(1.0, directions, roughness * math.sqrt(0.7), 1, 0) * directions[:, 2] * solid_angles
+        amplitudes = lobe @ np.polynomial.legendre.legvander(directions[:, 2], degree)
+        radiance = np.polynomial.legendre.legval(angles, (2 * np.arange(degree + 1) + 1) * amplitudes * window)
+        assert window[0] == 1 and radiance.min() >= -1e-3 * radiance.max()
 
 
 def test_an_even_sky_is_never_exceeded():
