@@ -215,7 +215,7 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
         roughness, metallic = roughness * factors[0], metallic * factors[1]
     if (roughness < LEAST).any():
         warnings.warn(
-            f"roughness below {LEAST}: shaded as {LEAST}, the least that light of degree 20 shows", stacklevel=2
+            f"roughness below {LEAST}: shaded as {LEAST}, the least that light of degree 40 shows", stacklevel=2
         )
     return SampleGloss(roughness.clamp(min=LEAST), metallic, strength)
 

@@ -36,7 +36,7 @@ class Harmonics:
 
     `size` functions, of which a light has a coefficient (size, 3) each, RGB. name: in files and messages.
     allow_negative: any coefficients render, negative radiance included (the paper's), though only light exists whose
-    radiance is nowhere negative. InputError: a degree beyond 20.
+    radiance is nowhere negative. InputError: a degree beyond 40.
     """
 
     degree: int = 6

@@ -96,19 +96,19 @@ def test_light_has_the_degree_of_the_smoothest_part_of_a_gloss_texture():
 def test_light_has_the_degree_that_gloss_needs_and_attacks_change_all_of_it(tmp_path):
     """An attack on a scene of this degree is written, and read back to the same image; of degree 6, rings are said."""
     write_map(tmp_path / "map.exr", to_map(probe("grace"), 64).clamp(min=0))
-    shiny, matte, options = ObjectSettings("solid:pear", "pear", gloss=[0.25]), ("solid:orange", "pear"), {"samples": 1}
+    shiny, matte, options = ObjectSettings("solid:pear", "pear", gloss=[0.35]), ("solid:orange", "pear"), {"samples": 1}
     options |= {"light": str(tmp_path / "map.exr"), "rasterizer": "numpy"}
     with pytest.warns(
-        UserWarning, match="solid:pear has gloss of roughness 0.25, which takes light of degree 12: degree=6 takes"
+        UserWarning, match="solid:pear has gloss of roughness 0.35, which takes light of degree 12: degree=6 takes"
     ):
         scene = build_scene([matte, shiny], 16, **options)
-    assert scene.basis == Harmonics(degree_for(0.25)) == Harmonics(12)
-    light = renderer.load_light(options["light"], 12)
+    assert scene.basis == Harmonics(degree_for(0.35)) == Harmonics(12)
+    light = renderer.load_light(options["light"], 12, 0.35)
     ours = scene.render(scene.conditions(torch.tensor([1])), torch.tensor([1]))[0, 0]
     theirs = renderer.render(scene.objects[1].mesh, scene.cameras[1][0], light, 16, samples=1, rasterizer="numpy")
     torch.testing.assert_close(ours, theirs[0], rtol=0, atol=1e-5)
     assert build_scene([matte], 16, **options).basis == Harmonics(6)
-    with pytest.warns(UserWarning, match="degree=7 shows rings"):
+    with pytest.warns(UserWarning, match="degree=7 shows the highlight"):
         assert build_scene([shiny], 16, degree=7, **options).basis == Harmonics(7)
     build_scene([shiny], 16, degree=12, **options)
     sky = PARAMETERS["skylight"](scene, SkylightSettings())

@@ -19,14 +19,14 @@ from renderer.albedo import surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, background_term, tonemap
-from renderer.light.harmonics import MAX_DEGREE, nonzero_coefficients
+from renderer.light.harmonics import DIFFUSE_DEGREE, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import radiance
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")
-DEGREES = [0, 1, 2, 3, 6, 13, MAX_DEGREE]
+DEGREES = [0, 1, 2, 3, 6, 13, DIFFUSE_DEGREE]
 SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0], [0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
 
 
@@ -46,7 +46,7 @@ def test_irradiance_is_scipys(degree):
     np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, DIFFUSE_DEGREE])
 def test_derivatives_of_irradiance_are_central_differences(degree):
     inputs = [tensor.requires_grad_(True) for tensor in (some_normals(4), draw((degree + 1) ** 2, 3, seed=1))]
     assert torch.autograd.gradcheck(irradiance, inputs, fast_mode=degree > 6)
