@@ -26,6 +26,10 @@ ONE = torch.zeros(1, dtype=torch.int64)
 UNITS = torch.tensor([0.3, 0.2, 0.5, np.deg2rad(40)])
 
 
+# The scenes keep to light of degree 6, which takes less time.
+pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
+
+
 def egg(gloss: Gloss | None, textured: bool = False) -> Mesh:
     vertices, faces = sphere(1)
     mesh, draws = Mesh.plain(vertices * [1.0, 0.7, 0.8], faces, (0.8, 0.5, 0.3)), np.random.default_rng(0)
@@ -92,7 +96,6 @@ def test_a_material_starts_as_the_scene_shows_it_and_changes_the_object_alone():
     assert (scene.objects[1].mesh.gloss == before).all()
 
 
-@pytest.mark.filterwarnings("ignore:the mesh has gloss")
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 @pytest.mark.parametrize("radius", [0.5, 4.0, None])
 def test_a_material_stays_within_its_norm_ball_and_what_exists(norm, radius):

@@ -39,6 +39,7 @@ def check(found, mesh: renderer.Mesh, camera, light: torch.Tensor, irradiance: f
     assert float((found - expected).norm() / expected.norm()) < irradiance
 
 
+@pytest.mark.slow
 def test_a_renders_camera_and_light_are_found_before_any_background():
     mesh, light = renderer.normalize(renderer.solid("mushroom")), positive_light("eucalyptus")
     behind = torch.rand(3, 48, 48, generator=torch.Generator().manual_seed(0)).double()

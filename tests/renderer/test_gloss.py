@@ -111,7 +111,7 @@ def test_a_highlight_under_its_window_is_nowhere_negative():
     directions, solid_angles = hemisphere(160)
     for roughness in (LEAST, 0.25, 0.5):
         degree = degree_for(roughness)
-        window = highlight_window(degree, roughness)[torch.arange(degree + 1) ** 2].numpy()
+        window = highlight_window(degree, roughness, 0.7)[torch.arange(degree + 1) ** 2].numpy()
         lobe = gltf_reflectance(1.0, directions, roughness * math.sqrt(0.7), 1, 0) * directions[:, 2] * solid_angles
         amplitudes = lobe @ np.polynomial.legendre.legvander(directions[:, 2], degree)
         radiance = np.polynomial.legendre.legval(angles, (2 * np.arange(degree + 1) + 1) * amplitudes * window)
