@@ -24,7 +24,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.light.harmonics import bands, basis
@@ -224,8 +224,8 @@ class _Target(NamedTuple):
         def moved(values: np.ndarray) -> Camera:
             polar, azimuth, wider, right, up = values.tolist()
             turned = replace(camera, polar=polar, azimuth=azimuth, width=width * wider)
-            if not isinstance(camera, OrthographicCamera):
-                turned = replace(turned, distance=camera.distance * wider)
+            if isinstance(turned, PerspectiveCamera):
+                turned = replace(turned, distance=turned.distance * wider)
             return replace(turned, right=width * right, up=width * up)
 
         def residuals(values: np.ndarray) -> np.ndarray:
