@@ -49,6 +49,7 @@ DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of t
 CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
 CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
 LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
+MOST_EXCHANGES = 100  # Iterations of non-negative least squares per direction; three are usual.
 FIRST_DIRECTIONS = 16  # Every so many directions of a grid constrain the first solution.
 SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
 WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
@@ -287,7 +288,7 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
         known = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
         negative = free @ sides < 0
         while negative.any():
-            multipliers, _ = nnls(sides[:, known], -free)
+            multipliers, _ = nnls(sides[:, known], -free, maxiter=MOST_EXCHANGES * len(known))
             nearest = free + sides[:, known] @ multipliers
             negative = (nearest @ sides < 0) & ~known
             known |= negative
