@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 NOTICED = 0.05  # irradiance error, of the rms irradiance, from which on it is told
 SHADED = 2  # degree: of lower ones, irradiance of a point source is off by 0.42 or more, of 2 by 0.09
-BYTES = 8  # of a pixel's operator for each coefficient of the light: two channels of float32
+BYTES = 8  # An operator takes so many for each pixel and coefficient of the light: two channels of float32.
 COMPARED = 8  # degree, beyond which irradiance of no light is off by NOTICED
 
 

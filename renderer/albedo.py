@@ -84,8 +84,9 @@ def painted_albedo(
     """
     offset, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
     angles = None if hue is None else hue.index_select(0, fragments.faces)
-    # index_select, since the gradient of an index in brackets adds in another order each time on several threads
-    of_corners, of_samples = None, None
+    # The gradient of index_select adds in the same order on any number of threads. That of brackets does not.
+    of_corners = None
+    of_samples = None
     if angles is not None:
         of_corners = angles[:, None]
         of_samples = angles.index_select(0, fragments.face)

@@ -40,7 +40,8 @@ POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees of
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
 STEPS = 20  # Steps of descent from each camera.
 LEAST_GAIN = 1e-3  # Relative change of the squared error, or of the camera, at which a descent ends.
-DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)  # Of polar, azimuth, relative width, right and up, in pixels over the image's.
+# Steps of the differences by polar angle, azimuth, relative width, right and up, as multiples of 1 / size.
+DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
 SAMPLES = 8  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
 PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.

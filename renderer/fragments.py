@@ -157,7 +157,7 @@ class Fragments:
         return runs.pixel, runs.face, summed.T
 
     @cached_property
-    def runs(self) -> "Runs":
+    def runs(self) -> Runs:
         """The runs of samples that lie next to each other in memory and see one face in one pixel."""
         face_count = max(len(self.faces), 1)
         key, count = (self.pixel * face_count + self.face).unique_consecutive(return_counts=True)
@@ -265,7 +265,7 @@ def _fragments(
 
 def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """(the distinct values below `count`, ascending, and where in them each value is): np.unique without a sort."""
-    values = values.astype(np.intp)  # once, instead of in each of the two lookups
+    values = values.astype(np.intp)  # Otherwise each of the two lookups converts them.
     present = np.zeros(count, dtype=bool)
     present[values] = True
     distinct = np.flatnonzero(present)

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
-BLOCK = 2**12  # pixels filtered at a time: their sums stay in the processor's cache
+BLOCK = 2**12  # So many pixels are filtered at a time, whose sums stay in the processor's cache.
 GLOSSY = 2**20  # coefficients of samples with gloss at a time, of which more numbers are computed
 
 
@@ -434,7 +434,7 @@ def build_operators(
                     transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
             transfers.append(transfer.to(dtype))
             nonzero.append(rows.start + indices)
-        if len(transfers) == 1:  # nothing to join, and so nothing to copy
+        if len(transfers) == 1:  # There is nothing to join, so that nothing is copied.
             [joined_transfer] = transfers
         else:
             joined_transfer = torch.cat([torch.empty(channels, 0, pixels, dtype=dtype), *transfers], dim=1)
@@ -454,7 +454,7 @@ def build_operators(
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
     """Return the albedo (P, 3) of each pixel if its samples' (S, 3) agree to the dtype's rounding, else None."""
-    by_channel = albedo.T  # rows of one channel, which are contiguous
+    by_channel = albedo.T  # Each row holds one channel and is contiguous.
     by_pixel = by_channel.new_zeros(3, len(fragments.pixels)).index_copy(1, fragments.pixel, by_channel)
     spread = (by_channel - by_pixel.index_select(1, fragments.pixel)).abs_()
     agrees = spread <= torch.finfo(dtype).eps * by_channel
