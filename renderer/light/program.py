@@ -43,15 +43,16 @@ def shortest(sides: Array, least: Array) -> Array:
         except np.linalg.LinAlgError:  # the weights differ by more than rounding allows: the optimum is near
             break
         state = factor, sides, slacks, multipliers, unlike, outside
-        step = _newton_step(*state, slacks * multipliers)
-        length = _step_length(slacks, multipliers, *step)
-        predicted = (slacks + length * step[1]) @ (multipliers + length * step[2])
+        _, of_slacks, of_multipliers = _newton_step(*state, slacks * multipliers)
+        length = _step_length(slacks, multipliers, of_slacks, of_multipliers)
+        predicted = (slacks + length * of_slacks) @ (multipliers + length * of_multipliers)
         centering = (predicted / gap) ** 3 * gap / len(sides)
-        step = _newton_step(*state, slacks * multipliers + step[1] * step[2] - centering)
-        length = min(_SHORT_OF_EDGE * _step_length(slacks, multipliers, *step), 1)
-        y = y + length * step[0]
-        slacks = slacks + length * step[1]
-        multipliers = multipliers + length * step[2]
+        products = slacks * multipliers + of_slacks * of_multipliers - centering
+        of_y, of_slacks, of_multipliers = _newton_step(*state, products)
+        length = min(_SHORT_OF_EDGE * _step_length(slacks, multipliers, of_slacks, of_multipliers), 1)
+        y = y + length * of_y
+        slacks = slacks + length * of_slacks
+        multipliers = multipliers + length * of_multipliers
     return y * scale
 
 
@@ -64,15 +65,17 @@ def _newton_step(
     outside: Array,
     products: Array,
 ) -> tuple[Array, Array, Array]:
-    """The change of (y, slacks, multipliers) that makes both residuals and the products (M,) zero, to first order.
-    factor: Cholesky's of I + sidesᵀ diag(multipliers / slacks) sides."""
+    """Return the changes of y, slacks and multipliers that make both residuals and the products (M,) zero.
+
+    They do so to first order. The factor is Cholesky's of I + sidesᵀ diag(multipliers / slacks) sides.
+    """
     right = -unlike - sides.T @ ((multipliers * outside + products) / slacks)
     of_y = cho_solve(factor, right, check_finite=False)
     of_slacks = sides @ of_y + outside
     return of_y, of_slacks, -(products + multipliers * of_slacks) / slacks
 
 
-def _step_length(slacks: Array, multipliers: Array, _: Array, of_slacks: Array, of_multipliers: Array) -> float:
-    """The longest step with which slacks and multipliers stay positive, at most 1 / _SHORT_OF_EDGE."""
+def _step_length(slacks: Array, multipliers: Array, of_slacks: Array, of_multipliers: Array) -> float:
+    """Return the longest step with which slacks and multipliers stay positive, at most 1 / _SHORT_OF_EDGE."""
     shrinking = max((-of_slacks / slacks).max(), (-of_multipliers / multipliers).max())
     return 1 / max(shrinking, _SHORT_OF_EDGE)
