@@ -15,6 +15,7 @@ import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
+from threadpoolctl import threadpool_limits
 
 from renderer.rasterizer import Rasterizer
 
@@ -23,11 +24,14 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
-    """Here and in the processes that tests start: images and networks are so small that threads would wait for each
-    other."""
+    """Computes with one thread, here and in the processes that tests start.
+
+    Images and networks are so small that threads would wait for each other. The last bits of a factorization by NumPy
+    or SciPy also depend on the number of threads.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, threadpool_limits(1, user_api="blas"):
         patch.setenv("OMP_NUM_THREADS", "1")
         yield
     torch.set_num_threads(threads)
