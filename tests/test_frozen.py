@@ -1,4 +1,7 @@
-"""Weights, attacks and renders to the last bit, so that a refactoring proves that it changes none.
+"""Weights, attacks and renders as they were recorded, so that a refactoring proves that it changes none.
+
+There are two layers. Rounded values in float64 hold on every machine (portable.json). Hashes of all bits hold on the
+machine that recorded them (frozen.json).
 
 SHA-256 hashes are recorded in frozen.json by case, for each machine by its fingerprint: CPU, instruction set and the
 versions of the libraries that compute. On another machine the tests skip. To use them there, record at the commit
@@ -7,7 +10,7 @@ before a change, and verify after it:
     RECORD_FROZEN=1 python -m pytest -q tests/test_frozen.py    # all cases, or those that -k selects
     python -m pytest -q tests/test_frozen.py -k render          # or -k attack, -k weights
 
-A change that is meant to change bits records anew, and its commit says so. Tensors are hashed by type, shape and bytes
+A change that is meant to change bits or values records anew, and its commit says so. Tensors are hashed by type, shape and bytes
 in their order, not by name. The tables below hold everything by which the library is called, so that a renamed keyword
 or key is edited there.
 """
@@ -38,6 +41,10 @@ from renderer.light.presets import directional
 from renderer.light.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")
+PORTABLE = Path(__file__).with_name("portable.json")
+DECIMALS = 5  # of the values in portable.json
+SHOWN_VALUES = 40  # of each tensor in portable.json, at equal distances
+TRACED = {"bounces", "shadows", "bounces_gradients"}  # by rays in float32, whose hits depend on the machine
 LIBRARIES = ("torch", "numpy", "scipy", "embreex", "pillow")
 SOFTWARE = {"rasterizer": "numpy"}  # the same on every machine; "numba" has a case of its own
 SIZE = 24
@@ -168,6 +175,31 @@ def test_render_of_a_scene(name, verify):
     verify(relit, *gradients(relit, [lights]), reshaded, *gradients(reshaded, [lights, moved, albedo]))
 
 
+@pytest.mark.parametrize("name", sorted(RENDERS.keys() - TRACED))
+def test_values_of_a_render(name, tmp_path, verify_values):
+    shown, cameras, light, keywords, wanted = RENDERS[name]
+    mesh = mesh_named(shown, tmp_path)
+    shape = (mesh.textures or [mesh.faces])[0].shape
+    leaves = {
+        "light": light_named(light, tmp_path).double(),
+        "vertices": torch.from_numpy(mesh.vertices).double(),
+        "albedo": 0.2 + 0.6 * torch.rand(shape, generator=torch.Generator().manual_seed(2)).double(),
+    }
+    leaves = {argument: leaves[argument].requires_grad_() for argument in {"light", *wanted}}
+    images = renderer.render(mesh, cameras, size=SIZE, **keywords | SOFTWARE | leaves)
+    verify_values(images, *gradients(images, list(leaves.values())))
+
+
+@pytest.mark.parametrize("name", sorted(OPERATORS.keys() - TRACED))
+def test_values_of_a_render_by_operators(name, tmp_path, verify_values):
+    shown, cameras, keywords = OPERATORS[name]
+    named = ("grace", "skylight", "environment")
+    lights = torch.stack([light_named(light, tmp_path) for light in named]).double().requires_grad_()
+    found = renderer.precompute_transfer(mesh_named(shown, tmp_path), cameras, SIZE, **SOFTWARE, **keywords)
+    images = torch.stack([operator.image(lights, 0.3) for operator in found])
+    verify_values(images, *gradients(images, [lights]), found[0].radiance(lights.detach()))
+
+
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack(name, verify):
     changed, shown, others, target = ATTACKS[name]
@@ -235,6 +267,30 @@ def verify(request) -> Callable[..., None]:
         assert digest(tensors) == records[fingerprint()].get(case)
 
     return compare
+
+
+@pytest.fixture
+def verify_values(request) -> Callable[..., None]:
+    """Compares the values of float64 tensors with those recorded for this test, or records them."""
+    records = json.loads(PORTABLE.read_text()) if PORTABLE.exists() else {}
+
+    def compare(*tensors: Tensor) -> None:
+        found = [values_of(tensor) for tensor in tensors]
+        if os.environ.get("RECORD_FROZEN"):
+            records[request.node.name] = found
+            PORTABLE.write_text(json.dumps(records, indent=1, sort_keys=True) + "\n")
+        for values, expected in zip(found, records[request.node.name], strict=True):
+            torch.testing.assert_close(values, expected, rtol=1e-5, atol=1.5 * 10**-DECIMALS)
+
+    return compare
+
+
+def values_of(tensor: Tensor) -> list[float]:
+    """The mean magnitude and some values of a float64 tensor, rounded."""
+    assert tensor.dtype == torch.float64
+    flat = tensor.detach().flatten()
+    chosen = torch.linspace(0, len(flat) - 1, min(SHOWN_VALUES, len(flat))).long()
+    return [round(value, DECIMALS) for value in [flat.abs().mean().item(), *flat[chosen].tolist()]]
 
 
 @cache
