@@ -10,9 +10,9 @@ before a change, and verify after it:
     RECORD_FROZEN=1 python -m pytest -q tests/test_frozen.py    # all cases, or those that -k selects
     python -m pytest -q tests/test_frozen.py -k render          # or -k attack, -k weights
 
-A change that is meant to change bits or values records anew, and its commit says so. Tensors are hashed by type, shape and bytes
-in their order, not by name. The tables below hold everything by which the library is called, so that a renamed keyword
-or key is edited there.
+A change that is meant to change bits or values records anew, and its commit says so. Tensors are hashed by type, shape
+and bytes in their order, not by name. The tables below hold everything by which the library is called, so that a
+renamed keyword or key is edited there.
 """
 
 import hashlib
