@@ -23,12 +23,14 @@ from augment.service import ARMS
 from renderer.errors import InputError
 from train import checkpoint, console
 from train.errors import writable_folder
+from train.initial import load_initial
+from train.load_data import load_data
 from train.processes import Interrupted, broadcast, process_group
 from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import summarize
 from train.results import require_new_run
-from train.run import load_data, prepare
+from train.run import Run
 from train.run_folder import CONFIG, require_same_run, resumed, sole_writer
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, program, read_settings
 from train.sweep import run_in_sweep, sweep
@@ -73,8 +75,8 @@ def main(config: DictConfig) -> None:
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
     """Train the arms to compare with and the arm itself in the first process's folder, and print their table."""
-    run, first, command = broadcast(str(config.run)), utils.rank() == 0, given_command(overrides)
-    folder = Path(run).absolute()
+    given_folder, first, command = broadcast(str(config.run)), utils.rank() == 0, given_command(overrides)
+    folder = Path(given_folder).absolute()
     config.run = str(folder)
     if config.train.resume and not any(map(CHOICE.match, overrides)):  # which stand for all of a command
         config, command = resumed(config, overrides)
@@ -90,15 +92,21 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             require_same_run(path, arm_settings)
         require_new_run(path, "run", settings.overwrite, settings.train.resume)
     if first:
-        log_to(writable_folder(run, "run") / LOG)
+        log_to(writable_folder(given_folder, "run") / LOG)
     try:
         with sole_writer("run", *arms) if first else nullcontext():
-            data = load_data(settings)
-            runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake
-            for path, train_and_score in runs.items():
-                arm = arms[path].augment.arm
-                console.info("\n== augment=%s: %s%s", arm, ARMS[arm], "" if path == folder else ", for comparison")
-                train_and_score()
+            initial = load_initial(settings)
+            data = load_data(settings, initial)
+            runs = [Run(arm_settings, data, path, initial, command) for path, arm_settings in arms.items()]
+            for run in runs:  # All runs are loaded before the first trains, so that every mistake shows.
+                run.load()
+            for run in runs:
+                arm = run.settings.augment.arm
+                purpose = "" if run.folder == folder else ", for comparison"
+                console.info("\n== augment=%s: %s%s", arm, ARMS[arm], purpose)
+                run.fit()
+                run.score()
+                run.export()
             if first:
                 console.info("\n%s", format_table([summarize(path) for path in arms]))
                 console.info("%s", report_of([folder], folder))

@@ -1,7 +1,7 @@
 """Images as uint8 arrays, labeled (CIFAR-100, an .npz file, a folder of class folders) or not (any folder)."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -57,11 +57,22 @@ class Split:
 
 @dataclass(frozen=True)
 class DataSet:
-    """Class names in label order, a training and a test split."""
+    """Images for training and for one test.
+
+    Attributes:
+        classes: The names of the classes, in label order.
+        train: The images to learn from.
+        test: The images to score on.
+        labeled: Whether the labels are known. Otherwise all of them are 0, and the answers of
+            the network that a run begins with take their place.
+        rendered: Whether the images are renders of solids.
+    """
 
     classes: tuple[str, ...]
     train: Split
     test: Split
+    labeled: bool = True
+    rendered: bool = False
 
     @property
     def size(self) -> int:
@@ -73,7 +84,9 @@ def relabeled(data: DataSet, classes: Sequence[str], key: str) -> DataSet:
     """The data with labels that count these classes. InputError naming the key where one of its own is not among
     them."""
     labels = torch.tensor([class_index(classes, name, key) for name in data.classes])
-    return DataSet(tuple(classes), *(Split(part.images, labels[part.labels]) for part in (data.train, data.test)))
+    train = Split(data.train.images, labels[data.train.labels])
+    test = Split(data.test.images, labels[data.test.labels])
+    return replace(data, classes=tuple(classes), train=train, test=test)
 
 
 def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.validation") -> Tensor:
@@ -181,7 +194,7 @@ def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: 
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
     fraction = min(test_fraction, HELD_OUT / len(split))
     held_out = held_out_rows(split, fraction, seed=0, key="data.test_fraction")
-    return DataSet((), split[~held_out], split[held_out])
+    return DataSet((), split[~held_out], split[held_out], labeled=False)
 
 
 def _folders(root: Path) -> list[str]:

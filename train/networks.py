@@ -16,7 +16,7 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import utils
-from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier, load_classifier
+from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
 from augment.utils import eval_mode
@@ -35,7 +35,6 @@ CLASSIFIER = "classifier"  # of a description: of a network that began as one of
 WEIGHTS = "weights.pt"  # of a run that began with a classifier: under the names of its own file
 META = ("architecture", "settings", "scores", "versions", "operating_point")  # of a published network's file
 FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
-SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
 _OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
 
 
@@ -197,23 +196,6 @@ def is_classifier(name: str) -> bool:
     return (found := SOURCES.get(source + colon)) is not None and found.build is not None
 
 
-def load_initial(name: str, weights: str | None, size: int | None = None) -> tuple[Path, dict[str, Any]]:
-    """What `load_selected` finds for a run's folder or file, and the same of a classifier with its weights.
-
-    size: of images, in place of the classifier's own. InputError: as `load_classifier` and `load_selected`, or weights
-    of a run, which has its own.
-    """
-    if not is_classifier(name):
-        if weights is not None:
-            raise InputError(f"weights={weights} is not for train.init_from={name}, which has its own: leave it out")
-        return load_selected(Path(name))
-    classifier = load_classifier(name, weights)
-    network = cast(nn.Module, classifier.function)
-    shape = {"name": name, CLASSIFIER: True}
-    description = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
-    return Path(name), {"architecture": description, "model": network.state_dict()}
-
-
 def export(path: Path, network: nn.Module) -> None:
     """Write the weights of a network that began with a classifier, under the names of its own file."""
     content = io.BytesIO()
@@ -241,7 +223,7 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     if name.startswith(PYTHON) and name != model:
         attack = "for an attack, classifier=python: with a function that loads the weights"
         raise InputError(f"the network in {path} is made by {name}: give model={name} to run that code or, {attack}")
-    with _of_one_architecture(path):
+    with of_one_architecture(path):
         size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
         network = build_network(classes, size, **shape)
         network.load_state_dict(state["model"])
@@ -257,7 +239,7 @@ SOURCES["run:"] = Source(load_run, None)  # a classifier's name in the commands
 
 
 @contextmanager
-def _of_one_architecture(path: Path) -> Iterator[None]:
+def of_one_architecture(path: Path) -> Iterator[None]:
     """InputError naming the file where its description or its weights do not fit the network."""
     try:
         yield
@@ -283,20 +265,6 @@ def published(run: Path) -> Path:
     """The path, or where there is none the file or folder below pretrained/ of the installation or the clone."""
     homes = (Path(__file__).parent, Path(__file__).parents[1]) if run.parts[:1] == ("pretrained",) else ()
     return next((path for path in (run, *(home / run for home in homes)) if path.exists()), run)
-
-
-def start_from(network: nn.Module, description: Mapping[str, Any], path: Path, state: Mapping[str, Any]) -> None:
-    """Give the network the weights and the normalization of another run's, which `load_selected` found.
-
-    description: the network's (see `describe`). InputError where the other has other classes, another size or shape.
-    """
-    stored, description = ({"name": WIDERESNET, **facts} for facts in (state["architecture"], description))
-    for key in SHAPE:
-        if stored.get(key, description.get(key)) != description.get(key):
-            other = "other classes" if key == "classes" else f"{key} {stored[key]}, not {description[key]}"
-            raise InputError(f"train.init_from={path} was trained with {other}: give this run the same")
-    with _of_one_architecture(path):
-        network.load_state_dict(state["model"])
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:

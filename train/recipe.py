@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from augment import utils
 from augment.classifiers.adapter import nearest
@@ -157,25 +156,6 @@ def training_loss(
         return loss, is_right(logits.detach().argmax(1), labels, studied[1:]).sum()
 
     return loss_and_hits
-
-
-class MovingAverage(AveragedModel):
-    """The exponential moving average of a model's weights and statistics, beginning with those of the first update."""
-
-    def __init__(self, model: nn.Module, decay: float):
-        super().__init__(model, use_buffers=True)
-        self._average = get_ema_multi_avg_fn(decay)
-
-    def update_parameters(self, model: nn.Module) -> None:
-        """As torch's own, which makes a GPU wait at every step, since it moves its counter there."""
-        if self.n_averaged == 0:
-            return super().update_parameters(model)
-        tensors = [[*module.parameters(), *module.buffers()] for module in (self.module, model)]
-        pairs = [(average.detach(), latest.detach()) for average, latest in zip(*tensors, strict=True)]
-        for floating in (True, False):  # a call takes tensors of one type
-            if group := [pair for pair in pairs if pair[0].is_floating_point() == floating]:
-                self._average([average for average, _ in group], [latest for _, latest in group], None)
-        self.n_averaged += 1
 
 
 def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()) -> Augment:

@@ -1,36 +1,35 @@
-"""One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
+"""One training run, from its settings to its scores.
 
-from collections.abc import Callable
+`train.__main__` makes runs and calls their steps in order: `load`, `fit`, `score`, `export`.
+"""
+
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from augment import utils
-from augment.build import build_scene
-from augment.classifiers.adapter import class_index, label_names
-from augment.losses import complementary_label
-from augment.service import AugmentationService
-from augment.utils import Phases, progress, stream_seed
-from renderer.errors import InputError, require_choice, require_range
-from renderer.image import LARGEST_SIZE
+from augment.utils import progress, stream_seed
+from renderer.errors import InputError
 from train import checkpoint, console
 from train.cache import TensorCache, cache_folder
-from train.data import (
-    HELD_OUT,
-    DataSet,
-    Split,
-    channel_statistics,
-    held_out_rows,
-    load_cifar100,
-    load_folder,
-    load_npz,
-    load_unlabeled,
-    relabeled,
+from train.data import DataSet, Split, channel_statistics, held_out_rows, relabeled
+from train.device import (
+    MixedPrecision,
+    choose_device,
+    choose_precision,
+    choose_threads,
+    set_deterministic,
 )
-from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
+from train.initial import (
+    CachedModel,
+    Initial,
+    ValidationPart,
+    choose_validation,
+)
 from train.loop import Trainer, evaluate
 from train.networks import (
     CLASSIFIER,
@@ -39,312 +38,389 @@ from train.networks import (
     build_network,
     describe,
     export,
-    load_initial,
-    start_from,
     without_normalization,
 )
-from train.photographs.folder import find_photographs, load_photographs, require_outside
+from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.predictions import BATCH, Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
-from train.processes import first_process_first
 from train.recipe import freeze
-from train.rendered_shapes import load_shapes
+from train.renders import build_service
 from train.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
+from train.settings import ExperimentSettings
 
-Base = tuple[Path, dict[str, Any]] | None  # the network to begin with, as `load_initial` gives it
-Predict = Callable[[torch.Tensor], torch.Tensor]
-UNLABELED = "unlabelled"  # data whose labels are the answers of the network begun with
-SIZE = 32  # of the images of a folder, where neither data.size nor the network begun with says
-SAMPLED = 1000  # images whose channels are measured where they are on disk
-VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
+# Images whose channels are measured where all of them are on disk.
+SAMPLED = 1000
 
 
-def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], dict]:
-    """Begin a run of one arm: all that comes before the first epoch, where wrong input shows.
+class Run:
+    """One training run: its data, its network, its folder and its scores.
 
-    Returns a function that trains, and returns the scores that it writes. command: as it was given, to be recorded.
+    The steps are called in order: `load`, `fit`, `score`, `export`. Wrong input shows in `load`,
+    so that several runs can be loaded before the first of them trains.
+
+    Args:
+        settings: The settings of the run.
+        data: Its data set.
+        folder: The folder that the run writes to.
+        initial: The network that it begins with; None for random weights.
+        command: The command that was given, which is recorded.
     """
-    base = _initial(settings)
-    if settings.data.name == UNLABELED and not (base and settings.train.distillation):
-        missing = "set train.init_from and train.distillation"
-        raise InputError(f"data={UNLABELED}: a network keeps its answers on it: {missing}")
-    architecture = base[1]["architecture"] if base else {}
-    if settings.data.name == UNLABELED:
-        data = replace(data, classes=tuple(architecture["classes"]))
-    elif base and (settings.data.name == "shapes" or CLASSIFIER in architecture):
-        data = relabeled(data, architecture["classes"], f"data={settings.data.name}")
-    for name, photographs in settings.evaluate.folders.items():
-        require_outside(folder / name, photographs)
-        find_photographs(photographs, data.classes, settings.label)
-    set_deterministic(settings.train.deterministic)
-    anew = settings.overwrite and not settings.train.resume
-    threads, begun = settings.train.threads, checkpoint.exists(folder) and not anew
-    if begun and not settings.train.resume:
-        advice = "set train.resume=true to go on or overwrite=true to begin anew, or choose another run"
-        raise InputError(f"run={folder} holds a run already: {advice}")
-    if begun:
-        before = require_same_run(folder, settings)
-        recorded = OmegaConf.select(before, "hardware.threads")
-        threads = threads or (recorded if isinstance(recorded, int) and recorded > 0 else None)
-    fraction, left_out = _validation(settings, data.train, base)
-    held_out = held_out_rows(data.train, fraction, seed=0)
-    trainer = build_trainer(settings, data, folder, base, left_out, threads)
-    threads = torch.get_num_threads()
-    if begun:
-        trainer.resume()
-        epochs, planned = settings.train.epochs, before.train.epochs
-        if epochs != planned and not settings.train.soup:  # each of whose epochs has the whole schedule
-            rates = [settings.train.rate(trainer.epoch / count) for count in (epochs, planned)]
-            stretched = f"train.epochs={epochs}, not {planned}, stretches train.schedule={settings.train.schedule}"
-            console.warning("%s: the learning rate goes on at %.3g, not %.3g", stretched, *rates)
-    elif settings.train.resume:
-        console.info("nothing to resume in %s; starting at epoch 1", folder)
-    if utils.rank() == 0:
-        if anew:
-            remove_run(folder)
-        hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
-        write_config(folder, settings, hardware=hardware, command=command, test_images=_test_images(settings, data))
 
-    def train_and_score() -> dict[str, float]:
-        torch.set_num_threads(threads)  # of this run, after others were prepared
-        console.info(
-            f"{(~held_out).sum()} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
-            f"threads: {threads}, processes: {utils.world_size()}"
+    trainer: Trainer
+    log: RunLog | None
+    held_out: Tensor
+
+    def __init__(
+        self,
+        settings: ExperimentSettings,
+        data: DataSet,
+        folder: Path,
+        initial: Initial | None = None,
+        command: str = "",
+    ):
+        self.settings = settings
+        self.data = data
+        self.folder = folder
+        self.initial = initial
+        self.command = command
+        self._scores: dict[str, float] = {}
+        # The threads that the run trains with.
+        self._threads = 1
+        # The classes that the initial network gives the test images, shape (N,).
+        self._answers: Tensor | None = None
+
+    def load(self) -> None:
+        """Do everything that comes before the first epoch.
+
+        Raises:
+            InputError: The settings, the data, the folder or its checkpoint are wrong.
+        """
+        settings = self.settings
+        self.data = _data_for(settings, self.data, self.initial)
+        for name, photographs in settings.evaluate.folders.items():
+            require_outside(self.folder / name, photographs)
+            find_photographs(photographs, self.data.classes, settings.label)
+        set_deterministic(settings.train.deterministic)
+        before = self._require_folder()
+        part = choose_validation(settings, self.data, self.initial)
+        self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
+        self.trainer = build_trainer(
+            settings, self.data, self.folder, self.initial, part, self._asked_threads(before)
         )
-        log, labeled = None if utils.rank() else RunLog(folder, trainer.history), data
-        before: dict[str, float] = {}
-        if trainer.initial:
-            predict = _initial_predictor(settings, trainer)
-            answers = _answers(predict, trainer, data.test)
-            answered = Split(data.test.images, answers)
-            if settings.data.name == UNLABELED:
-                labels = data.train.labels.clone()  # of the others, the loss asks the teacher
-                labels[held_out] = _answers(predict, trainer, data.train[held_out])
-                labeled = DataSet(data.classes, Split(data.train.images, labels), answered)
-            if utils.rank() == 0:
-                before = _scores_before(settings, trainer, labeled, predict, answers)
-        trainer.fit(labeled.train.to(trainer.device), held_out, log)
-        scores = before | _test_scores(trainer, labeled, _test_images(settings, data))
-        if CLASSIFIER in trainer.architecture:
-            kept = scores["test/accuracy"]
-            if labeled is data:
-                kept = evaluate(trainer.selected, answered.to(trainer.device))["accuracy"]
-            scores["test/agreement"] = kept
-            name, count = settings.train.init_from, len(data.test)
-            console.info("agreement with %s on %d held-out images: %.4f", name, count, kept)
-            if log:
-                export(folder / WEIGHTS, trainer.selected.network)
-                console.info("network.load_state_dict(torch.load(%r)) loads the result", str(folder / WEIGHTS))
-        summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
+        self._threads = torch.get_num_threads()
+        if before is not None:
+            self.trainer.resume()
+            self._warn_of_stretched_schedule(before.train.epochs)
+        elif settings.train.resume:
+            console.info("nothing to resume in %s; starting at epoch 1", self.folder)
+        if utils.rank() == 0:
+            self._write_config()
+
+    def fit(self) -> None:
+        """Train to the last epoch. The network that the run begins with is scored before."""
+        torch.set_num_threads(self._threads)  # Other runs may have been loaded since.
+        console.info(
+            "%d images, %d classes; %s, %s, threads: %d, processes: %d",
+            (~self.held_out).sum(),
+            len(self.data.classes),
+            self.trainer.device,
+            self.trainer.model.precision,
+            self._threads,
+            utils.world_size(),
+        )
+        is_first = utils.rank() == 0
+        self.log = RunLog(self.folder, self.trainer.history) if is_first else None
+        if self.trainer.initial:
+            self._score_initial(self.trainer.initial)
+        split = self.data.train.to(self.trainer.device)
+        self.trainer.fit(split, self.held_out, self.log)
+
+    def score(self) -> dict[str, float]:
+        """Score the selected network on the test images and the photographs, once.
+
+        Returns:
+            The scores by name, which are also the last line of metrics.jsonl.
+        """
+        trainer = self.trainer
+        self._scores |= self._test_scores()
+        if self._answers is not None and CLASSIFIER in trainer.architecture:
+            self._scores["test/agreement"] = self._agreement(self._answers)
+        summaries = self._score_photographs(trainer.selected, self.folder)
         for name, summary in summaries.items():
             console.info("%s: %s", name, format_summary(summary))
-            parts = {name: summary} | {f"{name}/{label}": part for label, part in summary.get("by_label", {}).items()}
-            for key, part in parts.items():
-                metrics = {metric: find_metric(part, metric).get("value") for metric in ("top5", *METRICS)}
-                scores |= {f"{key}/{metric}": value for metric, value in metrics.items() if value is not None}
-        if log:
-            log.scalars(scores)
-        return scores
+            self._scores |= _photograph_scores(name, summary)
+        if self.log:
+            self.log.scalars(self._scores)
+        return self._scores
 
-    return train_and_score
+    def export(self) -> None:
+        """Write the weights of a network that began as a classifier, as its own file has them."""
+        if self.log and CLASSIFIER in self.trainer.architecture:
+            path = self.folder / WEIGHTS
+            export(path, self.trainer.selected.network)
+            console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
+
+    def _require_folder(self) -> DictConfig | None:
+        """Return the settings of the run that goes on in the folder; None if none does."""
+        resumes = self.settings.train.resume
+        begins_anew = self.settings.overwrite and not resumes
+        if begins_anew or not checkpoint.exists(self.folder):
+            return None
+        if not resumes:
+            remedy = "set train.resume=true to go on or overwrite=true to begin anew"
+            raise InputError(
+                f"run={self.folder} holds a run already: {remedy}, or choose another run"
+            )
+        return require_same_run(self.folder, self.settings)
+
+    def _asked_threads(self, before: DictConfig | None) -> int | None:
+        """Return the threads that the settings ask for, or those of the run that goes on."""
+        asked = self.settings.train.threads
+        if asked or before is None:
+            return asked
+        recorded = OmegaConf.select(before, "hardware.threads")
+        return recorded if isinstance(recorded, int) and recorded > 0 else None
+
+    def _warn_of_stretched_schedule(self, planned: int) -> None:
+        """Warn of the jump of the learning rate that another number of epochs causes."""
+        recipe = self.settings.train
+        # Each epoch of a soup has the whole schedule.
+        if recipe.epochs == planned or recipe.soup:
+            return
+        rate = recipe.rate(self.trainer.epoch / recipe.epochs)
+        rate_before = recipe.rate(self.trainer.epoch / planned)
+        change = f"train.epochs={recipe.epochs}, not {planned}"
+        console.warning(
+            "%s, stretches train.schedule=%s: the learning rate goes on at %.3g, not %.3g",
+            change,
+            recipe.schedule,
+            rate,
+            rate_before,
+        )
+
+    def _write_config(self) -> None:
+        """Write the settings and the facts of the run into its folder."""
+        if self.settings.overwrite and not self.settings.train.resume:
+            remove_run(self.folder)
+        hardware = {
+            "device": str(self.trainer.device),
+            "precision": self.trainer.model.precision,
+            "threads": self._threads,
+        }
+        write_config(
+            self.folder,
+            self.settings,
+            hardware=hardware,
+            command=self.command,
+            test_images=describe_test_images(self.settings, self.data),
+        )
+
+    def _score_initial(self, model: MixedPrecision) -> None:
+        """Score the network that the run begins with, and label unlabeled data by its answers."""
+        settings = self.settings
+        # The code of a foreign function may change unseen, so its logits are not stored.
+        is_foreign = settings.model.name.startswith(PYTHON)
+        cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
+        predict = CachedModel(model, self.trainer.device, cache)
+        test = self.data.test
+        self._answers = self._predicted_classes(predict, test)
+        if not self.data.labeled:
+            # The loss asks the teacher about the images that the network learns from.
+            labels = self.data.train.labels.clone()
+            held_out = self.data.train[self.held_out]
+            labels[self.held_out] = self._predicted_classes(predict, held_out)
+            train = Split(self.data.train.images, labels)
+            test = Split(test.images, self._answers)
+            self.data = replace(self.data, train=train, test=test)
+        if utils.rank() > 0:
+            return
+        accuracy = (self._answers == test.labels).float().mean().item()
+        if self.data.labeled:
+            images = describe_test_images(settings, self.data)
+            begun = settings.train.init_from
+            console.info("before: %s has accuracy %.4f on %s", begun, accuracy, images)
+        self._score_photographs(predict, self.folder / BEFORE)
+        self._scores["test/accuracy_before"] = accuracy
+
+    def _predicted_classes(self, model: Model, split: Split) -> Tensor:
+        """Return the classes that a model gives the images of a split, shape (N,)."""
+        batches = torch.arange(len(split)).split(BATCH)
+        count = len(self.trainer.architecture["classes"])
+        classes = [
+            compute_logits(model, images, count, self.trainer.device).argmax(1)
+            for images in progress(split.squares(batches), "predictions", len(batches))
+        ]
+        return torch.cat(classes)
+
+    def _test_scores(self) -> dict[str, float]:
+        """Look at the test images once: with the last network and, if it is another, the best.
+
+        The best network stays loaded.
+        """
+        trainer = self.trainer
+        test = self.data.test.to(trainer.device)
+        last = evaluate(trainer.selected, test)["accuracy"]
+        selected = last
+        best = checkpoint.load(self.folder / checkpoint.BEST)
+        if best["epoch"] != trainer.epoch:
+            trainer.selected.network.load_state_dict(best["model"])
+            selected = evaluate(trainer.selected, test)["accuracy"]
+        console.info(
+            "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s",
+            selected,
+            best["epoch"],
+            last,
+            describe_test_images(self.settings, self.data),
+        )
+        return {
+            "test/accuracy": selected,
+            "test/accuracy_last": last,
+            "test/epoch": best["epoch"],
+        }
+
+    def _agreement(self, answers: Tensor) -> float:
+        """Return how often the selected network answers test images as the initial one did."""
+        agreement = self._scores["test/accuracy"]
+        if self.data.labeled:
+            answered = Split(self.data.test.images, answers).to(self.trainer.device)
+            agreement = evaluate(self.trainer.selected, answered)["accuracy"]
+        console.info(
+            "agreement with %s on %d held-out images: %.4f",
+            self.settings.train.init_from,
+            len(answers),
+            agreement,
+        )
+        return agreement
+
+    def _score_photographs(self, model: Model, folder: Path) -> dict[str, dict[str, Any]]:
+        """Score a model on each folder of photographs; return the first process's summaries."""
+        if utils.rank() > 0:
+            return {}
+        summaries = {}
+        for name, photographs in self.settings.evaluate.folders.items():
+            summaries[name] = evaluate_photographs(
+                model,
+                self.data.classes,
+                photographs,
+                self.settings.label,
+                folder / name,
+                self.data.size,
+                self.settings.evaluate.skip_unreadable,
+                self.trainer.device,
+            )
+        return summaries
 
 
-def load_data(settings: ExperimentSettings) -> DataSet:
-    """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
-    data, cache = settings.data, TensorCache(cache_folder(settings.train.cache))
-    skip = settings.evaluate.skip_unreadable
-
-    def size() -> int:
-        base = None if data.size else _initial(settings)
-        return data.size or (base[1]["architecture"]["size"] if base else SIZE)
-
-    loaders = {
-        "cifar100": lambda: load_cifar100(data.path),
-        "npz": lambda: load_npz(data.path),
-        "folder": lambda: load_folder(data.path, size(), data.test_fraction, skip, data.workers),
-        UNLABELED: lambda: load_unlabeled(data.path, size(), data.test_fraction, skip, data.workers),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, size(), data.seed, cache),
-    }
-    require_choice("data.name", data.name, loaders)
-    console.info("data: %s", data.name)
-    with first_process_first():
-        loaded = loaders[data.name]()
-    with keyed("data.path"):
-        require_range("image size", loaded.size, SMALLEST_SIZE, LARGEST_SIZE)
-    return loaded
-
-
-def _initial(settings: ExperimentSettings) -> Base:
-    init_from = settings.train.init_from
-    return load_initial(init_from, settings.weights, settings.data.size) if init_from else None
-
-
-def _answers(predict: Predict, trainer: Trainer, split: Split) -> torch.Tensor:
-    """(N,) the classes that the network begun with gives."""
-    batches, classes = torch.arange(len(split)).split(BATCH), len(trainer.architecture["classes"])
-    images = progress(split.squares(batches), "predictions", len(batches))
-    logits = [compute_logits(predict, batch, classes, trainer.device) for batch in images]
-    return torch.cat(logits).argmax(1)
-
-
-def _validation(settings: ExperimentSettings, split: Split, base: Base) -> tuple[float, dict[str, Any] | None]:
-    """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
-    the smallest along its ancestors, since parts of one seed are nested, or None where `base` does not know its own."""
-    asked, init_from = settings.data.validation, settings.train.init_from
-    most = HELD_OUT / len(split) if settings.data.name == UNLABELED else 1.0
-    fraction = min(VALIDATION, most) if asked is None else asked
-    rendered = {"data": "shapes"} if settings.data.name == "shapes" else {}
-    own = {"fraction": fraction, "seed": 0, "images": split.content_hash, **rendered}
-    if base is None:
-        return fraction, own
-    stored = base[1]["architecture"].get("validation")
-    known = stored.get("fraction") if isinstance(stored, dict) else None
-    if rendered and known is not None and "data" not in stored:  # it learned from other images than rendered ones
-        return fraction, own
-    if not isinstance(known, float) or own | {"fraction": known} != stored:
-        console.info("validation: %s does not say whether it learned from these images, too", init_from)
-        return fraction, None
-    fraction = known if asked is None else asked
-    if fraction > known:
-        console.info("validation: %s learned from part of it: it left out only data.validation=%s", init_from, known)
-    return fraction, own | {"fraction": min(fraction, known)}
+def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
+    """Return the data in the classes that the run's network has."""
+    if not data.labeled:
+        if not (initial and settings.train.distillation):
+            missing = "set train.init_from and train.distillation"
+            problem = f"data={settings.data.name}: a network keeps its answers on it"
+            raise InputError(f"{problem}: {missing}")
+        return replace(data, classes=initial.classes)
+    if initial and (data.rendered or initial.is_classifier):
+        return relabeled(data, initial.classes, f"data={settings.data.name}")
+    return data
 
 
 def build_trainer(
-    settings: ExperimentSettings, data: DataSet, folder: Path, base: Base, left_out: dict | None, threads: int | None
+    settings: ExperimentSettings,
+    data: DataSet,
+    folder: Path,
+    initial: Initial | None,
+    validation: ValidationPart,
+    threads: int | None,
 ) -> Trainer:
-    """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before.
+    """Build a run's network, optimizer and scene. Nothing is written.
 
-    left_out: the part that validates the network, stored with it. threads: None for those of `choose_threads`.
+    Args:
+        settings: The settings of the run.
+        data: The data, in the classes of the network.
+        folder: The folder of the run.
+        initial: The network that the run begins with, if any.
+        validation: The images that validate the network, whose record is stored with it.
+        threads: The number of threads; None for `choose_threads`.
+
+    Returns:
+        The trainer, ready for `Trainer.fit`.
+
+    Raises:
+        InputError: The network, the renders or the initial weights do not fit together.
     """
-    device, shape = choose_device(settings.train.device), settings.model.shape
-    foreign = bool(base and CLASSIFIER in base[1]["architecture"])
-    if base and foreign:
-        name = base[1]["architecture"]["name"]
-        if shape.get("name", name) != name:
-            raise InputError(f"model={shape['name']}: train.init_from={base[0]} has its own network: leave it out")
-        shape = {"name": name, CLASSIFIER: True}
+    device = choose_device(settings.train.device)
+    shape = _network_shape(settings, initial)
     images = data.train.images
-    mean, std = channel_statistics(images if isinstance(images, torch.Tensor) else data.train.sample(SAMPLED))
+    if not isinstance(images, Tensor):
+        images = data.train.sample(SAMPLED)
+    mean, std = channel_statistics(images)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
-    facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
-    if base:
-        start_from(network, facts, *base)
+    facts = {
+        "classes": list(data.classes),
+        "size": data.size,
+        "encoding": settings.renderer.encoding,
+        **shape,
+    }
+    if initial:
+        initial.copy_to(network, facts)
     if settings.train.freeze:
         freeze(without_normalization(network), settings.train.freeze)
-    model = MixedPrecision(network.to(device), choose_precision(settings.train.precision, device, network))
+    precision = choose_precision(settings.train.precision, device, network)
+    model = MixedPrecision(network.to(device), precision)
     torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
-    service = build_service(settings, data, device)
-    labeled, recipe = settings.data.name != UNLABELED, settings.train
+    recipe = settings.train
     if recipe.eval_mode is None:
-        recipe = replace(recipe, eval_mode=foreign)
-    return Trainer(recipe, model, describe(network, **facts, validation=left_out), service, folder, labeled)
+        recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
+    return Trainer(
+        recipe,
+        model,
+        describe(network, **facts, validation=validation.record),
+        build_service(settings, data, device),
+        folder,
+        data.labeled,
+    )
 
 
-def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
-    """The scene, its labels and the service that regenerates its renders; logs the rasterizer."""
-    scene, images, labels = None, None, torch.zeros(0, dtype=torch.int64, device=device)
-    phases, process = Phases(device), (utils.rank(), utils.world_size())
-    names = label_names(settings.label)
-    ranks = bool(settings.scene.hard_negatives) or len(names) > 1
-    studied = [class_index(data.classes, name, "label") for name in names if ranks or settings.augment.renders]
-    if settings.augment.renders and settings.augment.arm == "folder":
-        images, labels = (part.to(device) for part in load_renders(settings, data))
-        ranks = len(labels.unique()) > 1
-    elif settings.augment.renders:
-        objects = settings.objects
-        named = {item.label: key for key, item in objects.items() if item.label != OTHER}
-        numbers = {name: class_index(data.classes, name, f"label of {key}") for name, key in named.items()}
-        numbers[OTHER] = complementary_label(studied[0])  # the service and the loss know the others
-        rasterizer = chosen_rasterizer(settings.renderer)
-        console.info("rasterizer: %s", rasterizer.description)
-        options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
-        with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
-            options |= {"attack": settings.augment.attack, "vary": settings.augment.vary}
-            scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
-        labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
-    if len(studied) == len(data.classes) and (labels < 0).any():
-        raise InputError(f"label={settings.label} leaves no class of the network for other things: leave these out")
-    towards = studied if ranks else ()
-    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, towards, *process, images)
+def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
+    """Return what the run's network is built from: its settings, or the initial classifier's."""
+    shape = settings.model.shape
+    if initial is None or not initial.is_classifier:
+        return shape
+    if shape.get("name", initial.name) != initial.name:
+        problem = f"model={shape['name']}: train.init_from={initial.source} has its own network"
+        raise InputError(f"{problem}: leave it out")
+    return {"name": initial.name, CLASSIFIER: True}
 
 
-def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[torch.Tensor, torch.Tensor]:
-    """The images (N, 3, size, size) uint8 of the folder `augment.folder`, and their labels (N,) by the names of its
-    folders. InputError: as `find_photographs` and `load_photographs`, or no image of a class under study."""
-    folder, studied = Path(str(settings.augment.folder)), label_names(settings.label)
-    with keyed("augment.folder"):
-        found = find_photographs(folder, data.classes, studied)
-        found, images, _ = load_photographs(folder, found, data.size, advice="")
-        numbers = {name: index for index, name in enumerate(data.classes)}
-        foreign = complementary_label(numbers[studied[0]])
-        labels = torch.tensor([numbers.get(item.label, foreign) for item in found])
-        if missing := set(studied) - {item.label for item in found}:
-            raise InputError(f"{folder} holds no image of label={min(missing)}: add a folder of them")
-    return images, labels
+def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
+    """Say in words what the test accuracy is of.
 
+    Args:
+        settings: The settings of a run.
+        data: Its data, in the classes of its network.
 
-def _test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """What the test accuracy is of, in words."""
-    if settings.data.name == UNLABELED:
+    Returns:
+        The words, such as "the test images of cifar100".
+    """
+    if not data.labeled:
         return f"the answers of {settings.train.init_from} to held-out photographs"
-    kind = "rendered solids" if settings.data.name == "shapes" else f"the test images of {settings.data.name}"
-    others = len(data.classes) - len(data.train.labels.unique())  # the test's labels are looked at once, later
+    kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
+    # The labels of the test images are looked at once, later.
+    others = len(data.classes) - len(data.train.labels.unique())
     return f"{kind}, not of the network's {others} other classes" if others else kind
 
 
-def _initial_predictor(settings: ExperimentSettings, trainer: Trainer) -> Predict:
-    """The network begun with, whose logits are cached under a hash of weights and images, for all runs."""
-    model, device = cast(MixedPrecision, trainer.initial), trainer.device
-    is_foreign = settings.model.name.startswith(PYTHON)  # whose code may change unseen
-    cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
-    key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
-
-    def predict(images: torch.Tensor) -> torch.Tensor:
-        batch = checkpoint.content_hash([key, images])
-        if (stored := cache.read(batch)) is None:
-            stored = {"logits": model(images).cpu().contiguous()}
-            cache.write(batch, stored)
-        return stored["logits"]
-
-    return predict
-
-
-def _scores_before(
-    settings: ExperimentSettings, trainer: Trainer, data: DataSet, predict: Predict, answers: torch.Tensor
-) -> dict[str, float]:
-    """Score the network of train.init_from by its answers (N,) to the test set and, in the folder BEFORE, on the
-    photographs."""
-    accuracy = (answers == data.test.labels).float().mean().item()
-    if settings.data.name != UNLABELED:  # whose labels are these answers
-        images = _test_images(settings, data)
-        console.info("before: %s has accuracy %.4f on %s", settings.train.init_from, accuracy, images)
-    _score_photographs(settings, predict, data, trainer.folder / BEFORE, trainer.device)
-    return {"test/accuracy_before": accuracy}
-
-
-def _test_scores(trainer: Trainer, data: DataSet, images: str) -> dict[str, float]:
-    """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
-    test = data.test.to(trainer.device)
-    last = selected = evaluate(trainer.selected, test)["accuracy"]
-    best = checkpoint.load(trainer.folder / checkpoint.BEST)
-    if best["epoch"] != trainer.epoch:
-        trainer.selected.network.load_state_dict(best["model"])
-        selected = evaluate(trainer.selected, test)["accuracy"]
-    console.info("accuracy %.4f (epoch %d, selected), %.4f (the last) on %s", selected, best["epoch"], last, images)
-    return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
-
-
-def _score_photographs(
-    settings: ExperimentSettings, model: Model, data: DataSet, folder: Path, device: torch.device
-) -> dict[str, Any]:
-    """Score a model on each folder of photographs, in a sub-folder of its name; the summaries of the first process."""
-    label, skip = settings.label, settings.evaluate.skip_unreadable
-    return {
-        name: evaluate_photographs(model, data.classes, photographs, label, folder / name, data.size, skip, device)
-        for name, photographs in settings.evaluate.folders.items()
-        if utils.rank() == 0
-    }
+def _photograph_scores(name: str, summary: dict[str, Any]) -> dict[str, float]:
+    """Return the known metrics of a summary and of its classes, by name."""
+    parts = {name: summary}
+    for label, part in summary.get("by_label", {}).items():
+        parts[f"{name}/{label}"] = part
+    scores = {}
+    for key, part in parts.items():
+        for metric in ("top5", *METRICS):
+            value = find_metric(part, metric).get("value")
+            if value is not None:
+                scores[f"{key}/{metric}"] = value
+    return scores

@@ -22,11 +22,13 @@ from renderer.errors import InputError
 from renderer.io.files import write_whole
 from train import checkpoint, console
 from train.errors import one_sentence, writable_folder
+from train.initial import load_initial
+from train.load_data import load_data
 from train.report.compare import format_table
 from train.report.page import PAGE, report_of
 from train.report.summary import is_finished, summarize
 from train.results import require_new_run, require_replaceable
-from train.run import load_data, prepare
+from train.run import Run
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, quoted, read_settings
 
@@ -113,7 +115,12 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
             settings = read_settings(ExperimentSettings, config)
             settings.train.resume = checkpoint.exists(folder)
             command = given_command([*map(_unescaped, HydraConfig.get().overrides.task)])
-            prepare(settings, load_data(settings), folder, command)()
+            initial = load_initial(settings)
+            run = Run(settings, load_data(settings, initial), folder, initial, command)
+            run.load()
+            run.fit()
+            run.score()
+            run.export()
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()

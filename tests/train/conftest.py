@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from train.run import load_data, prepare
+from tests.runs import completed_run
 from train.run_folder import write_config
 from train.settings import ExperimentSettings, compose, read_settings
 
@@ -74,7 +74,7 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
     """The folder of a finished adversarial run, scored on photographs."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     settings = tiny(f"evaluate.photos={photos}")
-    prepare(settings, load_data(settings), folder)()
+    completed_run(settings, folder)
     return folder
 
 

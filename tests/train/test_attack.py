@@ -14,8 +14,8 @@ from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe
 from renderer.rasterizer import opengl
+from tests.runs import loaded_run
 from train.attack import AttackExperimentSettings, attacks, format_attack, overrides
-from train.run import load_data, prepare
 from train.settings import compose, read_settings
 
 CLASSES = ("orange", "lime", "sky")
@@ -86,7 +86,7 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
     settings = tiny("renderer.rasterizer=opengl")
     for command in (
         lambda: attacked("renderer.rasterizer=opengl"),
-        lambda: prepare(settings, load_data(settings), tmp_path),
+        lambda: loaded_run(settings, tmp_path),
     ):
         with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
             command()

@@ -12,8 +12,9 @@ from torchvision.models import get_model
 
 from augment.classifiers import load_classifier
 from renderer.errors import InputError
+from tests.runs import completed_run
+from train.load_data import load_data
 from train.networks import load_run
-from train.run import load_data, prepare
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings, compose, read_settings
 
@@ -58,7 +59,7 @@ def tuned(weights, photos, tmp_path_factory) -> Callable[..., tuple[Path, dict[s
         folder = tmp_path_factory.mktemp("runs") / "run"
         keys = [*KEYS, f"data={data}", f"data.path={photos}", f"weights={weights}", f"run={folder}", *overrides]
         settings = read_settings(ExperimentSettings, compose("train", keys))
-        return folder, prepare(settings, load_data(settings), folder)()
+        return folder, completed_run(settings, folder)
 
     return run
 

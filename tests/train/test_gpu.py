@@ -3,16 +3,16 @@
 import pytest
 import torch
 
+from tests.runs import completed_run
 from train import checkpoint
 from train.loop import Trainer
-from train.run import load_data, prepare
 from train.run_folder import read_metrics
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
 def weights_of(config, folder) -> dict[str, torch.Tensor]:
-    prepare(config, load_data(config), folder)()
+    completed_run(config, folder)
     return checkpoint.load(folder / checkpoint.LAST)["model"]
 
 

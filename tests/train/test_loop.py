@@ -219,18 +219,21 @@ def test_the_moving_average_follows_the_steps_and_is_validated_and_kept(tmp_path
 def test_a_soup_is_the_mean_of_epochs_that_each_begin_anew(tmp_path, monkeypatch, ema_decay):
     trainer = make_trainer(tmp_path, soup=True, ema_decay=ema_decay, schedule="one_cycle")
     begun, ends, rates = [], [], []
-    regenerate, update = trainer._regenerate, trainer.soup.update_parameters
+    regenerate = trainer._regenerate
 
     def regenerated(*rest):
         begun.append(copy.deepcopy(trainer.model.state_dict()))
         return regenerate(*rest)
 
-    def updated(model):
-        ends.append(copy.deepcopy(model.state_dict()))
-        update(model)
+    end_epoch = trainer.averages.end_epoch
+
+    def updated():
+        averaged = trainer.averages._ema.module if ema_decay else trainer.model
+        ends.append(copy.deepcopy(averaged.state_dict()))
+        end_epoch()
 
     monkeypatch.setattr(trainer, "_regenerate", regenerated)
-    monkeypatch.setattr(trainer.soup, "update_parameters", updated)
+    monkeypatch.setattr(trainer.averages, "end_epoch", updated)
     trainer.optimizer.register_step_post_hook(lambda *rest: rates.append(trainer.optimizer.param_groups[0]["lr"]))
     initial = copy.deepcopy(trainer.model.state_dict())
     fit_noise(trainer)

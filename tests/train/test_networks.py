@@ -10,8 +10,8 @@ from torchvision.models import resnet18
 
 from augment.classifiers import load_classifier
 from renderer.errors import InputError
-from train import networks
 from train.checkpoint import BEST, save
+from train.initial import Initial
 from train.networks import PUBLISHED, Dropout, WideResNet, build_network, describe, load_run, load_selected, publish
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
@@ -53,6 +53,12 @@ def network() -> WideResNet:
 def description_of(network: nn.Module, **changes) -> dict:
     shape = {"size": 48, "encoding": "linear", "depth": 10, "width": 1, "dropout": 0.0} | changes
     return describe(network, CLASSES, **shape)
+
+
+def initial_of(path: Path) -> Initial:
+    """The network of a file, for a run to begin with."""
+    source, state = load_selected(path)
+    return Initial(source, state["architecture"], state["model"])
 
 
 def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
@@ -202,7 +208,7 @@ def test_other_networks_come_back_from_their_file_code_only_where_it_is_named(tm
     assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    networks.start_from(fresh, {"classes": [*CLASSES], "size": 16, "name": name}, *load_selected(tmp_path / BEST))
+    initial_of(tmp_path / BEST).copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})
     assert torch.equal(fresh.eval()(images), network(images))
     if name.startswith("python:"):
         with pytest.raises(InputError, match=f"give model={name} to run that code"):
@@ -223,7 +229,7 @@ def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
 
 def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
     fresh = WideResNet(3, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
-    networks.start_from(fresh, description_of(fresh, dropout=0.3), *load_selected(write(tmp_path, network)))
+    initial_of(write(tmp_path, network)).copy_to(fresh, description_of(fresh, dropout=0.3))
     images = torch.rand(3, 3, 32, 32)
     assert torch.equal(fresh.eval()(images), network(images))
 
@@ -232,9 +238,10 @@ def test_a_network_starts_with_the_weights_and_the_normalization_of_another(netw
     "change, fault", [({"classes": ["pear", "apple", "orange"]}, "other classes"), ({"depth": 16}, "depth 10, not 16")]
 )
 def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, change, fault):
-    base = load_selected(write(tmp_path, network))
-    with pytest.raises(InputError, match=f"train.init_from={base[0]} was trained with {fault}: give this run the same"):
-        networks.start_from(network, {**description_of(network), **change}, *base)
+    initial = initial_of(write(tmp_path, network))
+    sentence = f"train.init_from={initial.source} was trained with {fault}: give this run the same"
+    with pytest.raises(InputError, match=sentence):
+        initial.copy_to(network, {**description_of(network), **change})
 
 
 def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_takes_to_use_it(network, tmp_path):
@@ -252,12 +259,12 @@ def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_take
 
 def test_a_published_network_is_found_from_any_folder_unless_that_has_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = [networks.load_run(name).name for name in ("pretrained/none", "pretrained/none/model.safetensors")]
+    names = [load_run(name).name for name in ("pretrained/none", "pretrained/none/model.safetensors")]
     assert names == ["run:pretrained/none", "run:pretrained/none/model.safetensors"]
-    assert networks.load_run("pretrained/best").operating_points[0].false_positive_rate == 0.05
+    assert load_run("pretrained/best").operating_points[0].false_positive_rate == 0.05
     (tmp_path / "pretrained" / "none").mkdir(parents=True)
     with pytest.raises(InputError, match=r"run=pretrained/none holds neither best\.pt nor model\.safetensors"):
-        networks.load_run("pretrained/none")
+        load_run("pretrained/none")
 
 
 @pytest.mark.parametrize("arm", ["none", "random", "adversarial"])

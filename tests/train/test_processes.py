@@ -17,9 +17,9 @@ from PIL import Image
 
 from augment import AugmentationService, AugmentationSettings, utils
 from augment.scene import Scene
+from tests.runs import completed_run
 from train import checkpoint, loop
 from train.processes import Interrupted, Interruption, process_group
-from train.run import load_data, prepare
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings, read_settings
 
@@ -46,7 +46,7 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
 
 def run_from_file(config: Path, folder: Path) -> None:
     settings = read_settings(ExperimentSettings, OmegaConf.load(config))
-    prepare(settings, load_data(settings), folder)()
+    completed_run(settings, folder)
 
 
 def random_arm(file: Path) -> None:

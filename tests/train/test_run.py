@@ -19,20 +19,18 @@ from augment.build import build_scene
 from augment.losses import complementary_label
 from renderer.errors import InputError
 from renderer.image import to_bytes
-from train import batches, checkpoint, loop, run
+from tests.runs import completed_run, finish, loaded_run
+from train import batches, checkpoint, loop
 from train.errors import one_sentence
-from train.networks import load_run, load_selected
+from train.initial import choose_validation, load_initial
+from train.load_data import load_data
+from train.networks import load_run
 from train.processes import Interrupted
 from train.report.compare import format_table
 from train.report.page import write_report
 from train.report.summary import summarize
-from train.run import load_data, prepare
+from train.run import describe_test_images
 from train.run_folder import read_metrics
-from train.settings import ExperimentSettings
-
-
-def train(settings: ExperimentSettings, folder: Path) -> dict[str, float]:
-    return prepare(settings, load_data(settings), folder)()
 
 
 def weights(folder: Path) -> list[str]:
@@ -61,7 +59,7 @@ def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -
 def train_with_signal(settings, folder: Path, round_number: int, step: int, number: signal.Signals) -> None:
     with pytest.MonkeyPatch.context() as patch:
         act_at(patch, round_number, step, lambda: signal.raise_signal(number))
-        train(settings, folder)
+        completed_run(settings, folder)
 
 
 @pytest.fixture
@@ -83,7 +81,7 @@ def test_the_training_set_lies_in_memory_once(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(batches, "CHUNK_BYTES", 1)
     act_at(monkeypatch, 0, 2, lambda: after.append(large()))
     before = large()
-    prepare(tiny("augment=none", "train.epochs=1"), data, tmp_path)()
+    completed_run(tiny("augment=none", "train.epochs=1"), tmp_path, data)
     assert after == [before] and data.train.images.data_ptr() in before
 
 
@@ -91,10 +89,10 @@ def test_more_epochs_stretch_the_schedule_and_a_jump_of_its_rate_is_said(tiny, t
     """One cycle's rate ends at zero; half way through, it is .5 / .8 of the highest."""
     keys = "augment=none", "train.schedule=one_cycle", "train.resume=true"
     data = load_data(tiny())
-    prepare(tiny(*keys, "train.epochs=1"), data, tmp_path)()
-    prepare(tiny(*keys, "train.epochs=1"), data, tmp_path)
+    completed_run(tiny(*keys, "train.epochs=1"), tmp_path, data)
+    loaded_run(tiny(*keys, "train.epochs=1"), tmp_path, data)
     assert not any(record.levelname == "WARNING" for record in caplog.records)
-    prepare(tiny(*keys, "train.epochs=2"), data, tmp_path)
+    loaded_run(tiny(*keys, "train.epochs=2"), tmp_path, data)
     (message,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
     assert message.endswith(f" {0.05 * 0.5 / 0.8:.3g}, not 0")
 
@@ -109,7 +107,7 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
     renders (2, 2 and 1 steps); with lights that continue from round to round, dropout, and a teacher's predictions."""
     rounds = ("train.epochs=2", "augment.every=16", "train.images_per_epoch=40", "train.resume=true")
     settings = tiny(*rounds, f"train.init_from={finished}", "train.distillation=2", average)
-    train(settings, tmp_path / "whole")
+    completed_run(settings, tmp_path / "whole")
     folder = tmp_path / "stopped"
     handlers = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
     for round_number, step, done in [(1, 2, (0, 4)), (2, 1, (1, None)), (4, 1, (1, 3))]:
@@ -120,7 +118,7 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
         state = checkpoint.load(folder / checkpoint.LAST)
         assert (state["epoch"], state["under_way"] and state["under_way"]["step"]) == done
     torch.manual_seed(17)
-    train(settings, folder)
+    completed_run(settings, folder)
     assert weights(folder) == weights(tmp_path / "whole") and metrics(folder) == metrics(tmp_path / "whole")
     images = [(path / "renders" / "epoch_002.png").read_bytes() for path in (folder, tmp_path / "whole")]
     assert images[0] == images[1]
@@ -147,14 +145,14 @@ def test_a_batch_systems_signal_writes_a_checkpoint_before_its_own_handler_acts(
 def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
     act_at(monkeypatch, 0, 1, lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     with pytest.raises(KeyboardInterrupt):
-        train(tiny("augment=none"), tmp_path)
+        completed_run(tiny("augment=none"), tmp_path)
     assert not checkpoint.exists(tmp_path)
 
 
 def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp_path):
-    train(tiny("augment=none", "train.epochs=1"), tmp_path)
+    completed_run(tiny("augment=none", "train.epochs=1"), tmp_path)
     before = metrics(tmp_path), (tmp_path / checkpoint.LAST).read_bytes()
-    train(tiny("augment=none", "train.epochs=1", "train.resume=true"), tmp_path)
+    completed_run(tiny("augment=none", "train.epochs=1", "train.resume=true"), tmp_path)
     assert (metrics(tmp_path), (tmp_path / checkpoint.LAST).read_bytes()) == before
 
 
@@ -165,7 +163,7 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
         (tiny("train.resume=true", "seed=8"), "was made with seed=7, not 8"),
     ]:
         with pytest.raises(InputError, match=message):
-            prepare(settings, load_data(settings), finished)
+            loaded_run(settings, finished)
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 
@@ -175,9 +173,9 @@ def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(ti
         for chosen, asked in [(2, "null"), (1, "null"), (1, "3")]:
             monkeypatch.setattr("train.run.choose_threads", Mock(return_value=chosen))
             settings = tiny("augment=none", "train.epochs=1", f"train.threads={asked}", "train.resume=true")
-            train_and_score = prepare(settings, load_data(settings), tmp_path)
+            run = loaded_run(settings, tmp_path)
             torch.set_num_threads(before)  # as another arm's may be
-            train_and_score()
+            finish(run)
             counts.append((torch.get_num_threads(), OmegaConf.load(tmp_path / "config.yaml").hardware.threads))
     finally:
         torch.set_num_threads(before)
@@ -198,9 +196,9 @@ def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(tiny,
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(writer, Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
         with pytest.raises(OSError) as full:
-            train(settings, tmp_path)
+            completed_run(settings, tmp_path)
     assert one_sentence(full.value).endswith(" cannot be written (No space left on device): make room and start again")
-    train(settings, tmp_path)
+    completed_run(settings, tmp_path)
     assert len(read_metrics(tmp_path)) == 2
 
 
@@ -208,7 +206,7 @@ def test_no_examples_and_no_augmentation_train_the_same_weights(tiny, tmp_path):
     """So the arms differ in their renders alone: nothing else draws from the training's random streams."""
     arms = {"none": ["augment=none"], "empty": ["augment.examples=0"], "renders": []}
     for name, overrides in arms.items():
-        train(tiny("train.epochs=1", *overrides), tmp_path / name)
+        completed_run(tiny("train.epochs=1", *overrides), tmp_path / name)
     assert weights(tmp_path / "empty") == weights(tmp_path / "none") != weights(tmp_path / "renders")
     assert not (tmp_path / "none" / "renders").exists()
 
@@ -236,7 +234,7 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     tiny, tmp_path, regenerated, overrides, rounds, expected
 ):
     """A hard negative that names no class has the complementary label. Of each mesh, 2 views × 2 backgrounds."""
-    train(tiny("train.epochs=1", *overrides), tmp_path)
+    completed_run(tiny("train.epochs=1", *overrides), tmp_path)
     assert len(regenerated) == rounds
     for renders in regenerated:
         assert renders.labels.tolist() == [label for label in expected for _ in range(4)]
@@ -254,7 +252,7 @@ def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(tiny
     for number, (name, image) in enumerate(zip(scene.labels, images, strict=True)):
         (tmp_path / "photos" / name).mkdir(parents=True, exist_ok=True)
         Image.fromarray(to_bytes(image).permute(1, 2, 0).numpy()).save(tmp_path / "photos" / name / f"{number}.png")
-    train(tiny("augment=none", "train.epochs=1"), tmp_path / "base")
+    completed_run(tiny("augment=none", "train.epochs=1"), tmp_path / "base")
     keys = [f"train.init_from={tmp_path / 'base'}", f"evaluate.photos={tmp_path / 'photos'}", "train.resume=true"]
     keys += ["label=[apple,pear]", "scene.meshes=['solid:apple','solid:pear']", "train.ranking=1", "train.epochs=6"]
     settings, folder = (
@@ -263,7 +261,7 @@ def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(tiny
     )
     with pytest.raises(Interrupted):
         train_with_signal(settings, folder, 0, 2, signal.SIGTERM)
-    scores, names = train(settings, folder), ["random", "random, label=apple", "random, label=pear"]
+    scores, names = completed_run(settings, folder), ["random", "random, label=apple", "random, label=pear"]
     before = json.loads((folder / "before" / "photographs" / "summary.json").read_text())["by_label"]
     for label, part in before.items():
         assert scores[f"photographs/{label}/recall"] > 0.4 > 0.1 > part["recall"]["value"]
@@ -306,7 +304,7 @@ def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(fi
 
 def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(tiny, photos, tmp_path):
     named = f"evaluate.photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
-    scores = train(tiny("augment=none", "train.epochs=1", named), tmp_path / "run")
+    scores = completed_run(tiny("augment=none", "train.epochs=1", named), tmp_path / "run")
     assert scores == read_metrics(tmp_path / "run")[-1]
     for name in ("lab", "wild-1"):
         summary = json.loads((tmp_path / "run" / name / "summary.json").read_text())
@@ -320,13 +318,14 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
 
     class GuardedData:
         classes, train, size = data.classes, data.train, data.size
+        labeled, rendered = True, False
 
         @property
         def test(self):
             looks.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
             return data.test
 
-    prepare(tiny("augment=none"), GuardedData(), tmp_path)()
+    completed_run(tiny("augment=none"), tmp_path, GuardedData())
     assert looks == [3]
     *epochs, scores = read_metrics(tmp_path)
     accuracies = [line["validation/accuracy"] for line in epochs]
@@ -356,7 +355,7 @@ def test_a_folders_images_train_in_place_of_renders_and_a_resumed_run_shows_thos
         "train.epochs=6",
     ]
     settings = tiny("augment=folder", *keys, "train.epochs=2", "augment.every=27", "augment.examples=4")
-    train(settings, tmp_path / "whole")
+    completed_run(settings, tmp_path / "whole")
     shown, rounds = [], list(regenerated)
     for part in rounds:
         shown += [image.permute(1, 2, 0).numpy().tobytes() for image in part.images]
@@ -364,14 +363,14 @@ def test_a_folders_images_train_in_place_of_renders_and_a_resumed_run_shows_thos
     assert len(rounds) == 4 and len(set(shown[:9])) == 9
     with pytest.raises(Interrupted):
         train_with_signal(settings, tmp_path / "stopped", 3, 1, signal.SIGTERM)
-    train(settings, tmp_path / "stopped")
+    completed_run(settings, tmp_path / "stopped")
     assert weights(tmp_path / "stopped") == weights(tmp_path / "whole")
     (tmp_path / "lab" / "apple" / "0.png").unlink()
     with pytest.raises(InputError, match=r"lab has changed since .*stopped began"):
-        train(settings, tmp_path / "stopped")
+        completed_run(settings, tmp_path / "stopped")
     (tmp_path / "lab" / "orange").rename(tmp_path / "lab" / "pear")
     with pytest.raises(InputError, match=r"^augment.folder: .*lab holds no image of label=orange"):
-        train(settings, tmp_path / "new")
+        completed_run(settings, tmp_path / "new")
 
 
 def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(tiny, finished, tmp_path, caplog):
@@ -381,7 +380,7 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
     unknown = tmp_path / "unknown.pt"
     checkpoint.save(unknown, stored | {"architecture": {**stored["architecture"], "validation": None}})
     keys = "augment=none", "train.epochs=1"
-    train(tiny(*keys, "data.validation=0.05"), tmp_path / "base")
+    completed_run(tiny(*keys, "data.validation=0.05"), tmp_path / "base")
     for name, init, asked, images, left_out, warned in [
         ("as its base", tmp_path / "base", "null", 3, 0.05, False),
         ("less", finished, "0.05", 3, 0.05, False),
@@ -389,7 +388,7 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
         ("unknown", unknown, "null", 6, None, True),
     ]:
         caplog.clear()
-        train(tiny(*keys, f"train.init_from={init}", f"data.validation={asked}"), tmp_path / name)
+        completed_run(tiny(*keys, f"train.init_from={init}", f"data.validation={asked}"), tmp_path / name)
         state = checkpoint.load(tmp_path / name / checkpoint.BEST)["architecture"]["validation"]
         assert (state and state["fraction"]) == left_out
         assert f"{60 - images} images, 3 classes" in caplog.text
@@ -398,25 +397,24 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
 
 
 def test_rendered_solids_are_new_to_a_network_of_other_images_alone(tiny, finished):
-    settings, base, split = tiny(f"train.init_from={finished}"), load_selected(finished), load_data(tiny()).train
-    settings.data.name = "shapes"
-    _, own = run._validation(settings, split, base)
-    base[1]["architecture"]["validation"] = own
-    assert (
-        own
-        and run._validation(settings, split, base)[1] == own
-        and run._validation(settings, split[:9], base)[1] is None
-    )
+    settings = tiny(f"train.init_from={finished}")
+    initial = load_initial(settings)
+    data = replace(load_data(settings), rendered=True)
+    own = choose_validation(settings, data, initial).record
+    initial.architecture["validation"] = own
+    fewer = replace(data, train=data.train[:9])
+    assert own and choose_validation(settings, data, initial).record == own
+    assert choose_validation(settings, fewer, initial).record is None
 
 
 def test_the_test_accuracy_says_how_many_classes_it_leaves_out(tiny):
     data = load_data(tiny())
-    assert " 2 " in run._test_images(tiny(), replace(data, classes=(*data.classes, "worm", "tulip")))
+    assert " 2 " in describe_test_images(tiny(), replace(data, classes=(*data.classes, "worm", "tulip")))
 
 
 def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, photos, tmp_path):
     keys = "train.epochs=1", "augment=none", f"train.init_from={finished}", f"evaluate.photos={photos}"
-    scores = train(tiny(*keys), tmp_path)
+    scores = completed_run(tiny(*keys), tmp_path)
     assert scores["test/accuracy_before"] == pytest.approx(read_metrics(finished)[-1]["test/accuracy"])
     for file in ("predictions.csv", "summary.json"):
         base, before = (folder / "photographs" / file for folder in (finished, tmp_path / "before"))
@@ -425,7 +423,7 @@ def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, pho
 
 
 def test_statistics_are_those_of_the_network_begun_with_after_training_in_eval_mode(tiny, finished, tmp_path):
-    train(tiny("train.epochs=1", f"train.init_from={finished}", "train.eval_mode=true"), tmp_path)
+    completed_run(tiny("train.epochs=1", f"train.init_from={finished}", "train.eval_mode=true"), tmp_path)
     begun, trained = (checkpoint.load(folder / checkpoint.BEST)["model"] for folder in (finished, tmp_path))
     for name, value in trained.items():
         is_statistic = name.rpartition(".")[2] in ("running_mean", "running_var", "num_batches_tracked", "mean", "std")
@@ -435,7 +433,7 @@ def test_statistics_are_those_of_the_network_begun_with_after_training_in_eval_m
 def test_a_run_killed_within_its_first_epoch_goes_on_within_it_and_ends_the_same(tiny, tmp_path, monkeypatch):
     """A checkpoint after each step stands for one each minute; KeyboardInterrupt, which saves nothing, for the kill."""
     settings = tiny("train.epochs=2", "train.resume=true")
-    train(settings, tmp_path / "whole")
+    completed_run(settings, tmp_path / "whole")
     with monkeypatch.context() as patch:
         patch.setattr(loop, "SAVING_EVERY", 0.0)
         patch.setattr(loop, "SAVING_SHARE", 1e9)
@@ -445,10 +443,10 @@ def test_a_run_killed_within_its_first_epoch_goes_on_within_it_and_ends_the_same
 
         act_at(patch, 0, 4, kill)
         with pytest.raises(KeyboardInterrupt):
-            train(settings, tmp_path / "killed")
+            completed_run(settings, tmp_path / "killed")
     state = checkpoint.load(tmp_path / "killed" / checkpoint.LAST)
     assert (state["epoch"], state["under_way"]["step"]) == (0, 3)
-    train(settings, tmp_path / "killed")
+    completed_run(settings, tmp_path / "killed")
     assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
     assert metrics(tmp_path / "killed") == metrics(tmp_path / "whole")
 
@@ -470,7 +468,7 @@ def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, ti
 
     monkeypatch.setattr(checkpoint, "save", slow_save)
     monkeypatch.setattr(loop.Interruption, "requested", slow_step)
-    train(tiny("augment=none", "train.epochs=1", "train.batch_size=1", "train.accumulate=1"), tmp_path)
+    completed_run(tiny("augment=none", "train.epochs=1", "train.batch_size=1", "train.accumulate=1"), tmp_path)
     *within, _, _ = saved  # the last two are best.pt and last.pt at the end
     assert len(within) >= 3 and within[0] <= 75
     assert all(later - earlier >= 150 for earlier, later in pairwise(within))
@@ -486,11 +484,11 @@ def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, ti
 )
 def test_a_missing_or_foreign_best_network_stops_a_resumed_run_before_it_trains(tiny, finished, tmp_path, spoil):
     """The other run differs in its seed alone."""
-    train(tiny("augment=none", "train.epochs=1", "seed=8"), tmp_path / "other")
-    train(tiny("augment=none", "train.epochs=1"), tmp_path / "run")
+    completed_run(tiny("augment=none", "train.epochs=1", "seed=8"), tmp_path / "other")
+    completed_run(tiny("augment=none", "train.epochs=1"), tmp_path / "run")
     spoil(tmp_path / "run" / "best.pt", tmp_path / "other")
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")}
     settings = tiny("augment=none", "train.epochs=2", "train.resume=true")
     with pytest.raises(InputError, match=r"best\.pt is not the network that this run kept"):
-        prepare(settings, load_data(settings), tmp_path / "run")
+        loaded_run(settings, tmp_path / "run")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "run").rglob("*")} == before

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
+from tests.runs import loaded_run
 from train.attack import AttackExperimentSettings
 from train.batches import rounds_of_epoch
-from train.run import load_data, prepare
 from train.settings import OTHER, ExperimentSettings, as_override, compose, dotted, quoted, read_settings
 
 
@@ -155,7 +155,7 @@ BOTH = ["label=[orange,pear]", "scene.meshes=['solid:orange','solid:pear']", "au
 def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, overrides, message):
     with pytest.raises(InputError, match=re.escape(message)) as refusal:
         settings = tiny(*overrides)
-        prepare(settings, load_data(settings), tmp_path / "run")
+        loaded_run(settings, tmp_path / "run")
     assert "\n" not in str(refusal.value) and not (tmp_path / "run").exists()
 
 

@@ -158,18 +158,18 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
 def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_other(
     run_sweep, folder_of, tmp_path, monkeypatch, capsys
 ):
-    prepare = sweep.prepare
+    fit = sweep.Run.fit
 
-    def broken(settings, *rest):
-        if settings.train.learning_rate == 0.5:
+    def broken(run):
+        if run.settings.train.learning_rate == 0.5:
             raise ZeroDivisionError("a mistake of the program")
-        return prepare(settings, *rest)
+        fit(run)
 
     rates = ("-1", "0.05", "0.5")
     overrides = ["train.epochs=1", f"train.learning_rate={','.join(rates)}"]
     wrong, right, unlucky = (folder_of(tmp_path, overrides[0], f"train.learning_rate={rate}") for rate in rates)
     with monkeypatch.context() as patch:
-        patch.setattr(sweep, "prepare", broken)
+        patch.setattr(sweep.Run, "fit", broken)
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
     assert "1 of 3 runs are finished\n" in printed

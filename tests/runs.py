@@ -1,0 +1,32 @@
+"""How tests make training runs: by the steps that `python -m train` takes."""
+
+from pathlib import Path
+
+from train.data import DataSet
+from train.initial import load_initial
+from train.load_data import load_data
+from train.run import Run
+from train.settings import ExperimentSettings
+
+
+def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:
+    """Make a run and load it. Without data, the settings name them."""
+    initial = load_initial(settings)
+    run = Run(settings, data or load_data(settings, initial), folder, initial)
+    run.load()
+    return run
+
+
+def finish(run: Run) -> dict[str, float]:
+    """Train and score a run that was loaded; return its scores."""
+    run.fit()
+    scores = run.score()
+    run.export()
+    return scores
+
+
+def completed_run(
+    settings: ExperimentSettings, folder: Path, data: DataSet | None = None
+) -> dict[str, float]:
+    """Make, train and score a run; return its scores."""
+    return finish(loaded_run(settings, folder, data))
