@@ -126,7 +126,7 @@ def load_cifar100(path: str) -> DataSet:
         Split(torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous(), torch.tensor(part.targets))
         for part in (train, test)
     ]
-    return DataSet(tuple(train.classes), *splits)
+    return DataSet(tuple(train.classes), splits[0], splits[1])
 
 
 def load_npz(path: str) -> DataSet:
@@ -147,7 +147,7 @@ def load_npz(path: str) -> DataSet:
             raise ValueError("train_images and test_images differ in size")
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a damaged or foreign file
         raise InputError(f"data.path={path} is not an .npz file of labeled images: {in_one_line(error)}") from error
-    return DataSet(tuple(classes.tolist()), *splits)
+    return DataSet(tuple(classes.tolist()), splits[0], splits[1])
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:

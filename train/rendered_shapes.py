@@ -41,7 +41,7 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
             cache.write(key, cached)
         console.info("%s images: %d", part, len(cached["images"]))
         splits.append(Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(count)))
-    return DataSet(CLASSES, *splits, rendered=True)
+    return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
