@@ -6,7 +6,7 @@ and so does a checkpoint. Checkpoints are also written within an epoch that take
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import closing
 from copy import deepcopy
 from dataclasses import dataclass
@@ -269,7 +269,7 @@ class Trainer:
 
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
-    ) -> Iterator[Batch]:
+    ) -> Generator[Batch, None, None]:
         """Give the batches that are left of an epoch, and render before each further round."""
         current = len(state.diagnostics) - 1
         for index in range(current, len(plan.rounds)):
