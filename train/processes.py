@@ -15,19 +15,24 @@ from torch.nn.parallel import DistributedDataParallel
 
 from augment import utils
 
-BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)  # submitit's, before a job's time is over; Windows has none
+# submitit sends this signal before the time of a job is over. Windows does not have it.
+BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)
 SIGNALS = tuple(filter(None, (signal.SIGTERM, signal.SIGINT, BATCH_SYSTEM)))
 
 
 @contextmanager
 def process_group() -> Iterator[None]:
-    """Join the processes that torchrun started; a run by itself has none to join."""
+    """Join the processes that torchrun started while the block runs.
+
+    A run by itself has none to join.
+    """
     if int(os.environ.get("WORLD_SIZE", 1)) == 1:
         yield
         return
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+    dist.init_process_group(backend)
     try:
         yield
     finally:
@@ -36,7 +41,7 @@ def process_group() -> Iterator[None]:
 
 @contextmanager
 def first_process_first() -> Iterator[None]:
-    """Let the first process do alone what the others then find done, such as a download."""
+    """Let the first process run the block before the others, which then find a download done."""
     if utils.rank() > 0:
         dist.barrier()
     yield
@@ -45,7 +50,14 @@ def first_process_first() -> Iterator[None]:
 
 
 def broadcast(value: str) -> str:
-    """The first process's value, which the others wait for."""
+    """Return the value of the first process, for which the others wait.
+
+    Args:
+        value: The value of this process.
+
+    Returns:
+        The value of the first process.
+    """
     values = [value]
     if utils.world_size() > 1:
         dist.broadcast_object_list(values, src=0)
@@ -53,26 +65,46 @@ def broadcast(value: str) -> str:
 
 
 def summed(values: Tensor) -> Tensor:
-    """The sum over all processes, in place."""
+    """Add up values over all processes, in place.
+
+    Args:
+        values: The values of this process, of any shape.
+
+    Returns:
+        The same tensor.
+    """
     if utils.world_size() > 1:
         dist.all_reduce(values)
     return values
 
 
 def replicated(model: nn.Module) -> nn.Module:
-    """The model whose gradients are averaged over all processes; itself where there is but one.
+    """Wrap a model so that its gradients are averaged over all processes.
 
-    Batch normalization takes its statistics over the whole batch on GPUs, over each process's part on CPUs.
+    Batch normalization takes its statistics over the whole batch on GPUs, and over each process's
+    part of it on CPUs.
+
+    Args:
+        model: The model, whose layers of batch normalization may be replaced.
+
+    Returns:
+        The wrapped model, or the model itself if there is one process.
     """
     if utils.world_size() == 1:
         return model
     if next(model.parameters()).is_cuda:
-        nn.SyncBatchNorm.convert_sync_batchnorm(model)  # replaces the norms inside
+        nn.SyncBatchNorm.convert_sync_batchnorm(model)
     return DistributedDataParallel(model)
 
 
 class Interrupted(SystemExit):
-    """A run ended early by a signal, with its checkpoint written; its exit status is the shell's: 128 + number."""
+    """A signal ended a run early, after its checkpoint was written.
+
+    The exit status is the one that a shell gives: 128 plus the number of the signal.
+
+    Args:
+        number: The number of the signal.
+    """
 
     def __init__(self, number: int):
         super().__init__(128 + number)
@@ -80,18 +112,25 @@ class Interrupted(SystemExit):
 
 
 class Interruption:
-    """Notes the first of `SIGNALS` while it is entered, in the main thread, which alone gets them; a second one acts as
-    it would without, as does the first where nobody asks for it. Those that the process was to ignore stay ignored."""
+    """Notes the first of `SIGNALS` while its block runs.
+
+    A second signal acts as it would without the block. So does the first one if nobody asks for
+    it before the block ends. Signals that the process ignored before stay ignored. Only the main
+    thread gets signals.
+    """
 
     def __init__(self) -> None:
         self._number: int | None = None
-        self._asked: tuple[dist.Work, Tensor] | None = None  # what all processes noted by the last question
-        self._handlers: dict[int, Any] = {}  # before it was entered
+        # What all processes had noted when they were asked the last time.
+        self._asked: tuple[dist.Work, Tensor] | None = None
+        # The handlers before the block.
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():
-            heeded = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-            self._handlers = {number: signal.signal(number, self._note) for number in heeded}
+            for number in SIGNALS:
+                if signal.getsignal(number) != signal.SIG_IGN:
+                    self._handlers[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
@@ -100,26 +139,41 @@ class Interruption:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:
-        """Whether to stop now, since any process of the run got a signal before it was asked: or, of several processes,
-        which tell each other meanwhile and do not wait, before it was asked the last time."""
+        """Say whether to stop now, since a process of the run got a signal.
+
+        Several processes tell each other without waiting. They hear of a signal that came before
+        they were asked the last time.
+        """
+        has_signal = self._number is not None
         if utils.world_size() == 1:
-            return self._number is not None
-        asked, noted = self._asked, torch.tensor(float(self._number is not None))  # on the CPU: no device catches up
+            return has_signal
+        before = self._asked
+        # The tensor is on the CPU, so that no GPU has to catch up.
+        noted = torch.tensor(float(has_signal))
         self._asked = dist.all_reduce(noted, async_op=True), noted
-        return asked is not None and asked[0].wait() and bool(asked[1])
+        if before is None:
+            return False
+        work, noted_before = before
+        return work.wait() and bool(noted_before)
 
     def stop(self) -> None:
-        """Raise `Interrupted`, after a batch system's own handler, which may queue the job again and exit."""
-        number = self._number or signal.SIGTERM  # the signal may have reached another process alone
+        """Raise `Interrupted`.
+
+        A batch system's own handler is called before. It may queue the job again and exit.
+        """
+        # The signal may have reached only another process.
+        number = self._number or signal.SIGTERM
         if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
             signal.raise_signal(number)
         raise Interrupted(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
+        """Note a signal, and let the next one act as it would without the block."""
         self._number = number
         self._restore()
 
     def _restore(self) -> None:
+        """Put the handlers back that were there before the block."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers = {}

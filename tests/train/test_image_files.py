@@ -8,7 +8,7 @@ from PIL import Image
 from renderer.errors import InputError
 from train.batches import Round, TrainingImages, training_batches
 from train.data import Split, load_folder, load_unlabeled
-from train.image_files import LEAST, ImageFiles
+from train.image_files import MINIMUM_AREA, ImageFiles
 from train.photographs.folder import find_unlabeled, load_photographs
 
 SIZE = 72
@@ -51,7 +51,7 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     places = crops[:, :2].float() / 255
     spans = [(places[:, 0, 36, -1] - places[:, 0, 36, 0]), places[:, 1, -1, 36] - places[:, 1, 0, 36]]
     areas = (spans[0] * spans[1]).abs()
-    assert LEAST - 0.04 < areas.min() < 0.45 and 0.9 < areas.max() <= 1
+    assert MINIMUM_AREA - 0.04 < areas.min() < 0.45 and 0.9 < areas.max() <= 1
     assert 70 < (spans[0] < 0).sum() < 130 and (spans[1] > 0).all()  # half are flipped, none is upside down
 
 
