@@ -12,7 +12,7 @@ import augment
 import renderer
 from augment.build import load_backgrounds
 from augment.objects import SceneObject
-from augment.scene import Conditions, Scene
+from augment.scene import Scene
 from augment.utils import generator, progress
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
@@ -27,25 +27,56 @@ from train.data import DataSet, Split
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
-VIEWS, BACKGROUNDS = 5, 4  # images per instance: every view on every background, each in a light of its own
-CODE = source_key(*(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__)))
+# An instance of a solid is shown from each view before each background, every time in a light of
+# its own.
+VIEWS = 5
+BACKGROUNDS = 4
+# A hash of the code that renders, since other code may render other images.
+CODE = source_key(
+    *(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__))
+)
 
 
-def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
-    """That many training and test images of every solid, in even light; whole instances (20 images) each."""
-    cache, settings, splits = cache or TensorCache(), replace(SETTINGS, size=size), []
+def load_shapes(
+    train: int, test: int, size: int, seed: int, cache: TensorCache | None = None
+) -> DataSet:
+    """Render images of every solid in even light, or read them from a cache.
+
+    Args:
+        train: The number of training images of each class. An instance of a solid has 20.
+        test: The number of test images of each class.
+        size: The pixels per side.
+        seed: The seed of shapes, views and lights.
+        cache: Where the images are kept; None renders them every time.
+
+    Returns:
+        The data set.
+    """
+    cache = cache or TensorCache()
+    settings = replace(SETTINGS, size=size)
+    splits = []
     for part, count in (("train", train), ("test", test)):
         key = content_hash([CODE, CLASSES, count, seed, part, settings])
-        if (cached := cache.read(key)) is None:
+        cached = cache.read(key)
+        if cached is None:
             cached = {"images": _render(part, count, seed, settings)}
             cache.write(key, cached)
         console.info("%s images: %d", part, len(cached["images"]))
-        splits.append(Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(count)))
+        labels = torch.arange(len(CLASSES)).repeat_interleave(count)
+        splits.append(Split(cached["images"], labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
-    """A lamp near the camera and bright surroundings. back: (3,), towards the camera. Coefficients (49, 3)."""
+    """Draw a light: a lamp near the camera, and bright surroundings.
+
+    Args:
+        back: The direction towards the camera, shape (3,).
+        draws: The random generator.
+
+    Returns:
+        The coefficients of the light, shape (49, 3).
+    """
     direction = F.normalize(back + 0.5 * torch.randn(3, generator=draws), dim=0)
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
     strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
@@ -53,24 +84,40 @@ def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
-    """Images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
-    instances, draws, images = math.ceil(per_class / (VIEWS * BACKGROUNDS)), generator(seed, part), []
+    """Render the images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
+    instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
+    draws = generator(seed, part)
+    images = []
     for name in progress(CLASSES, f"{part} images"):
-        meshes = (solid(name, int(torch.randint(2**31, (1,), generator=draws))) for _ in range(instances))
-        images.append(torch.cat([_portraits(mesh, settings, draws) for mesh in meshes])[:per_class])
+        portraits = []
+        for _ in range(instances):
+            mesh = solid(name, int(torch.randint(2**31, (1,), generator=draws)))
+            portraits.append(_portraits(mesh, settings, draws))
+        images.append(torch.cat(portraits)[:per_class])
     return torch.cat(images)
 
 
 def _portraits(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> Tensor:
-    """20 images of one instance: uint8 (20, 3, size, size)."""
-    polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
-    cameras = [
-        OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + w)
-        for p, a, w in zip(polar.tolist(), azimuth.tolist(), width.tolist(), strict=True)
-    ]
+    """Render 20 images of one instance: uint8 (20, 3, size, size)."""
+    polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64).tolist()
+    cameras = []
+    for view in range(VIEWS):
+        height = math.radians(40 + 45 * polar[view])
+        turn = 2 * math.pi * azimuth[view]
+        cameras.append(OrthographicCamera(height, turn, 2 + width[view]))
     backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
-    towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
-    lights = torch.stack([even_light(back, draws) for back in towards])
-    images = load_backgrounds(backgrounds, settings.size)
-    scene = Scene.grid([SceneObject("", normalize(mesh))], cameras, images, lights, settings, choose("numpy"))
-    return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))
+    lights = []
+    for camera in cameras:
+        back = torch.tensor(camera.axes()[2], dtype=torch.float32)
+        lights += [even_light(back, draws) for _ in backgrounds]
+    scene = Scene.grid(
+        [SceneObject("", normalize(mesh))],
+        cameras,
+        load_backgrounds(backgrounds, settings.size),
+        torch.stack(lights),
+        settings,
+        choose("numpy"),
+    )
+    examples = torch.arange(len(scene))
+    images = scene.render(scene.conditions(examples), examples)
+    return to_bytes(images.flatten(0, 1))
