@@ -1,4 +1,4 @@
-"""Find the images of a folder with their classes and sources, and reduce them to the classifier's size."""
+"""Find the images of a folder with their classes and sources, and reduce them to a network's size."""
 
 import csv
 import os
@@ -13,6 +13,7 @@ from typing import NoReturn
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from augment.classifiers.adapter import Label, class_index, label_names, nearest
 from augment.utils import progress, require_memory
@@ -20,20 +21,42 @@ from renderer.errors import InputError, in_one_line
 from renderer.io.images import read_square
 from train import console
 
-SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
-MACS = "__MACOSX"  # macOS puts this folder into archives
-FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
+SUFFIXES = (
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jfif",
+    ".png",
+    ".webp",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".gif",
+)
+# macOS puts this folder into archives.
+MACS = "__MACOSX"
+# The name of a folder begins with this if the network lacks its class.
+FOREIGN = "other_"
+# The table of sources and objects in a folder.
 TABLE = "photos.csv"
-DESCRIPTION = "lab.json"  # of a folder that pnb-lab made
-SEPARATOR = ";"  # between the sources in a cell of hard_negatives
+# The file in a folder that pnb-lab made.
+DESCRIPTION = "lab.json"
+# This stands between the sources in a cell of the column hard_negatives.
+SEPARATOR = ";"
 SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image: its path relative to the folder, its class (or `other_*`) and, if known, its source and its object.
+    """An image of a folder.
 
-    hard_negatives: the sources of other things that it is ranked against, besides its own. mesh: the object's name.
+    Attributes:
+        path: The path in the folder.
+        label: The class, or a name that begins with "other_".
+        source: Where the image comes from, if that is known.
+        hard_negatives: The sources of other things that the image is ranked against, besides its
+            own source.
+        mesh: The name of the object, if that is known.
     """
 
     path: PurePosixPath
@@ -43,171 +66,325 @@ class Photograph:
     mesh: str | None = field(default=None, repr=False)
 
 
+@dataclass(frozen=True)
+class _Row:
+    """A row of photos.csv."""
+
+    source: str | None = None
+    hard_negatives: tuple[str, ...] = ()
+    mesh: str | None = None
+
+
 def require_outside(out: Path, folder: Path) -> None:
-    """InputError if outputs would lie among the photographs, where the contact sheet would be scored, too."""
+    """Check that a folder for results does not lie among photographs.
+
+    The contact sheet would be scored there, too.
+
+    Args:
+        out: The folder for results.
+        folder: The folder of photographs.
+
+    Raises:
+        InputError: The first folder lies inside the second.
+    """
     if out.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"out={out} lies inside the photographs' folder: choose another")
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
-    """The images of a folder, sorted by path, each with its class.
+    """Find the images of a folder, each with its class.
 
-    The folder holds either a sub-folder per class, named as in `classes`, or images only, which are then all of class
-    `label`, if that is one. A sub-folder of no class shows other things, with a warning unless it is named `other_*`.
-    Sub-folders are searched to any depth, through symbolic links, too; hidden files and other kinds (`left_out`) are
-    skipped. A `photos.csv` gives sources in its columns `path` and `source_tag`; its column `hard_negatives` names
-    further sources, separated by `;`, and `mesh` the object, over which intervals are taken, too.
+    The folder holds a sub-folder per class, or images only. Images only are all of class `label`.
+    A sub-folder of no class shows other things. It is warned of unless its name begins with
+    "other_". Sub-folders are searched to any depth, through symbolic links, too. Hidden files and
+    other kinds (see `left_out`) are skipped.
 
-    InputError: the folder is missing, unreadable, empty or mixes both layouts; `label` is not a class; a sub-folder is
-    none, but has a name like `label`; no sub-folder is a class; `photos.csv` lacks its columns, contradicts itself, or
-    names no file of the folder or a source without images.
+    A file photos.csv gives sources in its columns `path` and `source_tag`. Its column
+    `hard_negatives` names further sources, separated by ";", and its column `mesh` names the
+    object.
+
+    Args:
+        folder: The folder.
+        classes: The names of the network's classes.
+        label: The class under study, or several.
+
+    Returns:
+        The images, sorted by path.
+
+    Raises:
+        InputError: The folder is missing, unreadable or empty, or it mixes both layouts. `label`
+            is not a class. A sub-folder is none, but has a name like `label`. No sub-folder is a
+            class. photos.csv lacks its columns, contradicts itself, or names no file of the
+            folder or a source without images.
     """
-    only, *others = label_names(label)
-    for name in (only, *others):
+    labels = label_names(label)
+    for name in labels:
         class_index(classes, name, "label")
     paths, files = _image_files(folder)
-    nested = _has_class_folders(folder, paths, classes, label_names(label))
-    if others and not nested:
-        raise InputError(f"{folder} has no class folders, and label names several classes: put its images into some")
+    has_class_folders = _has_class_folders(folder, paths, classes, labels)
+    if len(labels) > 1 and not has_class_folders:
+        problem = f"{folder} has no class folders, and label names several classes"
+        raise InputError(f"{problem}: put its images into some")
     rows = _read_table(folder / TABLE)
-    if unknown := sorted(rows.keys() - set(files)):
-        fault = f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, like {unknown[0]}"
-        if len(unknown) == len(rows):
-            raise InputError(f"{fault}; give paths such as {paths[0]}")
-        _warn_once(fault)
-    photographs = [
-        Photograph(path, path.parts[0] if nested else only, *rows.get(path, (None, (), None))) for path in paths
-    ]
-    sources = {item.source for item in photographs}
-    if missing := {name for item in photographs for name in item.hard_negatives} - sources:
-        raise InputError(f"{folder / TABLE} names hard_negatives of source {min(missing)!r}, which has no image")
+    _require_files_of_rows(folder / TABLE, rows, files, paths[0])
+
+    photographs = []
+    for path in paths:
+        row = rows.get(path, _Row())
+        name = path.parts[0] if has_class_folders else labels[0]
+        photographs.append(Photograph(path, name, row.source, row.hard_negatives, row.mesh))
+    known = {item.source for item in photographs}
+    named = {name for item in photographs for name in item.hard_negatives}
+    if named - known:
+        source = min(named - known)
+        problem = f"names hard_negatives of source {source!r}, which has no image"
+        raise InputError(f"{folder / TABLE} {problem}")
     return photographs
 
 
+def _require_files_of_rows(
+    table: Path,
+    rows: dict[PurePosixPath, _Row],
+    files: Sequence[PurePosixPath],
+    example: PurePosixPath,
+) -> None:
+    """Warn of rows for no file of the folder; raise InputError if all rows are of that kind."""
+    unknown = sorted(rows.keys() - set(files))
+    if not unknown:
+        return
+    counts = f"{len(unknown)} of {len(rows)} rows"
+    problem = f"{table} has {counts} for no file of the folder, like {unknown[0]}"
+    if len(unknown) == len(rows):
+        raise InputError(f"{problem}; give paths such as {example}")
+    _warn_once(problem)
+
+
 def find_unlabeled(folder: Path) -> list[Photograph]:
-    """All images of a folder and its sub-folders, sorted by path, of no class. InputError: no folder, or none in it."""
-    return [Photograph(path, "", None) for path in _image_files(folder)[0]]
+    """Find all images of a folder and its sub-folders. They have no class.
+
+    Args:
+        folder: The folder.
+
+    Returns:
+        The images, sorted by path.
+
+    Raises:
+        InputError: There is no such folder, or it holds no image.
+    """
+    paths, _ = _image_files(folder)
+    return [Photograph(path, "", None) for path in paths]
 
 
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
-    """The images of a folder, sorted, and all of its files; InputError: it is no folder, or holds no image."""
+    """Return the images of a folder, sorted, and all of its files."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a folder of photographs")
     files = list(_files(folder))
-    if not (paths := sorted(path for path in files if path.suffix.lower() in SUFFIXES)):
-        raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
+    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        advice = f"put some there ({', '.join(SUFFIXES)})"
+        raise InputError(f"{folder} holds no photographs: {advice}")
     return paths, files
 
 
 def left_out(folder: Path) -> list[PurePosixPath]:
-    """The files of a folder that are of no kind that is read; sorted."""
-    known = PurePosixPath(TABLE), PurePosixPath(DESCRIPTION)
-    return sorted(path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in known)
+    """Find the files of a folder that are of no kind that is read.
+
+    Args:
+        folder: The folder.
+
+    Returns:
+        Their paths, sorted.
+    """
+    own = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
+    return sorted(
+        path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in own
+    )
 
 
 @cache
 def _warn_once(text: str) -> None:
+    """Print a warning, but not again."""
     console.warning(text)
 
 
 def is_hidden(name: str) -> bool:
-    """Whether a file or folder belongs to the system rather than to the user."""
+    """Say whether a file or folder belongs to the system rather than to the user.
+
+    Args:
+        name: The name of the file or folder.
+
+    Returns:
+        Whether it is hidden.
+    """
     return name.startswith(".") or name == MACS
 
 
 def _files(folder: Path) -> Iterator[PurePosixPath]:
-    """Paths of files in the folder that are not hidden; links are followed, except to a folder that they lie in."""
+    """Give the paths of all files that are not hidden.
+
+    Links are followed, except to a folder that they lie in.
+    """
 
     def refuse(error: OSError) -> NoReturn:
         raise error
 
     for root, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
         inside = Path(os.path.realpath(root))
-        targets = {name: os.path.realpath(os.path.join(root, name)) for name in folders if not is_hidden(name)}
-        folders[:] = [name for name, target in targets.items() if not inside.is_relative_to(target)]
+        visited = []
+        for name in folders:
+            target = os.path.realpath(os.path.join(root, name))
+            if not is_hidden(name) and not inside.is_relative_to(target):
+                visited.append(name)
+        folders[:] = visited  # os.walk goes on with these.
         parent = PurePosixPath(Path(root).relative_to(folder).as_posix())
         yield from (parent / name for name in files if not is_hidden(name))
 
 
 def _has_class_folders(
-    folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str], labels: Sequence[str]
+    folder: Path,
+    paths: Sequence[PurePosixPath],
+    classes: Sequence[str],
+    labels: Sequence[str],
 ) -> bool:
-    """Whether images lie in class folders; InputError for folders of no class alone, or for one that may be meant for a
-    label, or for images beside folders."""
-    names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
+    """Say whether the images lie in class folders, and check the names of these.
+
+    Raise InputError if no folder is a class, if a folder may be meant for a label, or if images
+    lie beside folders.
+    """
+    names = sorted(
+        entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name)
+    )
     others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
     for name in others:
-        likely = [label for label in labels if label in name.lower() or get_close_matches(name.lower(), [label])]
-        if likely or others == names:
-            fault = f"is not named after a class of the model (such as {nearest(name, classes)})"
-            raise InputError(f"{folder / name} {fault}: rename it, to {FOREIGN}{name} if it shows other things")
+        if others == names or any(_is_like(name, label) for label in labels):
+            suggestions = nearest(name, classes)
+            problem = f"is not named after a class of the model (such as {suggestions})"
+            advice = f"rename it, to {FOREIGN}{name} if it shows other things"
+            raise InputError(f"{folder / name} {problem}: {advice}")
     if others:
         count = f"{len(others)} of {len(names)} folders in {folder}"
-        _warn_once(f"{count} are of no class of the model and count as other things: {', '.join(others)}")
-    if names and (loose := [path for path in paths if len(path.parts) == 1]):
-        raise InputError(f"{folder / loose[0]} lies beside class folders: move it into the folder of its class")
+        shown = ", ".join(others)
+        _warn_once(f"{count} are of no class of the model and count as other things: {shown}")
+    loose = [path for path in paths if len(path.parts) == 1]
+    if names and loose:
+        problem = f"{folder / loose[0]} lies beside class folders"
+        raise InputError(f"{problem}: move it into the folder of its class")
     return bool(names)
 
 
-def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...], str | None]]:
-    """Source, hard negatives and mesh by path; empty without a table."""
-    rows: dict[PurePosixPath, tuple[str | None, tuple[str, ...], str | None]] = {}
+def _is_like(name: str, label: str) -> bool:
+    """Say whether a folder's name may be meant for a label."""
+    return label in name.lower() or bool(get_close_matches(name.lower(), [label]))
+
+
+def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
+    """Read photos.csv by path; nothing if there is no such file."""
+    rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
         return rows
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
             for line in csv.DictReader(file, restval="", strict=True):
                 path = PurePosixPath(line["path"].replace("\\", "/"))
-                negatives = split_sources(line.get("hard_negatives", ""))
-                row = line["source_tag"] or None, negatives, line.get("mesh") or None
+                row = _Row(
+                    line["source_tag"] or None,
+                    split_sources(line.get("hard_negatives", "")),
+                    line.get("mesh") or None,
+                )
                 if rows.setdefault(path, row) != row:
                     raise ValueError(f"two different rows for {path}")
     except (ValueError, LookupError, csv.Error, OSError) as error:
-        advice = "make it UTF-8 with the columns path and source_tag, separated by commas, and a row per file"
+        columns = "the columns path and source_tag, separated by commas"
+        advice = f"make it UTF-8 with {columns}, and a row per file"
         raise InputError(f"{table} cannot be used ({in_one_line(error)}): {advice}") from error
     return rows
 
 
 def split_sources(cell: str) -> tuple[str, ...]:
-    """The sources in a cell of `hard_negatives`."""
+    """Split a cell of the column hard_negatives into the names of sources.
+
+    Args:
+        cell: The cell, such as "lab;shop".
+
+    Returns:
+        The names.
+    """
     return tuple(name.strip() for name in cell.split(SEPARATOR) if name.strip())
 
 
 def load_photographs(
-    folder: Path, photographs: Sequence[Photograph], size: int = 32, skip_unreadable: bool = False, advice: str = SKIP
-) -> tuple[list[Photograph], torch.Tensor, list[str]]:
-    """Read photographs as the classifier sees them.
+    folder: Path,
+    photographs: Sequence[Photograph],
+    size: int = 32,
+    skip_unreadable: bool = False,
+    advice: str = SKIP,
+) -> tuple[list[Photograph], Tensor, list[str]]:
+    """Read photographs as a network sees them.
 
-    Returns the photographs that could be read, their images as (N, 3, size, size) uint8 sRGB, and the paths of the
-    others. Each image is turned as its EXIF orientation says, converted to RGB (alpha over white, 16 bits to 8),
-    cropped to its central square and reduced with Pillow's Lanczos filter, which widens with the reduction: detail too
-    fine for `size` averages out instead of aliasing.
+    Each image is turned as its EXIF orientation says and converted to RGB. Alpha is blended over
+    white, and 16 bits become 8. The central square is reduced with Pillow's Lanczos filter, which
+    widens with the reduction. Detail too fine for `size` then averages out instead of aliasing.
 
-    InputError: broken or oversized images unless `skip_unreadable`; no image can be read; memory is too small.
-    advice: how to skip them, in the words of the caller.
+    Args:
+        folder: The folder.
+        photographs: The photographs to read.
+        size: The pixels per side.
+        skip_unreadable: Whether broken and oversized images are skipped.
+        advice: How to skip them, in the words of the caller, which ends the error's sentence.
+
+    Returns:
+        The photographs that could be read, their images (N, 3, size, size) as uint8 sRGB, and the
+        paths of the others.
+
+    Raises:
+        InputError: An image is broken or oversized and is not to be skipped, no image can be
+            read, or memory is too small.
     """
-    shape = len(photographs), 3, size, size
-    require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), torch.device("cpu"))
+    shape = (len(photographs), 3, size, size)
+    cpu = torch.device("cpu")
+    require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), cpu)
     images = torch.empty(shape, dtype=torch.uint8)
+    errors = _read_into(images, folder, photographs)
+
+    readable = []
+    broken = []
+    for row, (photograph, error) in enumerate(zip(photographs, errors, strict=True)):
+        if error is None:
+            readable.append(row)
+        else:
+            broken.append((photograph.path, error))
+    if broken and not (readable and skip_unreadable):
+        path, error = broken[0]
+        counts = f"{len(broken)} of {len(photographs)} photographs cannot be read"
+        first = f"the first being {folder / path} ({error})"
+        remedy = f"replace them{advice if readable else ''}"
+        raise InputError(f"{counts}, {first}: {remedy}")
+    if broken:
+        images = images[readable]
+    return [photographs[row] for row in readable], images, [str(path) for path, _ in broken]
+
+
+def _read_into(
+    images: Tensor, folder: Path, photographs: Sequence[Photograph]
+) -> list[Exception | None]:
+    """Read photographs into the rows of a tensor; return the error of each row, if any."""
+    size = images.shape[-1]
 
     def read(row: int) -> Exception | None:
         try:
-            pixels = np.array(read_square(folder / photographs[row].path, size))  # a copy: Pillow's memory is read-only
-        except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+            # np.array copies, since Pillow's memory is read-only.
+            pixels = np.array(read_square(folder / photographs[row].path, size))
+        except Exception as error:  # Pillow's decoders raise almost anything at a broken file.
             return error
         images[row] = torch.from_numpy(pixels).permute(2, 0, 1)
         return None
 
-    pool = ThreadPoolExecutor()  # Pillow releases the interpreter while it decodes and resizes
+    # Threads help, since Pillow releases the interpreter while it decodes and resizes.
+    pool = ThreadPoolExecutor()
     try:
         results = pool.map(read, range(len(photographs)))
-        errors = [error for _, error in zip(progress(photographs, "photographs"), results, strict=True)]
+        shown = progress(photographs, "photographs")
+        return [error for _, error in zip(shown, results, strict=True)]
     finally:
-        pool.shutdown(cancel_futures=True)  # so that Ctrl-C does not wait for the rest
-    rows = [row for row, error in enumerate(errors) if error is None]
-    broken = [(item.path, error) for item, error in zip(photographs, errors, strict=True) if error is not None]
-    if broken and not (rows and skip_unreadable):
-        first = f"{folder / broken[0][0]} ({broken[0][1]})"
-        fault = f"{len(broken)} of {len(photographs)} photographs cannot be read, the first being {first}"
-        raise InputError(f"{fault}: replace them{advice if rows else ''}")
-    return [photographs[row] for row in rows], images[rows] if broken else images, [str(path) for path, _ in broken]
+        pool.shutdown(cancel_futures=True)  # Ctrl-C does not wait for the other images.
