@@ -32,7 +32,7 @@ def cache_folder(choice: str | None) -> Path | None:
     Returns:
         The folder. None if nothing is to be kept, or if "auto" finds no home folder.
     """
-    if choice is None:
+    if not choice:
         return None
     if choice != "auto":
         return Path(os.path.expanduser(choice))
