@@ -185,7 +185,7 @@ def test_values_of_a_render(name, tmp_path, verify_values):
         "vertices": torch.from_numpy(mesh.vertices).double(),
         "albedo": 0.2 + 0.6 * torch.rand(shape, generator=torch.Generator().manual_seed(2)).double(),
     }
-    leaves = {argument: leaves[argument].requires_grad_() for argument in {"light", *wanted}}
+    leaves = {argument: leaves[argument].requires_grad_() for argument in dict.fromkeys(("light", *wanted))}
     images = renderer.render(mesh, cameras, size=SIZE, **keywords | SOFTWARE | leaves)
     verify_values(images, *gradients(images, list(leaves.values())))
 
