@@ -159,10 +159,13 @@ class Fragments:
     @cached_property
     def runs(self) -> Runs:
         """The runs of samples that lie next to each other in memory and see one face in one pixel."""
-        face_count = max(len(self.faces), 1)
-        key, count = (self.pixel * face_count + self.face).unique_consecutive(return_counts=True)
-        pixel = torch.div(key, face_count, rounding_mode="floor")
-        return Runs(pixel, key - pixel * face_count, count)
+        is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
+        torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
+        is_start[1:-1] |= self.face[1:] != self.face[:-1]
+        # NumPy finds them in a quarter of the time of torch. The last one is the end of all samples.
+        starts = torch.from_numpy(np.flatnonzero(is_start.cpu().numpy())).to(self.pixel.device)
+        first = starts[:-1]
+        return Runs(self.pixel.index_select(0, first), self.face.index_select(0, first), starts.diff())
 
     def to(self, device: torch.device | str) -> "Fragments":
         """The same on another device."""
