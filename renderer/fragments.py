@@ -165,7 +165,7 @@ class Fragments:
         is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
         torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
         is_start[1:-1] |= self.face[1:] != self.face[:-1]
-        # NumPy finds them in a quarter of the time of torch. The last one is the end of all samples.
+        # NumPy finds them in a quarter of the time of torch. The last is the end of all samples.
         found = np.flatnonzero(is_start.cpu().numpy())
         starts = torch.from_numpy(found).to(self.pixel.device)
         pixel = self.pixel.index_select(0, starts[:-1])

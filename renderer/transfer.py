@@ -513,12 +513,13 @@ def _mostly_filled(fragments: Fragments) -> bool:
 def _copied_from_faces(fragments: Fragments, face_harmonics: Tensor, dtype: torch.dtype) -> Tensor:
     """Return `_box_filter` (1, K, P) of G faces of albedo 1 that have the values (G, K).
 
-    A pixel that one face fills has the values of this face, which are copied. Only the other pixels are summed.
+    A pixel that one face fills has the values of this face, which are copied. Only the
+    other pixels are summed.
     """
     pixel, face, sample_count = fragments.runs
     run_count = torch.bincount(pixel, minlength=len(fragments.pixels))
     first_run = _row_starts(run_count)[:-1]
-    positive_zero = face_harmonics + 0.0  # A sum is never −0.0, so that a copy must not be, either.
+    positive_zero = face_harmonics + 0.0  # A sum is never −0.0, so a copy must not be, either.
     by_function = positive_zero.T.to(dtype).contiguous()
     filtered = by_function.index_select(1, face.index_select(0, first_run))
     is_partial = sample_count < fragments.samples**2
