@@ -142,7 +142,9 @@ def _colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) linear albedo of the corners' colors at the samples, float64 on the fragments' device."""
     corner_colors = _corner_colors(mesh, fragments, encoding)
     if mesh.one_color_per_face:
-        return _of_faces(corner_colors[:, 0], fragments)
+        by_channel = corner_colors[:, 0].T.contiguous()
+        # In float64, index_select takes three times as long.
+        return by_channel.gather(1, fragments.face.expand(3, -1)).T
     return fragments.interpolate(corner_colors)
 
 

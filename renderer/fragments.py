@@ -151,18 +151,26 @@ class Fragments:
         if self.samples == 1 or not len(self.pixel):
             return self.pixel, self.face, albedo
         runs = self.runs
-        run_of_sample = torch.arange(len(runs.sample_count), device=albedo.device).repeat_interleave(runs.sample_count)
+        sample_count = runs.sample_count.cpu().numpy()
+        # NumPy repeats in a quarter of the time of torch.
+        run_of_sample = np.repeat(np.arange(len(sample_count)), sample_count)
         scaled = albedo.T / self.samples**2
-        summed = albedo.new_zeros(albedo.shape[1], len(runs.sample_count)).index_add(1, run_of_sample, scaled)
+        zeros = albedo.new_zeros(albedo.shape[1], len(sample_count))
+        summed = zeros.index_add(1, torch.from_numpy(run_of_sample).to(albedo.device), scaled)
         return runs.pixel, runs.face, summed.T
 
     @cached_property
     def runs(self) -> Runs:
         """The runs of samples that lie next to each other in memory and see one face in one pixel."""
-        face_count = max(len(self.faces), 1)
-        key, count = (self.pixel * face_count + self.face).unique_consecutive(return_counts=True)
-        pixel = torch.div(key, face_count, rounding_mode="floor")
-        return Runs(pixel, key - pixel * face_count, count)
+        is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
+        torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
+        is_start[1:-1] |= self.face[1:] != self.face[:-1]
+        # NumPy finds them in a quarter of the time of torch. The last is the end of all samples.
+        found = np.flatnonzero(is_start.cpu().numpy())
+        starts = torch.from_numpy(found).to(self.pixel.device)
+        pixel = self.pixel.index_select(0, starts[:-1])
+        face = self.face.index_select(0, starts[:-1])
+        return Runs(pixel, face, starts.diff())
 
     def to(self, device: torch.device | str) -> "Fragments":
         """The same on another device."""

@@ -110,9 +110,12 @@ def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
     cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
     for m in range(degree + 1):
         for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
-            for index, circular in ((l * l + l - m, sine), (l * l + l + m, cosine)):
-                if index in indices:
-                    rows[index] = circular * legendre
+            if l * l + l + m in indices:
+                rows[l * l + l + m] = cosine * legendre
+            if m and l * l + l - m in indices:
+                rows[l * l + l - m] = sine * legendre
+        if m == degree:
+            break
         if m == 0:
             cosine = cosine * math.sqrt(2)
         cosine, sine = (torch.addcmul(x * cosine, y, sine, value=-1), torch.addcmul(x * sine, y, cosine))
