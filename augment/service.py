@@ -13,17 +13,19 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from augment import utils
+from augment import distributed
 from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import AttackProblem
+from augment.batches import as_found
 from augment.build import Shown, build_scene
 from augment.classifiers.adapter import NetworkCall
 from augment.degree import with_needed_degree
 from augment.losses import NO_CLASS, is_right, label_loss, require_known
+from augment.progress import Phases
+from augment.random_streams import generator, stream_seed
 from augment.scene import Conditions, Scene
-from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_unit
@@ -207,7 +209,7 @@ class AugmentationService:
         require_kind("settings", self.settings, AugmentationSettings, "augment.AugmentationSettings(...)")
         require_seed("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
-        require_kind("phases", self.phases, Phases, "augment.utils.Phases()")
+        require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
         self.studied = [int(label) for label in as_integers("studied", self.studied)]
         if self.scene is not None and self.labels.shape != (len(self.scene),):
@@ -289,7 +291,7 @@ class AugmentationService:
         once = self.settings.arm == "random"
         scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), once)
         make = self._random if once else self._adversarial
-        shard = utils.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
+        shard = distributed.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
         return make(model, self.settings.attack.problem(scene), number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -344,7 +346,7 @@ class AugmentationService:
     def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         values = self._random_values(problem, number)
         images = problem.images(values, shard)[:, 0]
-        images = utils.merged(images, shard, len(self.labels), self.world_size)
+        images = distributed.merged(images, shard, len(self.labels), self.world_size)
         success, diagnostics = self._errors(model, images, self.labels)
         examples = choose_attack_examples(model, problem, values, success, self.labels)
         return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
@@ -397,9 +399,9 @@ class AugmentationService:
                 stream_seed(self.seed, number),
             )
         success = fooled.all(1) | result.success_before  # as no attack was needed there
-        success = utils.merged(success, shard, len(self.labels), self.world_size)
+        success = distributed.merged(success, shard, len(self.labels), self.world_size)
         shards = [getattr(result, item.name) for item in fields(result)]
-        result = DescentResult(*(utils.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
+        result = DescentResult(*(distributed.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
         if self.settings.warm_start:
             self._last_values = result.values
         diagnostics = {

@@ -8,10 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment import utils
+from augment import distributed
+from augment.batches import as_found
 from augment.classifiers.adapter import nearest
 from augment.losses import divergence, is_right, label_loss, ranking_loss
-from augment.utils import as_found, generator, stream_seed
+from augment.random_streams import generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_bytes, to_unit
 from train.batches import FLIPS
@@ -166,7 +167,7 @@ def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] =
         return lambda images, labels, step: images
     if name == "pgd":
         return lambda images, labels, step: pgd(
-            model, images, labels, generator(seed, step, "pgd", utils.rank()), absent
+            model, images, labels, generator(seed, step, "pgd", distributed.rank()), absent
         )
     from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
 
@@ -177,7 +178,7 @@ def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] =
         """torchvision's transforms draw once for a whole batch, and from the global generator."""
         transformed = []
         with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-            for index, image in enumerate(images, utils.rank() * len(images)):
+            for index, image in enumerate(images, distributed.rank() * len(images)):
                 torch.manual_seed(stream_seed(seed, step, index, "distortion"))
                 transformed.append(transform(image))
         return torch.stack(transformed)

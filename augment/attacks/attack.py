@@ -25,11 +25,13 @@ from augment.attacks.parameters import (
     SkylightSettings,
     lighting,
 )
+from augment.batches import BatchSize
 from augment.classifiers.adapter import Classifier, class_index, require_classifier
 from augment.degree import NOTICED, with_needed_degree
 from augment.losses import logit_gap
+from augment.progress import Phases, progress
+from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import parts_of
 from renderer.light.harmonics import irradiance_error

@@ -23,8 +23,10 @@ import torch
 from torch import Tensor, nn
 
 from augment.attacks.eot import ExpectationOverTransformations, stored
+from augment.batches import BatchSize, as_found
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
-from augment.utils import BatchSize, Phases, as_found, generator, progress
+from augment.progress import Phases, progress
+from augment.random_streams import generator
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

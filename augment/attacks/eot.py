@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
-from augment.utils import generator
+from augment.random_streams import generator
 from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
 from renderer.validation import require_field_types
@@ -63,7 +63,7 @@ def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) 
         images: (A, V, 3, H, W) in [0, 1].
         deviation: the standard deviation of the Gaussian noise, in steps of 8 bits (1/255).
         examples: (A,) int64, the numbers of the examples.
-        key: of the random stream, such as the seed of an attack; see `augment.utils.stream_seed`.
+        key: of the random stream, such as the seed of an attack; see `augment.random_streams.stream_seed`.
 
     Yields:
         (A, V, 3, H, W) in [0, 1], of 8 bits, with values of the images' type.

@@ -26,7 +26,8 @@ from augment.attacks.descent import Goal, descend
 from augment.attacks.parameters import AttackProblem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.utils import generator, progress
+from augment.progress import progress
+from augment.random_streams import generator
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.validation import as_list, require_number
 

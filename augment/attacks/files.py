@@ -19,7 +19,7 @@ from augment.attacks.attack import (
 )
 from augment.attacks.eot import as_jpeg
 from augment.attacks.evaluate import CHECKED, warnings
-from augment.utils import progress
+from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import write_whole

@@ -14,8 +14,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.objects import SceneObject
+from augment.progress import progress
 from augment.scene import Conditions, Scene
-from augment.utils import progress, rotation_matrices
 from renderer.camera import PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Ball, nearest_in_box, parts_of
@@ -23,6 +23,7 @@ from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 from renderer.microfacets import LEAST
+from renderer.vectors import rotation_matrices
 
 POSE = ("rotation", "shift", "scale", "view", "distance")  # its parts, of 3, 2, 1, 2 and 1 values
 MATERIAL = ("roughness", "metallic", "strength", "hue")

@@ -12,8 +12,8 @@ from torch import Tensor
 from augment.attacks.attack import AttackSettings, logits_of
 from augment.build import SceneSettings
 from augment.classifiers import Classifier
+from augment.progress import progress
 from augment.scene import Scene
-from augment.utils import progress
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 

@@ -10,6 +10,7 @@ from torch.utils.data import ConcatDataset, DataLoader
 from augment.attacks.norm_ball import StepSettings
 from augment.build import build_scene
 from augment.losses import complementary_label
+from augment.progress import Phases
 from augment.scene import Conditions, Scene
 from augment.service import (
     AugmentationService,
@@ -18,7 +19,6 @@ from augment.service import (
     Renders,
     TrainingAttackSettings,
 )
-from augment.utils import Phases
 from augment.variation import VariationSettings
 from renderer.errors import InputError
 from renderer.light.presets import probe

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from augment import utils
+from augment import distributed
 from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
@@ -131,7 +131,7 @@ def test_every_image_is_changed_by_draws_of_its_own_whatever_the_number_of_proce
     same = images[:1].expand(6, -1, -1, -1)
     whole = augmentation(name, model, 0)(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1
-    monkeypatch.setattr(utils, "rank", lambda: 1)
+    monkeypatch.setattr(distributed, "rank", lambda: 1)
     assert torch.equal(augmentation(name, model, 0)(same[3:], LABELS[3:], 1), whole[3:])
 
 
