@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from augment.attacks.parameters import MaterialSettings, initial_gloss
+from augment.attacks.parameters.material import ROUGHNESS, initial_surface
+from augment.attacks.parameters.settings import MaterialSettings
 from augment.memory import has_memory, operator_bytes
 from augment.objects import SceneObject
 from augment.scene import Scene
@@ -83,8 +84,8 @@ def reached_gloss(
 
 def _reached_roughness(item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None) -> float:
     """The least roughness of an object's own faces, whatever a variation draws and an attack does."""
-    rows, own = initial_gloss(item)
-    roughness = rows[own, 0]
+    surface = initial_surface(item)
+    roughness = surface.face_gloss[surface.object_mask, ROUGHNESS]
     varnished = varnish is not None and any(varnish.strength)
     attacked = material is not None and any((material.roughness, material.metallic, material.strength))
     if varnish is not None and varnished:

@@ -17,7 +17,7 @@ from augment import distributed
 from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import AttackProblem
+from augment.attacks.problem import AttackProblem
 from augment.batches import as_found
 from augment.build import Shown, build_scene
 from augment.classifiers.adapter import NetworkCall

@@ -23,7 +23,7 @@ from augment.attacks.attack import (
     require_result,
 )
 from augment.attacks.descent import Goal, descend
-from augment.attacks.parameters import AttackProblem
+from augment.attacks.problem import AttackProblem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.progress import progress

@@ -27,7 +27,7 @@ from augment.attacks.attack import (
 from augment.attacks.descent import Goal
 from augment.attacks.evaluate import success_by_radius
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import SkylightSettings
+from augment.attacks.parameters.settings import SkylightSettings
 from augment.build import LampsSettings, ProjectorSettings
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
