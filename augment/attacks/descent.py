@@ -13,10 +13,10 @@ by repeating the step
 
     x ← project(x − length · step(∂cost/∂x)).
 
-The function `step` scales the gradient (see `StepSettings`). The function
-`project` returns the nearest values that are feasible and lie in the norm-ball.
-The length is 1. With backtracking (`AttackSettings.shorten`), a step that does
-not lower the cost is undone and tried again at half its length.
+`StepSettings.take_step` takes this step: it scales the gradient, and returns the
+nearest values that are feasible and lie in the norm-ball. The length is 1. With
+backtracking (`AttackSettings.shorten`), a step that does not lower the cost is
+undone and tried again at half its length.
 
 One forward and backward pass of the classifier gives the cost, its gradient and
 the predictions. An example succeeds when the predictions reach its goal in
@@ -474,10 +474,12 @@ class Descent:
     def _step(self, state: _State) -> None:
         """Set the candidates of the active examples to one step from their accepted values."""
         active_rows = state.active_rows
-        step = state.length[active_rows] * self.problem.step(state.gradient[active_rows])
-        moved = state.values[active_rows] - step
-        projected = self.problem.project(moved, state.examples[active_rows])
-        state.candidate[active_rows] = projected
+        state.candidate[active_rows] = self.problem.take_step(
+            values=state.values[active_rows],
+            gradient=state.gradient[active_rows],
+            examples=state.examples[active_rows],
+            length=state.length[active_rows],
+        )
         state.result.steps[active_rows] += 1
 
 

@@ -90,19 +90,28 @@ class AttackProblem:
             image_part.copy_(self.render(values[example_part], example_part))
         return images
 
-    def step(self, gradient: Tensor) -> Tensor:
-        """Scale a gradient to the step that a descent subtracts from the values.
+    def take_step(
+        self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor
+    ) -> Tensor:
+        """Take a step of projected gradient descent with each parameter.
 
         Args:
-            gradient: Gradient of the cost of A examples, shape (A, D). The part
-                of each parameter is scaled by the settings of this parameter.
+            values: Values of A examples, shape (A, D).
+            gradient: Gradient of the cost with respect to the values,
+                shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+            length: Factor of the steps of each example, shape (A, 1).
 
         Returns:
-            Step of each example, shape (A, D).
+            Values after the step, which are feasible and lie in the
+            norm-balls, shape (A, D).
         """
-        parts = self.by_parameter(gradient)
-        steps = [parameter.settings.along(part) for parameter, part in parts]
-        return torch.cat(steps, dim=1)
+        parts = zip(self.by_parameter(values), self.by_parameter(gradient), strict=True)
+        moved = [
+            parameter.take_step(part, gradient_part, examples, length)
+            for (parameter, part), (_, gradient_part) in parts
+        ]
+        return torch.cat(moved, dim=1)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls.

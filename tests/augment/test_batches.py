@@ -44,11 +44,8 @@ class Shades:
     def render(self, values, examples):
         return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
 
-    def step(self, gradient):
-        return 0.05 * gradient.sign()
-
-    def project(self, values, examples):
-        return values.clamp(0, 1)
+    def take_step(self, values, gradient, examples, length):
+        return (values - length * 0.05 * gradient.sign()).clamp(0, 1)
 
 
 def attack(model: nn.Module, batch_size: int = 4, at_once: int = 10) -> DescentResult:

@@ -76,6 +76,24 @@ class Parameter(ABC):
         """
         return anywhere(values, within)
 
+    def take_step(
+        self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor
+    ) -> Tensor:
+        """Take a step of projected gradient descent.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            gradient: Gradient of the cost with respect to the values,
+                shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+            length: Factor of the step of each example, shape (A, 1).
+
+        Returns:
+            Values after the step, shape (A, D).
+        """
+        center = self.start[examples]
+        return self.settings.take_step(values, gradient, center, self.domain, length)
+
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
 

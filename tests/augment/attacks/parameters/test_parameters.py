@@ -385,13 +385,17 @@ def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
         parameter.settings = replace(parameter.settings, step_size=size)
         parameter.start = parameter.start + torch.arange(3)[:, None]
     values = problem.start + 0.1 * torch.randn(problem.start.shape, generator=draws)
-    parts, steps = split(problem, values), split(problem, problem.step(values))
+    parts = split(problem, values)
     chosen = torch.tensor([2, 0])
+    length = torch.tensor([[0.5], [2.0]]).double()
     projected = split(problem, problem.project(values[chosen], chosen))
-    for parameter, part, step, nearest in zip(problem.parameters, parts, steps, projected, strict=True):
+    stepped = split(problem, problem.take_step(values[chosen], values[chosen], chosen, length))
+    for parameter, part, nearest, after in zip(problem.parameters, parts, projected, stepped, strict=True):
+        part, center = part[chosen], parameter.start[chosen]
+        assert torch.equal(nearest, parameter.settings.project(part, center))
         unit = part / part.norm(dim=1, keepdim=True)
-        torch.testing.assert_close(step, parameter.settings.step_size * unit, rtol=0, atol=16 * EPS)
-        assert torch.equal(nearest, parameter.settings.project(part[chosen], parameter.start[chosen]))
+        expected = parameter.settings.project(part - length * parameter.settings.step_size * unit, center)
+        torch.testing.assert_close(after, expected, rtol=0, atol=64 * EPS)
 
 
 def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
