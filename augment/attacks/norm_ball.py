@@ -160,9 +160,7 @@ class StepSettings:
         return center + self.radius * offset.to(center)
 
 
-def _sample_unit_ball(
-    shape: torch.Size, generator: torch.Generator, used: Tensor | None
-) -> Tensor:
+def _sample_unit_ball(shape: torch.Size, generator: torch.Generator, used: Tensor | None) -> Tensor:
     """Draw points (A, D) uniformly from the unit ball of the L2 norm, along the used axes."""
     direction = torch.randn(shape, generator=generator)
     axis_count: int | Tensor = shape[1]
