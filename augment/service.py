@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
-from torch.utils.data._utils.collate import default_collate_fn_map
 
 from augment import distributed
 from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
@@ -154,22 +153,29 @@ class AttackExamples:
         return len(self.labels)
 
 
-class Label(Tensor):
-    """A label (), which PyTorch's DataLoader puts into a batch with numbers, too."""
-
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]  # results are plain
-
-
-# of batches that begin with a render
-default_collate_fn_map[Label] = lambda batch, **_: torch.tensor([int(label) for label in batch])
-
-
 @dataclass(frozen=True)
-class Renders(Dataset[tuple[Tensor, Tensor]]):
-    """Labeled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+class Renders(Dataset[tuple[Tensor, int]]):
+    """Labeled examples. As a data set, it holds pairs of an image on the CPU and a label.
 
-    attack_examples: a few successful ones with what they were before the attack; None where nothing is rendered.
-    As a data set, it holds images and labels on the CPU, so that `data + renders` is both.
+    With data of the same kind, `data + renders` is both. A data set with labels
+    as tensors, such as a `TensorDataset`, needs them as numbers for that, since
+    PyTorch's `DataLoader` makes a batch of one kind of labels.
+
+    Attributes:
+        images: Images in [0, 1], shape (E, 3, H, W).
+        labels: Labels, shape (E,), int64.
+        diagnostics: Plain numbers about the regeneration.
+        attack_examples: A few successful examples with what they were before
+            the attack. None if nothing is rendered.
+
+    Example:
+        >>> tensors = torch.utils.data.TensorDataset(torch.rand(2, 3, 8, 8), torch.tensor([0, 1]))
+        >>> data = [(image, int(label)) for image, label in tensors]
+        >>> renders = Renders(torch.rand(1, 3, 8, 8), torch.tensor([2]), {})
+        >>> both = torch.utils.data.ConcatDataset([data, renders])
+        >>> [(images, labels)] = torch.utils.data.DataLoader(both, batch_size=3)
+        >>> labels
+        tensor([0, 1, 2])
     """
 
     images: Tensor
@@ -178,10 +184,12 @@ class Renders(Dataset[tuple[Tensor, Tensor]]):
     attack_examples: AttackExamples | None = None
 
     def __len__(self) -> int:
+        """Return the number of examples."""
         return len(self.labels)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Label]:
-        return self.images[index].cpu(), self.labels[index].cpu().as_subclass(Label)
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        """Return an image (3, H, W) in [0, 1] on the CPU, and its label."""
+        return self.images[index].cpu(), int(self.labels[index])
 
 
 @dataclass(eq=False, repr=False)
