@@ -1,4 +1,4 @@
-"""Batches of images that shrink when memory runs out, and the state of the classifier between them."""
+"""Passes of batches through a classifier: their size, and the state that they leave it in."""
 
 import logging
 from collections.abc import Callable, Iterator

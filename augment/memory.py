@@ -79,7 +79,12 @@ def free_memory(device: torch.device) -> int | None:
     return min(free, limit - used)
 
 
-def attack_bytes(pixels: int, pixels_at_once: int, lights: torch.Tensor, camera_effects: bool) -> int:
+def attack_bytes(
+    pixels: int,
+    pixels_at_once: int,
+    lights: torch.Tensor,
+    camera_effects: bool,
+) -> int:
     """Estimate the memory that an attack on the light of a scene takes beside the operators.
 
     Args:

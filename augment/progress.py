@@ -18,7 +18,12 @@ LONGEST_WAIT = 30.0  # Seconds between two lines of progress.
 Item = TypeVar("Item")
 
 
-def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
+def progress(
+    items: Iterable[Item],
+    description: str,
+    total: int | None = None,
+    done: int = 0,
+) -> Iterator[Item]:
     """Yield items, and show on the standard error stream how many of them are done.
 
     The first sign comes after `PATIENCE` seconds, also before the first item is

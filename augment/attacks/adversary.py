@@ -1,4 +1,4 @@
-"""An example of an attack, with all that its images are rendered from, as a value and as a folder."""
+"""Adversaries: examples of an attack with all that they show, as values and as folders."""
 
 from __future__ import annotations
 
@@ -226,7 +226,10 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
 
 
 def save_lights(
-    folder: Path, light: Tensor, basis: Basis, when: str = ""
+    folder: Path,
+    light: Tensor,
+    basis: Basis,
+    when: str = "",
 ) -> list[tuple[Any, Tensor]]:
     """Write light.json, and NAME.json of each local light.
 
@@ -307,10 +310,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     for camera in cameras:
         # A camera refuses a mesh around it.
         camera.depths(shown.mesh.vertices)
-    local_lights = [
-        read_light(folder / f"{Path(name).name}.json", Projector, Lamps)
-        for name in description["local_lights"]
-    ]
+    local_lights = []
+    for name in description["local_lights"]:
+        path = folder / f"{Path(name).name}.json"
+        local_lights.append(read_light(path, Projector, Lamps))
     sky = load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
     background = description["background"]
@@ -345,7 +348,11 @@ def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
     require_range("albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
     require_range("own_faces", own_faces, 1, len(mesh.faces))
     return SceneObject(
-        str(description["label"]), mesh, albedo_scale, str(description["name"]), own_faces
+        str(description["label"]),
+        mesh,
+        albedo_scale,
+        str(description["name"]),
+        own_faces,
     )
 
 

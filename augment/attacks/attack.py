@@ -90,7 +90,7 @@ class AttackSettings(ParameterSettings):
         unlimited = any(settings.radius is None for settings in self.parameters.values())
         if self.restarts and unlimited:
             raise InputError(
-                "restarts draws from the norm-balls: set the radius of every parameter, or restarts=0"
+                "restarts draws from the norm-balls: set the radius of every parameter, or restarts=0",
             )
 
     @property
@@ -112,7 +112,7 @@ class AttackSettings(ParameterSettings):
         if not self.parameters:
             names = ", ".join(PARAMETER_NAMES)
             raise InputError(
-                f"attack: name what to change, such as attack=lighting; there are {names}"
+                f"attack: name what to change, such as attack=lighting; there are {names}",
             )
 
     def preprocessed_model(self, classifier: nn.Module) -> nn.Module:
@@ -314,7 +314,13 @@ def attack(
 
     logits = logits_of(model, images, settings.batch_size)
     success_in_views = fooled_in_views(
-        model, images, logits.argmax(2), problem.everything, goal, settings, seed
+        model,
+        images,
+        logits.argmax(2),
+        problem.everything,
+        goal,
+        settings,
+        seed,
     )
     return AttackResult(
         problem=problem,
@@ -349,11 +355,8 @@ def warn_of_changed_light(given: Scene, physical: Scene) -> None:
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > NOTICED:
         problem = "the light is negative in places, and without that its irradiance is off by"
-        advice = (
-            "a higher scene.degree is closer, "
-            "and attack.allow_negative=true leaves the light as it is"
-        )
-        message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice}"
+        advice = "a higher scene.degree is closer, and attack.allow_negative=true leaves the light"
+        message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice} as it is"
         warnings.warn(message, stacklevel=3)
 
 
@@ -394,7 +397,10 @@ def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tenso
 
 
 def require_clean_correct(
-    scene: Scene, logits: Tensor, source: Tensor, classifier: Classifier
+    scene: Scene,
+    logits: Tensor,
+    source: Tensor,
+    classifier: Classifier,
 ) -> None:
     """Check that every image is classified correctly.
 
@@ -465,8 +471,9 @@ def _target_names(target: Sequence[str], classifier: Classifier) -> list[str]:
     """Return the names of a list of target classes, and refuse everything else."""
     suggested = classifier.classes[0]
     # Whoever gives the index of a class is told the name of this class.
-    if is_whole(target) and 0 <= int(target) < len(classifier.classes):  # type: ignore[call-overload]
-        suggested = classifier.classes[target]  # type: ignore[call-overload]
+    index: Any = target
+    if is_whole(index) and 0 <= int(index) < len(classifier.classes):
+        suggested = classifier.classes[index]
     advice = f"the name of a class, such as {suggested!r}, or a name for each view"
     return [str(name) for name in as_list("target", target, str | Integral, advice)]
 
@@ -487,7 +494,10 @@ def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Ten
 
 
 def final_images(
-    problem: AttackProblem, values: Tensor, examples: Tensor, images: Tensor
+    problem: AttackProblem,
+    values: Tensor,
+    examples: Tensor,
+    images: Tensor,
 ) -> Tensor:
     """Return the images of a descent with the shadows and bounces of the attacked shape.
 
@@ -559,7 +569,11 @@ def fooled_in_views(
     examples_of_rows = examples.to(rows.device)[rows]
     goal_of_rows = goal.of(rows)
     noisy_versions = stored(
-        images_of_rows, settings.sensor_noise, examples_of_rows, seed, "sensor noise"
+        images_of_rows,
+        settings.sensor_noise,
+        examples_of_rows,
+        seed,
+        "sensor noise",
     )
     for noisy_images in noisy_versions:
         logits = logits_of(model, noisy_images, settings.batch_size)

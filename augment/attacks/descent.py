@@ -369,7 +369,11 @@ class Descent:
         return _Score(cost=cost.sum(1), gap=gap.amin(1), predicted=predicted), image_gradient
 
     def _score_batch(
-        self, all_images: Tensor, goal: Goal, all_gradients: Tensor, batch_rows: slice
+        self,
+        all_images: Tensor,
+        goal: Goal,
+        all_gradients: Tensor,
+        batch_rows: slice,
     ) -> _Score:
         """Compute the cost, logit gap and prediction of each image of a batch.
 
@@ -425,7 +429,10 @@ class Descent:
         )
 
     def _with_lead_over_noise(
-        self, is_finished: Tensor, state: _State, evaluation: _Evaluation
+        self,
+        is_finished: Tensor,
+        state: _State,
+        evaluation: _Evaluation,
     ) -> Tensor:
         """Return which of the finished examples also lead by more than noise changes, shape (N,).
 
@@ -439,7 +446,9 @@ class Descent:
         rows = state.active_rows[chosen]
         with self.phases("attack_classifier"):
             is_leading = self._leads_over_noise(
-                evaluation.images[chosen], state.examples[rows], state.goal.of(rows)
+                evaluation.images[chosen],
+                state.examples[rows],
+                state.goal.of(rows),
             )
         return is_finished.index_copy(0, chosen, is_leading)
 
@@ -459,7 +468,11 @@ class Descent:
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
         noisy_versions = stored(
-            images, self.settings.sensor_noise, examples, self.seed, "noise margin"
+            images,
+            self.settings.sensor_noise,
+            examples,
+            self.seed,
+            "noise margin",
         )
         leads = []
         for version in (images, *noisy_versions):
@@ -626,7 +639,9 @@ class _State:
         """
         self._halve_length(~decision.is_accepted)
         accepted, kept, unfinished = _indices_of_masks(
-            decision.is_accepted, decision.is_kept, ~decision.is_finished
+            decision.is_accepted,
+            decision.is_kept,
+            ~decision.is_finished,
         )
         self._accept(accepted, evaluation)
         self._keep(kept, evaluation)

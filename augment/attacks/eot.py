@@ -1,4 +1,4 @@
-"""Images as a classifier gets them: with 8 bits, with sensor noise, or under random transformations."""
+"""Images as a classifier gets them: with 8 bits, sensor noise, or random transformations."""
 
 import io
 from collections.abc import Callable, Iterator

@@ -81,7 +81,11 @@ def check(result: AttackResult) -> dict[str, Any]:
     draws = generator(result.seed, "random search")
     draw = partial(result.problem.sample, draws, descent.values)
     random = _success_by_draws(result, Successes.before(result), draw)
-    by_steps = _success_by_steps(result)
+    counted_by_steps = {}
+    without_noise_by_steps = {}
+    for steps, found in _success_by_steps(result).items():
+        counted_by_steps[steps] = _fraction(found.counted[is_clean])
+        without_noise_by_steps[steps] = _fraction(found.without_noise[is_clean])
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
@@ -92,12 +96,8 @@ def check(result: AttackResult) -> dict[str, Any]:
         "success_with_margin": _fraction(result.success_with_margin[is_clean]),
         "random_search": _fraction(random.counted[is_clean]),
         "random_search_without_noise": _fraction(random.without_noise[is_clean]),
-        "success_by_steps": {
-            steps: _fraction(found.counted[is_clean]) for steps, found in by_steps.items()
-        },
-        "success_by_steps_without_noise": {
-            steps: _fraction(found.without_noise[is_clean]) for steps, found in by_steps.items()
-        },
+        "success_by_steps": counted_by_steps,
+        "success_by_steps_without_noise": without_noise_by_steps,
     }
 
 
@@ -115,7 +115,7 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
     reasons = []
     if lost_to_noise > success:
         reasons.append(
-            "most successes do not survive a sensor's noise, a larger attack.margin helps"
+            "most successes do not survive a sensor's noise, a larger attack.margin helps",
         )
     if 0 < success <= checks["random_search"]:
         reasons.append("random search does as well or better")
@@ -163,9 +163,8 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     random = adversarial.clone()
     rows = []
     for scale in progress(sorted(set(scales)), "radii"):
-        balls = {
-            name: _scaled(settings, scale) for name, settings in result.settings.parameters.items()
-        }
+        parameters = result.settings.parameters.items()
+        balls = {name: _scaled(settings, scale) for name, settings in parameters}
         scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
         problem = scaled_settings.problem(result.problem.scene)
         _descend_further(result, problem, values, adversarial)
@@ -186,7 +185,7 @@ def transfer(
     azimuths: Sequence[float] = (),
     objects: Sequence[SceneObject] = (),
 ) -> list[dict[str, Any]]:
-    """Show the adversaries of an attack to other classifiers, from other sides and on other objects.
+    """Show adversaries to other classifiers, from other sides and on other objects.
 
     The A adversaries are the clean-correct examples with success. Added pixels
     and the background are resized for another classifier.
@@ -221,7 +220,10 @@ def transfer(
     require_result(result)
     classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
     objects = as_list(
-        "objects", objects, SceneObject, "a list of scene objects, such as scene.objects"
+        "objects",
+        objects,
+        SceneObject,
+        "a list of scene objects, such as scene.objects",
     )
     azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
     for azimuth in azimuths:
@@ -245,7 +247,9 @@ def transfer(
 
 
 def require_transferable(
-    parameters: Collection[str], azimuths: Collection[float], objects: Collection[Any]
+    parameters: Collection[str],
+    azimuths: Collection[float],
+    objects: Collection[Any],
 ) -> None:
     """Check that what an attack changed can be shown in other views and on other meshes.
 
@@ -265,10 +269,8 @@ def require_transferable(
         ("meshes", objects, of_mesh),
     ):
         if elsewhere and bound:
-            raise InputError(
-                f"{argument}: attacked {bound[0]} cannot be transferred to others, "
-                "leave one of them out"
-            )
+            problem = f"attacked {bound[0]} cannot be transferred to others"
+            raise InputError(f"{argument}: {problem}, leave one of them out")
 
 
 @dataclass(frozen=True)
@@ -351,7 +353,9 @@ def _predicted(result: AttackResult, images: Tensor) -> Tensor:
 
 
 def _success_by_draws(
-    result: AttackResult, found: Successes, draw: Callable[[], Tensor]
+    result: AttackResult,
+    found: Successes,
+    draw: Callable[[], Tensor],
 ) -> Successes:
     """Return what was found, and what as many draws (E, D) as the attack had steps add to it."""
     found = found.clone()
@@ -416,7 +420,10 @@ def _scaled(settings: StepSettings, scale: float) -> StepSettings:
 
 
 def _descend_further(
-    result: AttackResult, problem: AttackProblem, values: Tensor, found: Successes
+    result: AttackResult,
+    problem: AttackProblem,
+    values: Tensor,
+    found: Successes,
 ) -> None:
     """Attack the examples that are left from their values (E, D), which change, as does `found`."""
     left = found.left
@@ -532,13 +539,13 @@ class _Adversaries:
         size = classifier.size
         if not adversaries:
             return self.result.images.new_empty(0, scene.views, 3, size, size)
-        images = [
-            adversary.render(scene.rasterizer) for adversary in progress(adversaries, "transfer")
-        ]
+        images = []
+        for adversary in progress(adversaries, "transfer"):
+            images.append(adversary.render(scene.rasterizer))
         return torch.stack(images).to(self.result.images)
 
     def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
-        """Return the logits (A, V, C) of a classifier for images (A, V, 3, size, size), on the CPU."""
+        """Return the logits (A, V, C) of images (A, V, 3, size, size), on the CPU."""
         settings = self.result.settings
         if not len(images):
             return torch.empty(0, images.shape[1], len(classifier.classes))

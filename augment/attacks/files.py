@@ -143,10 +143,8 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     classes = result.classifier.classes
     before = predictions(result.logits_before[example], classes)
     change = descent.values[[example]] - result.problem.start[[example]]
-    largest_change = {
-        parameter.name: float(part.abs().max())
-        for parameter, part in result.problem.by_parameter(change)
-    }
+    changes = result.problem.by_parameter(change)
+    largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
     return {
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
@@ -166,7 +164,9 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
 
 
 def _versions(
-    result: AttackResult, paths: Sequence[Path], renderers: Sequence[str]
+    result: AttackResult,
+    paths: Sequence[Path],
+    renderers: Sequence[str],
 ) -> dict[str, list[dict[str, Any]]]:
     """Return the numbers of each example by version of its images after the attack.
 
@@ -186,10 +186,10 @@ def _versions(
     again = [render_again(path, renderers, rasterizer) for path in to_verify]
     for name in renderers:
         versions[name] = torch.stack([images_by_renderer[name] for images_by_renderer in again])
-    return {
-        name: _numbers_of_version(result, version.to(result.images))
-        for name, version in versions.items()
-    }
+    numbers = {}
+    for name, version in versions.items():
+        numbers[name] = _numbers_of_version(result, version.to(result.images))
+    return numbers
 
 
 def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
@@ -221,7 +221,9 @@ def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, 
 
 
 def render_again(
-    folder: Path, renderers: Sequence[str], rasterizer: Rasterizer
+    folder: Path,
+    renderers: Sequence[str],
+    rasterizer: Rasterizer,
 ) -> dict[str, Tensor]:
     """Render the images of an example from its files alone.
 
@@ -287,16 +289,16 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
     conditions_after = problem.conditions(result.descent.values[row], row)
     basis_before = scene.basis_under(conditions_before, 0)
     basis_after = scene.basis_under(conditions_after, 0)
-    is_same_light = torch.equal(conditions_before.light[0], conditions_after.light[0])
+    is_same_light = torch.equal(conditions_before.light, conditions_after.light)
     if is_same_light and basis_before == basis_after:
         return {}
-    cameras = scene.cameras[example]
-    spheres_before = [
-        light_sphere(conditions_before.light[0], SIDE, camera, basis_before) for camera in cameras
-    ]
-    spheres_after = [
-        light_sphere(conditions_after.light[0], SIDE, camera, basis_after) for camera in cameras
-    ]
+    light_before = conditions_before.light[0]
+    light_after = conditions_after.light[0]
+    spheres_before = []
+    spheres_after = []
+    for camera in scene.cameras[example]:
+        spheres_before.append(light_sphere(light_before, SIDE, camera, basis_before))
+        spheres_after.append(light_sphere(light_after, SIDE, camera, basis_after))
     return {
         "initial light": tiles_of(spheres_before),
         "adversarial light": tiles_of(spheres_after),

@@ -1,4 +1,4 @@
-"""Norm-balls in a space of parameters, uniform draws from them, and steps of gradient descent within them."""
+"""Norm-balls in a space of parameters, and the draws and steps of attacks within them."""
 
 import math
 from collections.abc import Callable
@@ -132,7 +132,10 @@ class StepSettings:
         return domain(values, within=ball)
 
     def sample(
-        self, center: Tensor, generator: torch.Generator, used: Tensor | None = None
+        self,
+        center: Tensor,
+        generator: torch.Generator,
+        used: Tensor | None = None,
     ) -> Tensor:
         """Draw values uniformly from the ball around each center.
 

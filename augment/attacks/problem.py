@@ -91,7 +91,11 @@ class AttackProblem:
         return images
 
     def take_step(
-        self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor
+        self,
+        values: Tensor,
+        gradient: Tensor,
+        examples: Tensor,
+        length: Tensor,
     ) -> Tensor:
         """Take a step of projected gradient descent with each parameter.
 

@@ -148,7 +148,10 @@ def _under_lights(scene: Scene, skies: Tensor) -> Scene:
 
 @torch.no_grad()
 def _confidences(
-    scene: Scene, attack: AttackSettings, classifier: Classifier, groups: int = 1
+    scene: Scene,
+    attack: AttackSettings,
+    classifier: Classifier,
+    groups: int = 1,
 ) -> Tensor:
     """Return the lowest confidence in the right class where an attack would begin.
 

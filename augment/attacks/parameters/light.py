@@ -75,7 +75,9 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
 
 
 def find_light(
-    scene: Scene, light_name: str, parameter_name: str
+    scene: Scene,
+    light_name: str,
+    parameter_name: str,
 ) -> tuple[slice, Harmonics | LocalBasis]:
     """Find a light of a scene by the name of its basis.
 
@@ -96,7 +98,7 @@ def find_light(
         if basis.name == light_name:
             return rows, basis
     raise InputError(
-        f"attack={parameter_name}: the scene has no {light_name}: set scene.{light_name}"
+        f"attack={parameter_name}: the scene has no {light_name}: set scene.{light_name}",
     )
 
 

@@ -127,7 +127,10 @@ class Material(Parameter):
         return conditions
 
     def _with_gloss(
-        self, conditions: Conditions, average_gloss: Tensor, objects: Tensor
+        self,
+        conditions: Conditions,
+        average_gloss: Tensor,
+        objects: Tensor,
     ) -> Conditions:
         """Return a copy of the conditions in which the gloss of the objects has given averages.
 

@@ -77,7 +77,11 @@ class Parameter(ABC):
         return anywhere(values, within)
 
     def take_step(
-        self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor
+        self,
+        values: Tensor,
+        gradient: Tensor,
+        examples: Tensor,
+        length: Tensor,
     ) -> Tensor:
         """Take a step of projected gradient descent.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import torch
 import torch.nn.functional as F
@@ -67,7 +68,7 @@ class Pose(Parameter):
     def __init__(self, scene: Scene, settings: PoseSettings):
         if not scene.settings.silhouettes:
             raise InputError(
-                "attack=pose needs gradients of outlines: set renderer.silhouettes=true"
+                "attack=pose needs gradients of outlines: set renderer.silhouettes=true",
             )
         self._object_of = scene.object_of
         self._vertices = scene.vertices
@@ -88,12 +89,9 @@ class Pose(Parameter):
         camera do not meet. Joints rotate at most by their unit, which is an
         attack value of 1. The other values have no limit.
         """
-        distances = [
-            camera.distance
-            for cameras in scene.cameras
-            for camera in cameras
-            if isinstance(camera, PerspectiveCamera)
-        ]
+        all_cameras = chain.from_iterable(scene.cameras)
+        cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
+        distances = [camera.distance for camera in cameras]
         object_radius = float(scene.vertices.norm(dim=-1).max()) + settings.shift
         # The scale of the object and the distance of the camera change by
         # factors, so the gap between them is measured as a logarithm. Without
