@@ -208,16 +208,18 @@ def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, 
     success = success_in_views.all(1)
     without_noise = result.goal.reached(predicted)
     differences = (images - result.images).abs().flatten(1)
-    return [
-        {
-            "success": bool(success[example]),
-            "success_without_noise": bool(without_noise[example]),
-            **predictions(logits[example], result.classifier.classes),
-            "largest_difference": float(difference.max()),
-            "mean_difference": float(difference.mean()),
-        }
-        for example, difference in enumerate(differences)
-    ]
+    numbers = []
+    for example, difference in enumerate(differences):
+        numbers.append(
+            {
+                "success": bool(success[example]),
+                "success_without_noise": bool(without_noise[example]),
+                **predictions(logits[example], result.classifier.classes),
+                "largest_difference": float(difference.max()),
+                "mean_difference": float(difference.mean()),
+            }
+        )
+    return numbers
 
 
 def render_again(
