@@ -12,7 +12,7 @@ __getattr__, __dir__, __all__ = attach(
         "attacks.norm_ball": ["StepSettings"],
         "build": ["LampsSettings", "ProjectorSettings", "build_scene"],
         "classifiers": ["Classifier", "load_classifier"],
-        "attacks.parameters": ["MaterialSettings", "PoseSettings", "SkylightSettings"],
+        "attacks.parameters.settings": ["MaterialSettings", "PoseSettings", "SkylightSettings"],
         "objects": ["PropSettings", "ObjectSettings"],
         "scene": ["Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from augment.degree import degree_of_scene, reached_gloss, warn_of_cut_light
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
+from augment.progress import progress
 from augment.scene import Scene
-from augment.utils import progress
 from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import (
     FACTOR,

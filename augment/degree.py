@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from augment.attacks.parameters import MaterialSettings, initial_gloss
+from augment.attacks.parameters.material import ROUGHNESS, initial_surface
+from augment.attacks.parameters.settings import MaterialSettings
+from augment.memory import has_memory, operator_bytes
 from augment.objects import SceneObject
 from augment.scene import Scene
-from augment.utils import has_memory
 from renderer.gloss import Gloss, smoothest
 from renderer.light.basis import harmonics_of
 from renderer.light.harmonics import irradiance_error
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 NOTICED = 0.05  # irradiance error, of the rms irradiance, from which on it is told
 SHADED = 2  # degree: of lower ones, irradiance of a point source is off by 0.42 or more, of 2 by 0.09
-BYTES = 8  # An operator takes so many for each pixel and coefficient of the light: two channels of float32.
 COMPARED = 8  # degree, beyond which irradiance of no light is off by NOTICED
 
 
@@ -84,8 +84,8 @@ def reached_gloss(
 
 def _reached_roughness(item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None) -> float:
     """The least roughness of an object's own faces, whatever a variation draws and an attack does."""
-    rows, own = initial_gloss(item)
-    roughness = rows[own, 0]
+    surface = initial_surface(item)
+    roughness = surface.face_gloss[surface.object_mask, ROUGHNESS]
     varnished = varnish is not None and any(varnish.strength)
     attacked = material is not None and any((material.roughness, material.metallic, material.strength))
     if varnish is not None and varnished:
@@ -135,7 +135,8 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
 def _affordable_degree(reached: Smoothest, pixels: int) -> int:
     """The degree that shows all gloss, or the highest from 6 on for whose operators there is memory."""
     degree = max(DEGREE, reached.degree)
-    while degree > DEGREE and not has_memory(BYTES * (degree + 1) ** 2 * pixels, torch.device("cpu")):
+    cpu = torch.device("cpu")
+    while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
         degree -= 1
     return degree
 

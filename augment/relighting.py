@@ -9,8 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from augment.memory import require_memory
 from augment.objects import SceneObject
-from augment.utils import progress, require_memory
+from augment.progress import progress
 from renderer.camera import Camera
 from renderer.image import ImageSettings, background_term
 from renderer.transfer import TransferOperator

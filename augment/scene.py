@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from augment.memory import attack_bytes, require_memory
 from augment.objects import SceneObject
+from augment.progress import progress
 from augment.relighting import Layer, Relighting
 from augment.reshading import Reshading
-from augment.utils import progress, require_memory
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.image import ImageSettings, background_term, clamp, encode
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 AT_ONCE = 2**24  # pixels of the images that are rendered at once
-# Numbers that an attack on the light holds beside the operators: for each pixel of all images, for each of those that
-# are rendered at once, without and with camera effects, and for each number of an example's light.
-KEPT, RENDERED, LIGHTS = 10, (16, 48), 12
 
 
 @dataclass(frozen=True)
@@ -144,8 +142,13 @@ class Scene:
         views = [(example.object, camera) for example in self.examples for camera in example.cameras]
         self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
         renders = f"{len(views)} renders of {size} pixels per side (meshes × views × backgrounds)"
-        kept = KEPT * len(self) + RENDERED[self.camera_effects is not None] * min(len(self), self.at_once)
-        self.attack_bytes = self.lights.element_size() * (kept * self.views * size**2 + LIGHTS * self.lights.numel())
+        pixels_per_example = self.views * size**2
+        self.attack_bytes = attack_bytes(
+            pixels=len(self) * pixels_per_example,
+            pixels_at_once=min(len(self), self.at_once) * pixels_per_example,
+            lights=self.lights,
+            camera_effects=self.camera_effects is not None,
+        )
         require_memory(renders, self.attack_bytes, device)
         shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
         # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory

@@ -11,19 +11,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
-from torch.utils.data._utils.collate import default_collate_fn_map
 
-from augment import utils
+from augment import distributed
 from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import AttackProblem
+from augment.attacks.problem import AttackProblem
+from augment.batches import as_found
 from augment.build import Shown, build_scene
 from augment.classifiers.adapter import NetworkCall
 from augment.degree import with_needed_degree
 from augment.losses import NO_CLASS, is_right, label_loss, require_known
+from augment.progress import Phases
+from augment.random_streams import generator, stream_seed
 from augment.scene import Conditions, Scene
-from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_unit
@@ -152,22 +153,29 @@ class AttackExamples:
         return len(self.labels)
 
 
-class Label(Tensor):
-    """A label (), which PyTorch's DataLoader puts into a batch with numbers, too."""
-
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]  # results are plain
-
-
-# of batches that begin with a render
-default_collate_fn_map[Label] = lambda batch, **_: torch.tensor([int(label) for label in batch])
-
-
 @dataclass(frozen=True)
-class Renders(Dataset[tuple[Tensor, Tensor]]):
-    """Labeled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+class Renders(Dataset[tuple[Tensor, int]]):
+    """Labeled examples. As a data set, it holds pairs of an image on the CPU and a label.
 
-    attack_examples: a few successful ones with what they were before the attack; None where nothing is rendered.
-    As a data set, it holds images and labels on the CPU, so that `data + renders` is both.
+    With data of the same kind, `data + renders` is both. A data set with labels
+    as tensors, such as a `TensorDataset`, needs them as numbers for that, since
+    PyTorch's `DataLoader` makes a batch of one kind of labels.
+
+    Attributes:
+        images: Images in [0, 1], shape (E, 3, H, W).
+        labels: Labels, shape (E,), int64.
+        diagnostics: Plain numbers about the regeneration.
+        attack_examples: A few successful examples with what they were before
+            the attack. None if nothing is rendered.
+
+    Example:
+        >>> tensors = torch.utils.data.TensorDataset(torch.rand(2, 3, 8, 8), torch.tensor([0, 1]))
+        >>> data = [(image, int(label)) for image, label in tensors]
+        >>> renders = Renders(torch.rand(1, 3, 8, 8), torch.tensor([2]), {})
+        >>> both = torch.utils.data.ConcatDataset([data, renders])
+        >>> [(images, labels)] = torch.utils.data.DataLoader(both, batch_size=3)
+        >>> labels
+        tensor([0, 1, 2])
     """
 
     images: Tensor
@@ -176,10 +184,12 @@ class Renders(Dataset[tuple[Tensor, Tensor]]):
     attack_examples: AttackExamples | None = None
 
     def __len__(self) -> int:
+        """Return the number of examples."""
         return len(self.labels)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Label]:
-        return self.images[index].cpu(), self.labels[index].cpu().as_subclass(Label)
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        """Return an image (3, H, W) in [0, 1] on the CPU, and its label."""
+        return self.images[index].cpu(), int(self.labels[index])
 
 
 @dataclass(eq=False, repr=False)
@@ -207,7 +217,7 @@ class AugmentationService:
         require_kind("settings", self.settings, AugmentationSettings, "augment.AugmentationSettings(...)")
         require_seed("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
-        require_kind("phases", self.phases, Phases, "augment.utils.Phases()")
+        require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
         self.studied = [int(label) for label in as_integers("studied", self.studied)]
         if self.scene is not None and self.labels.shape != (len(self.scene),):
@@ -289,7 +299,7 @@ class AugmentationService:
         once = self.settings.arm == "random"
         scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), once)
         make = self._random if once else self._adversarial
-        shard = utils.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
+        shard = distributed.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
         return make(model, self.settings.attack.problem(scene), number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -344,7 +354,7 @@ class AugmentationService:
     def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         values = self._random_values(problem, number)
         images = problem.images(values, shard)[:, 0]
-        images = utils.merged(images, shard, len(self.labels), self.world_size)
+        images = distributed.merged(images, shard, len(self.labels), self.world_size)
         success, diagnostics = self._errors(model, images, self.labels)
         examples = choose_attack_examples(model, problem, values, success, self.labels)
         return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
@@ -397,9 +407,9 @@ class AugmentationService:
                 stream_seed(self.seed, number),
             )
         success = fooled.all(1) | result.success_before  # as no attack was needed there
-        success = utils.merged(success, shard, len(self.labels), self.world_size)
+        success = distributed.merged(success, shard, len(self.labels), self.world_size)
         shards = [getattr(result, item.name) for item in fields(result)]
-        result = DescentResult(*(utils.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
+        result = DescentResult(*(distributed.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
         if self.settings.warm_start:
             self._last_values = result.values
         diagnostics = {

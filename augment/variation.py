@@ -14,8 +14,8 @@ from torch import Tensor
 from augment import room
 from augment.camera_effects import CameraEffectSettings, draw_camera_effects, pixel_middles, random_colors
 from augment.objects import another_instance, rotated, varnished
+from augment.progress import progress
 from augment.scene import Example, Scene
-from augment.utils import progress, rotation_matrices
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.gloss import Gloss
@@ -27,6 +27,7 @@ from renderer.light.presets import directional, load_light
 from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
 from renderer.validation import as_list, as_path, require_field_types
+from renderer.vectors import rotation_matrices
 
 UNCHANGED, NONE = (1.0, 1.0), (0.0, 0.0)
 WIDEST = 45.0  # degrees, of a lens that a normalized mesh is in front of

@@ -36,8 +36,8 @@ from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
 from augment.build import build_scene
+from augment.random_streams import generator
 from augment.service import TrainingAttackSettings
-from augment.utils import generator
 from augment.variation import vary
 from benchmarks.common import Row, record, with_median
 from train import checkpoint

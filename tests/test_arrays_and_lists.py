@@ -10,7 +10,7 @@ from torch import Tensor
 
 import augment
 import renderer
-from augment.utils import Phases
+from augment.progress import Phases
 from renderer import harmonics, skylight
 from renderer.camera import Camera
 from renderer.light.local import Lamps

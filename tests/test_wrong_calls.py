@@ -16,9 +16,9 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attacks.attack import AttackResult
+from augment.progress import Phases
 from augment.scene import Conditions
 from augment.service import RandomLightSettings
-from augment.utils import Phases
 from renderer import InputError, harmonics, skylight
 from renderer.light.local import Lamps, Projector
 from renderer.validation import describe

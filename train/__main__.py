@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from augment import utils
+from augment import distributed
 from augment.service import ARMS
 from renderer.errors import InputError
 from train import checkpoint, console
@@ -75,7 +75,7 @@ def main(config: DictConfig) -> None:
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
     """Train the arms to compare with and the arm itself in the first process's folder, and print their table."""
-    given_folder, first, command = broadcast(str(config.run)), utils.rank() == 0, given_command(overrides)
+    given_folder, first, command = broadcast(str(config.run)), distributed.rank() == 0, given_command(overrides)
     folder = Path(given_folder).absolute()
     config.run = str(folder)
     if config.train.resume and not any(map(CHOICE.match, overrides)):  # which stand for all of a command

@@ -33,8 +33,8 @@ from augment.build import LampsSettings, ProjectorSettings, RendererSettings, Sc
 from augment.classifiers import Classifier, load_classifier
 from augment.losses import NO_CLASS
 from augment.objects import ObjectSettings, load_object, on_ground
+from augment.random_streams import generator
 from augment.scene import Scene
-from augment.utils import generator
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.io.files import write_whole

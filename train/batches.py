@@ -12,8 +12,8 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from augment import utils
-from augment.utils import generator
+from augment import distributed
+from augment.random_streams import generator
 from train.data import Split
 from train.image_files import ImageFiles
 
@@ -143,8 +143,8 @@ def training_batches(
         The images, uint8, shape (B, 3, H, W), their labels (B,), and which are renders (B,).
     """
     draws = _draw(images, batch_size, seed, now, flips)
-    share = batch_size // utils.world_size()
-    begin = utils.rank() * share
+    share = batch_size // distributed.world_size()
+    begin = distributed.rank() * share
     draws = draws.of_columns(first, slice(begin, begin + share))
     if isinstance(images.split.images, ImageFiles):
         return _batches_from_files(images, images.split.images, draws)

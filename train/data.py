@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import class_index
-from augment.utils import generator, progress
+from augment.progress import progress
+from augment.random_streams import generator
 from renderer.errors import InputError, in_one_line
 from train import console
 from train.checkpoint import content_hash

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment import utils
+from augment import distributed
 from renderer.errors import InputError, as_device, require_choice
 from train import console
 
@@ -188,7 +188,7 @@ def compiles(choice: str, device: torch.device) -> bool:
     if choice == "always" and device.type == "cpu":
         problem = "train.compile=always is for a GPU, whose graphs it replays"
         raise InputError(f"{problem}: use auto or never")
-    if choice != "auto" or device.type != "cuda" or utils.world_size() > 1:
+    if choice != "auto" or device.type != "cuda" or distributed.world_size() > 1:
         return choice == "always"
     try:
         torch.compile(torch.exp)(torch.zeros(2, device=device))

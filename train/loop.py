@@ -19,9 +19,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from augment import utils
+from augment import distributed
+from augment.batches import eval_mode
+from augment.progress import announced, progress
+from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
-from augment.utils import announced, eval_mode, progress, stream_seed
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
@@ -401,7 +403,7 @@ class Trainer:
             state = self.state_dict()
             best = self._best
             self._best = None
-            if utils.rank() > 0:
+            if distributed.rank() > 0:
                 return
             start = time.perf_counter()
             if best:
@@ -418,7 +420,7 @@ class Trainer:
         moment. They write at the end of an epoch, or on a signal.
         """
         wait = max(SAVING_EVERY, self._saving_took / SAVING_SHARE)
-        return utils.world_size() == 1 and time.perf_counter() - self._saved_at > wait
+        return distributed.world_size() == 1 and time.perf_counter() - self._saved_at > wait
 
     def _description(self) -> dict[str, Any]:
         """Return what is stored beside the weights of a network."""
@@ -473,7 +475,7 @@ class Trainer:
         labels = state["labels"].to(self.device)
         renders = Renders(images, labels, state["diagnostics"][-1])
         # The sums are over all processes, so that one process counts them.
-        sums = state["sums"].to(self.device) * (utils.rank() == 0)
+        sums = state["sums"].to(self.device) * (distributed.rank() == 0)
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 
     def resume(self) -> None:
@@ -532,7 +534,7 @@ class Trainer:
 
 def _require_equal_shares(settings: TrainSettings) -> None:
     """Raise InputError where a batch cannot be divided among processes and parts."""
-    processes = utils.world_size()
+    processes = distributed.world_size()
     if settings.batch_size % (processes * settings.accumulate):
         divisor = f"{processes} processes × train.accumulate={settings.accumulate}"
         raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
@@ -636,7 +638,7 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
     rows = rows.to(device)
     totals = torch.zeros(2, device=device)
     loss_sum, hits = totals
-    batches = rows[utils.rank() :: utils.world_size()].split(EVALUATION_BATCH)
+    batches = rows[distributed.rank() :: distributed.world_size()].split(EVALUATION_BATCH)
     shown = progress(batches, f"{len(rows)} images")
     with eval_mode(model):
         for batch, images in zip(shown, split.squares(batches), strict=True):

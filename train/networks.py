@@ -15,11 +15,11 @@ import torch.nn.functional as F
 from safetensors import safe_open
 from torch import Tensor, nn
 
-from augment import utils
+from augment import distributed
+from augment.batches import eval_mode
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
-from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
 from renderer.io.files import write_whole
 from renderer.validation import as_path, require_kind
@@ -117,17 +117,17 @@ class Dropout(nn.Dropout):
             return x
         if x.device.type == "cpu":
             return x * self._drawn_by_numpy(x)
-        if utils.world_size() == 1:
+        if distributed.world_size() == 1:
             return super().forward(x)
-        whole_batch = torch.rand(utils.world_size(), *x.shape, device=x.device)
-        return x * (whole_batch[utils.rank()] >= self.p) / (1 - self.p)
+        whole_batch = torch.rand(distributed.world_size(), *x.shape, device=x.device)
+        return x * (whole_batch[distributed.rank()] >= self.p) / (1 - self.p)
 
     def _drawn_by_numpy(self, x: Tensor) -> Tensor:
         """0 or 1 / (1 - p) for each value, in x's memory layout: 16 bits each, from a generator that torch seeds."""
-        shard, whole_batch = x.numel(), x.numel() * utils.world_size()
+        shard, whole_batch = x.numel(), x.numel() * distributed.world_size()
         generator = np.random.Generator(np.random.SFC64(int(torch.randint(2**63 - 1, (1,)))))
         words = generator.integers(0, 2**64 - 1, -(-whole_batch // 4), dtype=np.uint64, endpoint=True)
-        bits = torch.from_numpy(words.view(np.int16))[utils.rank() * shard :][:shard]
+        bits = torch.from_numpy(words.view(np.int16))[distributed.rank() * shard :][:shard]
         dropped = round(self.p * DROPOUT_LEVELS)
         passed = bits.ge_(dropped - DROPOUT_LEVELS // 2)  # in place: int16 converts five times faster than bool
         factors = torch.empty_like(x)  # dense, so that its storage can be filled in order

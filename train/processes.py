@@ -13,7 +13,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from augment import utils
+from augment import distributed
 
 # submitit sends this signal before the time of a job is over. Windows does not have it.
 BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)
@@ -42,10 +42,10 @@ def process_group() -> Iterator[None]:
 @contextmanager
 def first_process_first() -> Iterator[None]:
     """Let the first process run the block before the others, which then find a download done."""
-    if utils.rank() > 0:
+    if distributed.rank() > 0:
         dist.barrier()
     yield
-    if utils.rank() == 0 and utils.world_size() > 1:
+    if distributed.rank() == 0 and distributed.world_size() > 1:
         dist.barrier()
 
 
@@ -59,7 +59,7 @@ def broadcast(value: str) -> str:
         The value of the first process.
     """
     values = [value]
-    if utils.world_size() > 1:
+    if distributed.world_size() > 1:
         dist.broadcast_object_list(values, src=0)
     return values[0]
 
@@ -73,7 +73,7 @@ def summed(values: Tensor) -> Tensor:
     Returns:
         The same tensor.
     """
-    if utils.world_size() > 1:
+    if distributed.world_size() > 1:
         dist.all_reduce(values)
     return values
 
@@ -90,7 +90,7 @@ def replicated(model: nn.Module) -> nn.Module:
     Returns:
         The wrapped model, or the model itself if there is one process.
     """
-    if utils.world_size() == 1:
+    if distributed.world_size() == 1:
         return model
     if next(model.parameters()).is_cuda:
         nn.SyncBatchNorm.convert_sync_batchnorm(model)
@@ -145,7 +145,7 @@ class Interruption:
         they were asked the last time.
         """
         has_signal = self._number is not None
-        if utils.world_size() == 1:
+        if distributed.world_size() == 1:
             return has_signal
         before = self._asked
         # The tensor is on the CPU, so that no GPU has to catch up.

@@ -3,17 +3,21 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from augment import utils
+from augment import distributed
+from augment.attacks.norm_ball import StepSettings
+from augment.batches import as_found
 from augment.classifiers.adapter import nearest
 from augment.losses import divergence, is_right, label_loss, ranking_loss
-from augment.utils import as_found, generator, stream_seed
+from augment.random_streams import generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_bytes, to_unit
+from renderer.light.basis import nearest_in_box
 from train.batches import FLIPS
 from train.device import COMPILE
 
@@ -24,7 +28,10 @@ TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 OPTIMIZERS = ("sgd", "adamw")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 ALL_BUT_LAST = "all_but_last"  # of train.freeze: only the last layer learns, as in Kirichenko et al. 2023
-PGD_RADIUS, PGD_STEP, PGD_STEPS = 2 / 255, 1 / 255, 3  # L∞ norm; Madry et al. 2018: 8/255 on CIFAR-10
+# Norm-ball and steps of `pgd`. Madry et al. 2018 have a radius of 8/255 on
+# CIFAR-10.
+PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
+PGD_STEPS = 3
 LARGEST = dict(
     epochs=10**6, images_per_epoch=10**9, batch_size=10**6, accumulate=10**6, checkpoint_every=10**6, threads=1024
 )
@@ -166,7 +173,7 @@ def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] =
         return lambda images, labels, step: images
     if name == "pgd":
         return lambda images, labels, step: pgd(
-            model, images, labels, generator(seed, step, "pgd", utils.rank()), absent
+            model, images, labels, generator(seed, step, "pgd", distributed.rank()), absent
         )
     from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
 
@@ -177,7 +184,7 @@ def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] =
         """torchvision's transforms draw once for a whole batch, and from the global generator."""
         transformed = []
         with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-            for index, image in enumerate(images, utils.rank() * len(images)):
+            for index, image in enumerate(images, distributed.rank() * len(images)):
                 torch.manual_seed(stream_seed(seed, step, index, "distortion"))
                 transformed.append(transform(image))
         return torch.stack(transformed)
@@ -186,17 +193,36 @@ def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] =
 
 
 @torch.enable_grad()
-def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator, absent: Sequence[int] = ()) -> Tensor:
-    """Images in the L∞ ball around the given ones, by steps along the sign of the loss's gradient from a random start
-    (Madry et al. 2018); the model is in eval mode meanwhile."""
+def pgd(
+    model: nn.Module,
+    images: Tensor,
+    labels: Tensor,
+    draws: torch.Generator,
+    absent: Sequence[int] = (),
+) -> Tensor:
+    """Attack images by projected gradient descent from a random start (Madry et al. 2018).
+
+    The steps are those of an attack on the pixels of a scene
+    (`StepSettings.take_step`), without a criterion to stop at.
+
+    Args:
+        model: Classifier of images in [0, 1], which is in eval mode meanwhile.
+        images: Images, shape (B, 3, H, W), uint8.
+        labels: Labels, shape (B,); see `augment.losses.label_loss`.
+        draws: CPU generator of the random start.
+        absent: Further classes that no image of a complementary label shows.
+
+    Returns:
+        Images within the norm-balls of `PGD`, rounded to 8 bits,
+        shape (B, 3, H, W), uint8.
+    """
     clean = to_unit(images)
-    noise = torch.rand(clean.shape, generator=draws).to(clean)
-    adversarial = (clean + PGD_RADIUS * (2 * noise - 1)).clamp(0, 1)
+    possible = partial(nearest_in_box, low=0, high=1)
+    adversarial = PGD.project(PGD.sample(clean, draws), clean, possible)
     with as_found(model):
         for _ in range(PGD_STEPS):
             adversarial.requires_grad_(True)
-            loss = label_loss(model(adversarial), labels, absent=absent).sum()
-            (gradient,) = torch.autograd.grad(loss, adversarial)
-            moved = adversarial.detach() + PGD_STEP * gradient.sign()
-            adversarial = moved.clamp(clean - PGD_RADIUS, clean + PGD_RADIUS).clamp(0, 1)
+            cost = -label_loss(model(adversarial), labels, absent=absent).sum()
+            (gradient,) = torch.autograd.grad(cost, adversarial)
+            adversarial = PGD.take_step(adversarial.detach(), gradient, clean, possible)
     return to_bytes(adversarial)

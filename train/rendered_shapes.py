@@ -12,8 +12,9 @@ import augment
 import renderer
 from augment.build import load_backgrounds
 from augment.objects import SceneObject
+from augment.progress import progress
+from augment.random_streams import generator
 from augment.scene import Scene
-from augment.utils import generator, progress
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
 from renderer.light.presets import ambient, directional

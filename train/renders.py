@@ -5,13 +5,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment import utils
+from augment import distributed
 from augment.build import build_scene
 from augment.classifiers.adapter import class_index, label_names
 from augment.losses import complementary_label
+from augment.progress import Phases
 from augment.scene import Scene
 from augment.service import AugmentationService
-from augment.utils import Phases
 from renderer.errors import InputError
 from train import console
 from train.data import DataSet
@@ -69,8 +69,8 @@ def build_service(
         settings.seed,
         phases,
         studied if is_ranked else (),
-        utils.rank(),
-        utils.world_size(),
+        distributed.rank(),
+        distributed.world_size(),
         images,
     )
 

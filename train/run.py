@@ -11,8 +11,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from augment import utils
-from augment.utils import progress, stream_seed
+from augment import distributed
+from augment.progress import progress
+from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from train import checkpoint, console
 from train.cache import TensorCache, cache_folder
@@ -114,7 +115,7 @@ class Run:
             self._warn_of_stretched_schedule(before.train.epochs)
         elif settings.train.resume:
             console.info("nothing to resume in %s; starting at epoch 1", self.folder)
-        if utils.rank() == 0:
+        if distributed.rank() == 0:
             self._write_config()
 
     def fit(self) -> None:
@@ -127,9 +128,9 @@ class Run:
             self.trainer.device,
             self.trainer.model.precision,
             self._threads,
-            utils.world_size(),
+            distributed.world_size(),
         )
-        is_first = utils.rank() == 0
+        is_first = distributed.rank() == 0
         self.log = RunLog(self.folder, self.trainer.history) if is_first else None
         if self.trainer.initial:
             self._score_initial(self.trainer.initial)
@@ -233,7 +234,7 @@ class Run:
             train = Split(self.data.train.images, labels)
             test = Split(test.images, self._answers)
             self.data = replace(self.data, train=train, test=test)
-        if utils.rank() > 0:
+        if distributed.rank() > 0:
             return
         accuracy = (self._answers == test.labels).float().mean().item()
         if self.data.labeled:
@@ -295,7 +296,7 @@ class Run:
 
     def _score_photographs(self, model: Model, folder: Path) -> dict[str, dict[str, Any]]:
         """Score a model on each folder of photographs; return the first process's summaries."""
-        if utils.rank() > 0:
+        if distributed.rank() > 0:
             return {}
         summaries = {}
         for name, photographs in self.settings.evaluate.folders.items():

@@ -21,9 +21,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from augment.build import RendererSettings, SceneSettings, count_views
 from augment.classifiers.adapter import label_names
+from augment.distributed import world_size
 from augment.objects import ObjectSettings
+from augment.progress import announced
 from augment.service import AugmentationSettings
-from augment.utils import announced, world_size
 from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.rasterizer import Rasterizer, choose

@@ -1,4 +1,4 @@
-"""One example of an attack as a value and as a folder: everything that its images are rendered from, and the images."""
+"""Adversaries: examples of an attack with all that they show, as values and as folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from augment.build import load_background
 from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import FACTOR, InputError, in_one_line, require_bounded, require_file, require_range
+from renderer.errors import (
+    FACTOR,
+    InputError,
+    in_one_line,
+    require_bounded,
+    require_file,
+    require_range,
+)
 from renderer.gloss import Gloss
 from renderer.image import ImageSettings, to_bytes
 from renderer.io.export import export_mesh
@@ -32,13 +39,37 @@ from renderer.mesh import load_mesh
 from renderer.rasterizer import Rasterizer, choose
 from renderer.validation import as_folder
 
+DESCRIPTION = "adversary.json"
+MESH = "mesh.glb"
+LIGHT = "light.json"
+BACKGROUND = "background.png"
+PIXELS = "pixels.npy"
+BEFORE = "before"
+AFTER = "after"
+MITSUBA = "mitsuba"
+MAP_HEIGHT = 256
+
+# Fraction of the brightest radiance that an .hdr file rounds off.
+NOWHERE = 2.0**-8
+
 
 @dataclass(frozen=True)
 class Adversary:
-    """V views of one object, each (3, size, size), before an attack and after.
+    """V views of one object, before an attack and after it, with everything that they show.
 
-    shown: the object with its attacked shape and colors, in the scene's coordinates. light: (size, 3) coefficients of
-    the basis, exposure included. background: (3 or 1, size, size). pixels: (V, 3, size, size) added to images, or None.
+    Attributes:
+        shown: The object with its attacked shape and colors, in the coordinates
+            of the scene.
+        cameras: The V cameras.
+        light: Coefficients of the light after the attack, exposure included,
+            shape (size of the basis, 3).
+        basis: Basis of the light.
+        background: Background in [0, 1], shape (3 or 1, size, size).
+        settings: Settings of the images.
+        images_before: Images before the attack, shape (V, 3, size, size).
+        images: Images after the attack, of the same shape.
+        pixels: What the attack added to the images, of the same shape. None if
+            it did not change pixels.
     """
 
     shown: SceneObject
@@ -53,25 +84,33 @@ class Adversary:
 
     @staticmethod
     def of(
-        scene: Scene, example: int, after: Conditions, before: Tensor, images: Tensor, row: int | None = None
+        scene: Scene,
+        example: int,
+        after: Conditions,
+        before: Tensor,
+        images: Tensor,
+        row: int | None = None,
     ) -> Adversary:
-        """An example of a scene and its images (V, 3, size, size) under a row of conditions, by default its own row."""
-        of_example, row = scene.examples[example], example if row is None else row
-        shown = scene.objects[of_example.object]
-        mesh, albedo_scale, changed = shown.mesh, shown.albedo_scale, after.row(row, shown.mesh)
-        if changed.albedo is not None:
-            added, hue = _as_numpy(changed.albedo), None if changed.hue is None else _as_numpy(changed.hue)
-            mesh, albedo_scale = with_added_albedo(mesh, added, scene.settings.encoding, albedo_scale, hue)
-        if changed.vertices is not None:
-            mesh = replace(mesh, vertices=_as_numpy(changed.vertices), skin=None)
-        if changed.gloss is not None:
-            mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
+        """Return an example of a scene with its images.
+
+        Args:
+            scene: The attacked scene.
+            example: The number of the example.
+            after: Conditions after the attack.
+            before: Images before the attack, shape (V, 3, size, size).
+            images: Images after it, of the same shape.
+            row: Row of the example in the conditions. None for the number of
+                the example.
+        """
+        row = example if row is None else row
+        described = scene.examples[example]
+        shown = scene.objects[described.object]
         return Adversary(
-            shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
+            shown=_attacked_object(shown, after.row(row, shown.mesh), scene.settings.encoding),
             cameras=tuple(camera.fixed() for camera in scene.cameras_under(after, row, example)),
-            light=after.light[row].detach().cpu() * of_example.exposure,
+            light=after.light[row].detach().cpu() * described.exposure,
             basis=scene.basis_under(after, row),
-            background=scene.backgrounds[of_example.background].cpu(),
+            background=scene.backgrounds[described.background].cpu(),
             settings=scene.settings,
             images_before=before.cpu(),
             images=images.cpu(),
@@ -79,45 +118,85 @@ class Adversary:
         )
 
     def scene(self, rasterizer: Rasterizer, device: torch.device | str = "cpu") -> Scene:
-        """A scene of this one example."""
-        rows, background, light = [Example(0, self.cameras, 0)], self.background[None], self.light.to(device)
-        return Scene([self.shown], rows, background, light, self.settings, rasterizer, basis=self.basis)
+        """Return a scene of this one example.
+
+        Args:
+            rasterizer: The rasterizer of the scene.
+            device: The device of the scene.
+        """
+        return Scene(
+            objects=[self.shown],
+            examples=[Example(0, self.cameras, 0)],
+            backgrounds=self.background[None],
+            lights=self.light.to(device),
+            settings=self.settings,
+            rasterizer=rasterizer,
+            basis=self.basis,
+        )
 
     @torch.no_grad()
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
-        """Render the images (V, 3, size, size) again; with the default rasterizer, unless another is given."""
-        rasterizer = rasterizer if isinstance(rasterizer, Rasterizer) else choose(rasterizer or "auto")
+        """Render the images after the attack again.
+
+        Args:
+            rasterizer: A rasterizer or its name. None for the default one.
+
+        Returns:
+            Images in [0, 1], shape (V, 3, size, size).
+        """
+        if not isinstance(rasterizer, Rasterizer):
+            rasterizer = choose(rasterizer or "auto")
         pixels = None if self.pixels is None else self.pixels[None]
-        return self.scene(rasterizer).render(Conditions(self.light[None], pixels=pixels), torch.arange(1))[0]
+        conditions = Conditions(self.light[None], pixels=pixels)
+        return self.scene(rasterizer).render(conditions, torch.arange(1))[0]
+
+
+def _attacked_object(item: SceneObject, changed: Conditions, encoding: str) -> SceneObject:
+    """Return an object with the colors, shape and gloss of a row of conditions."""
+    mesh = item.mesh
+    albedo_scale = item.albedo_scale
+    if changed.albedo is not None:
+        added = _as_numpy(changed.albedo)
+        hue = None if changed.hue is None else _as_numpy(changed.hue)
+        mesh, albedo_scale = with_added_albedo(mesh, added, encoding, albedo_scale, hue)
+    if changed.vertices is not None:
+        mesh = replace(mesh, vertices=_as_numpy(changed.vertices), skin=None)
+    if changed.gloss is not None:
+        mesh = Gloss(*changed.gloss.unbind(1), textured=True).on(mesh)
+    return replace(item, mesh=mesh, albedo_scale=albedo_scale)
 
 
 def _as_numpy(values: Tensor) -> np.ndarray:
+    """Return values as a float64 array."""
     return values.detach().cpu().double().numpy()
 
 
-DESCRIPTION, MESH, LIGHT = "adversary.json", "mesh.glb", "light.json"
-BACKGROUND, PIXELS = "background.png", "pixels.npy"
-BEFORE, AFTER, MITSUBA = "before", "after", "mitsuba"
-MAP_HEIGHT = 256
-NOWHERE = 2.0**-8  # of the brightest radiance: what an .hdr file rounds off
-
-
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
-    """Write the folder; returns {"negative_light": the fraction of the light's energy that is negative}.
+    """Write an adversary, which `reload` reads, and a scene for Mitsuba.
 
-    Mitsuba's scene leaves out negative light, and maps are written only of light that is positive all round.
+    The scene for Mitsuba leaves out negative light. Maps are written only of
+    light that is negative nowhere.
+
+    Args:
+        adversary: The adversary.
+        folder: The folder to write.
+
+    Returns:
+        "negative_light": the fraction of the energy of the environment light
+        that is negative.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shown, settings = adversary.shown, adversary.settings
+    shown = adversary.shown
+    settings = adversary.settings
     export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
-    (_, light), *local = save_lights(folder, adversary.light, adversary.basis)
+    (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
     description = {
         "label": shown.label,
         "name": Path(shown.name).name,
         "own_faces": shown.own,
         "albedo_scale": shown.albedo_scale,
         "gloss": shown.mesh.gloss is not None,
-        "local_lights": [basis.name for basis, _ in local],
+        "local_lights": [basis.name for basis, _ in local_lights],
         "background": _write_background(adversary.background, folder),
         "cameras": [asdict(camera) for camera in adversary.cameras],
         "image": asdict(settings),
@@ -125,23 +204,44 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     }
     if adversary.pixels is not None:
         write_numbers(folder / PIXELS, adversary.pixels.numpy())
-    for name, images in ((BEFORE, adversary.images_before), (AFTER, adversary.images)):
-        write_numbers(folder / f"{name}.npy", images.numpy())
-        for view, image in enumerate(to_bytes(images)):
-            write_image(folder / f"{name}_{view}.png", Image.fromarray(image.permute(1, 2, 0).numpy()))
+    _write_views(adversary.images_before, folder, BEFORE)
+    _write_views(adversary.images, folder, AFTER)
     write_whole(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+
     radiance = to_map(light, MAP_HEIGHT)
     if radiance.min() >= -NOWHERE * radiance.max():
         for suffix in (".hdr", ".exr"):
             write_map(folder / f"light{suffix}", radiance)
-    cameras = adversary.cameras
-    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.albedo_scale, cameras, settings, "light.exr", local)
+    write_mitsuba_scene(
+        folder / MITSUBA,
+        shown.mesh,
+        shown.albedo_scale,
+        adversary.cameras,
+        settings,
+        "light.exr",
+        local_lights,
+    )
     write_map(folder / MITSUBA / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
     return {"negative_light": negative_fraction(radiance)}
 
 
-def save_lights(folder: Path, light: Tensor, basis: Basis, when: str = "") -> list[tuple[Any, Tensor]]:
-    """Write light.json and NAME.json of each local light, `when` after the name; returns bases and coefficients."""
+def save_lights(
+    folder: Path,
+    light: Tensor,
+    basis: Basis,
+    when: str = "",
+) -> list[tuple[Any, Tensor]]:
+    """Write light.json, and NAME.json of each local light.
+
+    Args:
+        folder: The folder to write.
+        light: Coefficients of all lights, shape (size of the basis, 3).
+        basis: Basis of all lights.
+        when: What follows the name of each file, such as "_before".
+
+    Returns:
+        Basis and coefficients of each light, the environment light first.
+    """
     lights = [(part, light[rows]) for rows, part in parts_of(basis)]
     for part, coefficients in lights:
         name = part.name if isinstance(part, LocalBasis) else Path(LIGHT).stem
@@ -149,42 +249,79 @@ def save_lights(folder: Path, light: Tensor, basis: Basis, when: str = "") -> li
     return lights
 
 
-def reload(folder: str | Path) -> Adversary:
-    """Read the folder of an example that `augment.save` wrote. InputError where a file is missing or damaged.
+def _write_background(background: Tensor, folder: Path) -> float | str:
+    """Return the gray value of a background, or write it and return the name of its file."""
+    gray = float(background.flatten()[0])
+    if (background == gray).all():
+        return gray
+    pixels = to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0)
+    write_image(folder / BACKGROUND, Image.fromarray(pixels.numpy()))
+    return BACKGROUND
 
-    >>> lines = augment.save(result, "adversaries")
-    >>> adversary = augment.reload("adversaries/example_000")
-    >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
-    True
+
+def _write_views(images: Tensor, folder: Path, name: str) -> None:
+    """Write images (V, 3, size, size) exactly to one file, and with 8 bits to a file each."""
+    write_numbers(folder / f"{name}.npy", images.numpy())
+    for view, image in enumerate(to_bytes(images)):
+        pixels = image.permute(1, 2, 0).numpy()
+        write_image(folder / f"{name}_{view}.png", Image.fromarray(pixels))
+
+
+def reload(folder: str | Path) -> Adversary:
+    """Read the folder of an example that `augment.save` wrote.
+
+    Args:
+        folder: The folder, such as "adversaries/example_000".
+
+    Returns:
+        The adversary.
+
+    Raises:
+        InputError: If a file is missing or damaged.
+
+    Example:
+        >>> lines = augment.save(result, "adversaries")
+        >>> adversary = augment.reload("adversaries/example_000")
+        >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
+        True
     """
     folder = as_folder("folder", folder)
     path = folder / DESCRIPTION
     require_file(path, "give a folder that an attack wrote, such as .../example_000")
     try:
-        return _described(folder, json.loads(path.read_text(encoding="utf-8")))
+        return _read_adversary(folder, json.loads(path.read_text(encoding="utf-8")))
     except InputError as error:
-        named = str(error).startswith(str(folder))  # the file of the folder that is at fault
-        raise InputError(str(error) if named else f"{path}: {error}") from error
-    except Exception as error:  # JSON, and the types that it may hold in place of a description
-        raise InputError(f"{path} does not describe an adversary ({in_one_line(error)}): write it again") from error
+        # The message may already begin with the file of the folder that is at
+        # fault.
+        is_named = str(error).startswith(str(folder))
+        raise InputError(str(error) if is_named else f"{path}: {error}") from error
+    # JSON, and the types that it may hold instead of a description, raise many
+    # types of errors.
+    except Exception as error:
+        message = f"{path} does not describe an adversary ({in_one_line(error)}): write it again"
+        raise InputError(message) from error
 
 
-def _described(folder: Path, description: dict[str, Any]) -> Adversary:
+def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
+    """Return the adversary of a folder with the given description."""
     settings = ImageSettings(**description["image"])
-    kinds = [PerspectiveCamera if "distance" in camera else OrthographicCamera for camera in description["cameras"]]
-    cameras = tuple(kind(**camera) for kind, camera in zip(kinds, description["cameras"], strict=True))
-    mesh, own = load_mesh(folder / MESH, gloss=bool(description.get("gloss"))), description["own_faces"]
+    cameras = tuple(_camera(camera) for camera in description["cameras"])
+    shown = _read_object(folder, description)
     for camera in cameras:
-        camera.depths(mesh.vertices)  # which refuses a mesh around the camera
-    albedo_scale, own = float(description["albedo_scale"]), None if own is None else int(own)
-    require_range("albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
-    require_range("own_faces", own, 1, len(mesh.faces))
-    local = [read_light(folder / f"{Path(name).name}.json", Projector, Lamps) for name in description["local_lights"]]
-    basis, light = with_local_lights(load_light(str(folder / LIGHT), degree=None), local)
-    background, shape = description["background"], (len(cameras), 3, settings.size, settings.size)
-    background = folder / BACKGROUND if isinstance(background, str) else background
+        # A camera refuses a mesh around it.
+        camera.depths(shown.mesh.vertices)
+    local_lights = []
+    for name in description["local_lights"]:
+        path = folder / f"{Path(name).name}.json"
+        local_lights.append(read_light(path, Projector, Lamps))
+    sky = load_light(str(folder / LIGHT), degree=None)
+    basis, light = with_local_lights(sky, local_lights)
+    background = description["background"]
+    if isinstance(background, str):
+        background = folder / BACKGROUND
+    shape = (len(cameras), 3, settings.size, settings.size)
     return Adversary(
-        shown=SceneObject(str(description["label"]), mesh, albedo_scale, str(description["name"]), own),
+        shown=shown,
         cameras=cameras,
         light=light,
         basis=basis,
@@ -196,23 +333,39 @@ def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     )
 
 
-def _write_background(background: Tensor, folder: Path) -> float | str:
-    """A gray value, or the name of an image file."""
-    gray = float(background.flatten()[0])
-    if (background == gray).all():
-        return gray
-    pixels = to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0)
-    write_image(folder / BACKGROUND, Image.fromarray(pixels.numpy()))
-    return BACKGROUND
+def _camera(description: dict[str, Any]) -> Camera:
+    """Return the camera of a description; one with perspective has a distance."""
+    kind = PerspectiveCamera if "distance" in description else OrthographicCamera
+    return kind(**description)
+
+
+def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
+    """Return the attacked object of a folder with the given description."""
+    mesh = load_mesh(folder / MESH, gloss=bool(description.get("gloss")))
+    own_faces = description["own_faces"]
+    own_faces = None if own_faces is None else int(own_faces)
+    albedo_scale = float(description["albedo_scale"])
+    require_range("albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
+    require_range("own_faces", own_faces, 1, len(mesh.faces))
+    return SceneObject(
+        str(description["label"]),
+        mesh,
+        albedo_scale,
+        str(description["name"]),
+        own_faces,
+    )
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
+    """Return the images of a file, which must have the given shape."""
     require_file(path, "write the adversary again")
     try:
         images = torch.from_numpy(read_numbers(path))
         require_bounded(images=images)
         if images.shape != shape:
             raise InputError(f"it has shape {tuple(images.shape)}, not {shape}")
-    except Exception as error:  # Python's parser raises many types for a damaged header
-        raise InputError(f"{path} cannot be read ({in_one_line(error)}): write the adversary again") from error
+    # Python's parser raises many types of errors for a damaged header.
+    except Exception as error:
+        message = f"{path} cannot be read ({in_one_line(error)}): write the adversary again"
+        raise InputError(message) from error
     return images

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from numbers import Integral
 from typing import Any
 
@@ -17,21 +16,19 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import EOTSettings, Rounded, stored
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import (
-    PARAMETERS,
-    AttackProblem,
-    MaterialSettings,
-    PoseSettings,
-    SkylightSettings,
-    lighting,
-)
+from augment.attacks.parameters import make_parameter, parameter_class
+from augment.attacks.parameters.light import environment_light
+from augment.attacks.parameters.lighting import Lighting
+from augment.attacks.parameters.settings import PARAMETER_NAMES, ParameterSettings
+from augment.attacks.problem import AttackProblem
+from augment.batches import BatchSize
 from augment.classifiers.adapter import Classifier, class_index, require_classifier
 from augment.degree import NOTICED, with_needed_degree
 from augment.losses import logit_gap
+from augment.progress import Phases, progress
+from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.utils import BatchSize, Phases, generator, progress
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.light.basis import parts_of
 from renderer.light.harmonics import irradiance_error
 from renderer.validation import (
     as_list,
@@ -44,18 +41,17 @@ from renderer.validation import (
 
 LEAST_LIKELY = "least_likely"  # in place of a target class
 MOST_NOISE = 255.0  # steps of 8 bits: the whole range of values
-UNSTEADY = ("pose", "material")  # whose adversaries often end where noise still decides
 NOISE_MARGIN = 2.0  # times the range of the leads with noise and without
 
 
 @dataclass
-class AttackSettings:
+class AttackSettings(ParameterSettings):
     """What an attack changes, and how it descends. The defaults are careful: the light stays physically possible, and a
     success survives a camera's noise and 8 bits; the paper has allow_negative=True, margin=0, rounded=False and
     sensor_noise=0.
 
-    lighting, skylight, projector, lamps, positions (of lamps), geometry, pose, material, albedo, pixels: norm-ball and
-    steps of each parameter; None leaves it as it is.
+    The settings of each parameter are those of `ParameterSettings`.
+
     max_steps: renders after the first; the paper's appendix C has 30. shorten: undo a step that did not lower the cost,
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
@@ -70,16 +66,6 @@ class AttackSettings:
     batch_size: images per pass through the classifier, fewer where memory runs out.
     """
 
-    lighting: StepSettings | None = None
-    skylight: SkylightSettings | None = None
-    projector: StepSettings | None = None
-    lamps: StepSettings | None = None
-    positions: StepSettings | None = None
-    geometry: StepSettings | None = None
-    pose: PoseSettings | None = None
-    material: MaterialSettings | None = None
-    albedo: StepSettings | None = None
-    pixels: StepSettings | None = None
     max_steps: int = 30
     shorten: bool = False
     restarts: int = 0
@@ -103,12 +89,9 @@ class AttackSettings:
             raise InputError("lighting and skylight both set the light: choose one of them")
         unlimited = any(settings.radius is None for settings in self.parameters.values())
         if self.restarts and unlimited:
-            raise InputError("restarts draws from the norm-balls: set the radius of every parameter, or restarts=0")
-
-    @property
-    def parameters(self) -> dict[str, StepSettings]:
-        """The settings of the parameters to change, by name."""
-        return {name: settings for name in PARAMETERS if (settings := getattr(self, name)) is not None}
+            raise InputError(
+                "restarts draws from the norm-balls: set the radius of every parameter, or restarts=0",
+            )
 
     @property
     def lead_over_noise(self) -> float:
@@ -117,36 +100,76 @@ class AttackSettings:
             return 0.0
         if self.noise_margin is not None:
             return self.noise_margin
-        return NOISE_MARGIN if any(name in UNSTEADY for name in self.parameters) else 0.0
+        needed = any(parameter_class(name).needs_noise_margin for name in self.parameters)
+        return NOISE_MARGIN if needed else 0.0
 
     def require_parameters(self) -> None:
-        """InputError where nothing is to be changed."""
+        """Check that something is to be changed.
+
+        Raises:
+            InputError: If there are no settings of any parameter.
+        """
         if not self.parameters:
-            raise InputError(f"attack: name what to change, such as attack=lighting; there are {', '.join(PARAMETERS)}")
+            names = ", ".join(PARAMETER_NAMES)
+            raise InputError(
+                f"attack: name what to change, such as attack=lighting; there are {names}",
+            )
 
     def preprocessed_model(self, classifier: nn.Module) -> nn.Module:
-        """The classifier, behind rounding to 8 bits if the images are rounded."""
+        """Return the classifier, behind rounding to 8 bits if the images are rounded.
+
+        Args:
+            classifier: A model from images in [0, 1] to logits.
+        """
         return Rounded(classifier) if self.rounded else classifier
 
     def problem(self, scene: Scene) -> AttackProblem:
-        """The parameters to change of a scene, whose light is made physically possible unless it may be negative."""
+        """Return what an attack with these settings changes of a scene.
+
+        Args:
+            scene: The scene to attack.
+
+        Returns:
+            The scene and its parameters. Unless light may be negative, the
+            light of the scene is first made physically possible.
+        """
         if not self.allow_negative:
             scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
-        make = PARAMETERS | {"lighting": partial(lighting, nonnegative=not self.allow_negative)}
-        return AttackProblem(scene, [make[name](scene, settings) for name, settings in self.parameters.items()])
+        parameters = []
+        for name, settings in self.parameters.items():
+            options = {}
+            if name == Lighting.name:
+                options["nonnegative"] = not self.allow_negative
+            parameters.append(make_parameter(name, scene, settings, **options))
+        return AttackProblem(scene, parameters)
 
 
 @dataclass(frozen=True)
 class AttackResult:
-    """The result of an attack on E examples of V views, a value: `augment.check`, `augment.success_by_radius`,
-    `augment.transfer` and `augment.save` take it.
+    """Result of an attack on E examples of V views, seen by a classifier of C classes.
 
-    images_before, images: (E, V, 3, size, size), not rounded, with the shadows and bounces of each shape in its own
-    colors. logits_before, logits: (E, V, C), of the preprocessed images. success: (E,) bool, whether the goal is
-    reached in every view, as `fooled_in_views` counts it; success_without_noise: by these logits alone;
-    success_with_margin: a success that also leads by `settings.margin` or more in these logits. descent: where the
-    descent ended, whose own success is by its images alone; while shape and colors change, it holds shadows and bounces
-    fixed. seconds: of the descent.
+    It is a value that `augment.check`, `augment.success_by_radius`,
+    `augment.transfer` and `augment.save` take.
+
+    Attributes:
+        problem: The attacked scene, and the parameters that were changed.
+        classifier: The attacked classifier, without rounding.
+        goal: Source and target class of each view.
+        settings: Settings of the attack.
+        seed: Seed of the attack.
+        images_before: Images before the attack, in [0, 1] and not rounded,
+            shape (E, V, 3, size, size).
+        images: Images after the attack, with the shadows and bounces of each
+            shape in its own colors. They have the same shape and range.
+        logits_before: Logits of the preprocessed images before the attack,
+            shape (E, V, C).
+        logits: Logits of the preprocessed images after it, shape (E, V, C).
+        success_in_views: Whether each view counts as a success, as
+            `fooled_in_views` decides, shape (E, V), bool.
+        descent: Where the descent ended. Its own success is that of its images
+            alone. While shape and colors change, it holds shadows and bounces
+            fixed.
+        seconds: Seconds of the descent, by phase.
     """
 
     problem: AttackProblem
@@ -164,48 +187,58 @@ class AttackResult:
 
     @property
     def preprocessed_model(self) -> nn.Module:
-        """See `AttackSettings.preprocessed_model`."""
+        """Classifier with its preprocessing; see `AttackSettings.preprocessed_model`."""
         return self.settings.preprocessed_model(self.classifier)
 
     @property
     def success(self) -> Tensor:
-        """(E,) bool: whether the criterion is met in every view, also with the noise of a sensor."""
+        """Whether every view reaches its goal, also with the noise of a sensor, (E,) bool."""
         return self.success_in_views.all(1)
 
     @property
     def success_without_noise(self) -> Tensor:
-        """(E,) bool: whether the criterion is met in every view, by the images as the classifier gets them."""
+        """Whether every view reaches its goal as the classifier gets it, (E,) bool."""
         return self.goal.reached(self.logits.argmax(2))
 
     @property
     def success_with_margin(self) -> Tensor:
-        """(E,) bool: whether the logits lead by `settings.margin`, too, in every view."""
+        """Whether a success also leads by `settings.margin` in every view, (E,) bool."""
         gaps = logit_gap(self.logits, self.goal.source, self.goal.target)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
-        """(E,) bool: whether the criterion was met in every view before the attack."""
+        """Whether every view reached its goal before the attack, (E,) bool."""
         return self.goal.reached(self.logits_before.argmax(2))
 
     @property
     def clean_correct(self) -> Tensor:
-        """(E,) bool: whether every view was classified correctly before, so that success is the attack's merit."""
+        """Whether every view was classified correctly before the attack, (E,) bool.
+
+        Only then is a success the merit of the attack.
+        """
         return (self.logits_before.argmax(2) == self.goal.source).all(1)
 
     @property
     def steps(self) -> Tensor:
-        """(E,) int64: number of steps."""
+        """Number of steps of each example, (E,) int64."""
         return self.descent.steps
 
     @property
     def conditions(self) -> Conditions:
-        """The lights (E, 49, 3), vertices (E, N, 3), albedos and pixels after the attack; `Conditions`."""
+        """Light, shape, colors and other conditions of the E examples after the attack."""
         return self.problem.conditions(self.descent.values, self.problem.everything)
 
 
 def require_result(result: object) -> None:
-    """InputError unless it is the result of an attack."""
+    """Check that a value is the result of an attack.
+
+    Args:
+        result: The value.
+
+    Raises:
+        InputError: If it is something else.
+    """
     require_kind("result", result, AttackResult, "the result of augment.attack")
 
 
@@ -218,25 +251,41 @@ def attack(
     seed: int = 0,
     force: bool = False,
 ) -> AttackResult:
-    """Change a scene until a classifier errs, example by example; the classifier is left as it was found.
+    """Change a scene until a classifier errs, example by example.
 
-    target: None for any error, a class, a class for each of the views that share what is attacked, or "least_likely",
-    the class of each image's lowest confidence. settings: what is changed, within which norm-balls; by default the
-    light, without a limit. seed: of the restarts. force: also attack what the classifier gets wrong before. The scene
-    lies on the classifier's device.
-    InputError where an argument is of another type, an example is misclassified before, the classifier lacks a class,
-    or a target is the right one.
+    The classifier is left as it was found.
 
-    >>> def logits(images):
-    ...     mean = images.mean((1, 2, 3))
-    ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
-    >>> classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
-    >>> scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
-    >>> light = augment.StepSettings(step_size=0.5)
-    >>> settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
-    >>> result = augment.attack(classifier, scene, settings=settings)
-    >>> result.success, result.images.shape
-    (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
+    Args:
+        classifier: The classifier to attack. The scene lies on its device.
+        scene: The scene, with E examples of V views.
+        target: A class, a class for each of the views that share what is
+            attacked, or "least_likely" for the class of each image's lowest
+            confidence. None for any error.
+        settings: What is changed, and within which norm-balls. By default, the
+            light is changed without a limit.
+        seed: Seed of the restarts and of the noise.
+        force: Whether to attack also what the classifier gets wrong before.
+
+    Returns:
+        The images, logits and successes of the E examples, before the attack
+        and after it.
+
+    Raises:
+        InputError: If an argument is of another type, an example is
+            misclassified before the attack, the classifier lacks a class, or a
+            target is the right class of an example.
+
+    Example:
+        >>> def logits(images):
+        ...     mean = images.mean((1, 2, 3))
+        ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+        >>> classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
+        >>> scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
+        >>> light = augment.StepSettings(step_size=0.5)
+        >>> settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
+        >>> result = augment.attack(classifier, scene, settings=settings)
+        >>> result.success, result.images.shape
+        (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
     """
     require_classifier("classifier", classifier)
     require_kind("scene", scene, Scene, "a scene, such as augment.build_scene(...)")
@@ -246,92 +295,237 @@ def attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     scene = with_needed_degree(scene, settings.material)
-    problem, model = settings.problem(scene), settings.preprocessed_model(classifier)
+    problem = settings.problem(scene)
     warn_of_changed_light(scene, problem.scene)
+    model = settings.preprocessed_model(classifier)
+
     images_before = problem.images(problem.start)
-    before = logits_of(model, images_before, settings.batch_size)
-    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
+    logits_before = logits_of(model, images_before, settings.batch_size)
+    source = source_labels(scene, logits_before, classifier)
     if not force:
-        require_clean_correct(scene, before, labels, classifier)
-    source = labels[:, None].expand(-1, scene.views)
-    goal = Goal(source, target_labels(target, source, before, classifier))
+        require_clean_correct(scene, logits_before, source, classifier)
+    goal = Goal(source, target_labels(target, source, logits_before, classifier))
+
     phases = Phases(problem.start.device)
-    restarts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
+        restarts = random_starts(problem, settings.restarts, seed)
         descent = descend(model, problem, goal, settings, phases, restarts=restarts, seed=seed)
         images = final_images(problem, descent.values, problem.everything, descent.images)
-    after = logits_of(model, images, settings.batch_size)
-    fooled = fooled_in_views(model, images, after.argmax(2), problem.everything, goal, settings, seed)
+
+    logits = logits_of(model, images, settings.batch_size)
+    success_in_views = fooled_in_views(
+        model,
+        images,
+        logits.argmax(2),
+        problem.everything,
+        goal,
+        settings,
+        seed,
+    )
     return AttackResult(
-        problem, classifier, goal, settings, seed, images_before, images, before, after, fooled, descent, phases.take()
+        problem=problem,
+        classifier=classifier,
+        goal=goal,
+        settings=settings,
+        seed=seed,
+        images_before=images_before,
+        images=images,
+        logits_before=logits_before,
+        logits=logits,
+        success_in_views=success_in_views,
+        descent=descent,
+        seconds=phases.take(),
     )
 
 
 def warn_of_changed_light(given: Scene, physical: Scene) -> None:
-    """Warn where making light physical changes its irradiance by more than 5 %.
+    """Warn if making light physical changes its irradiance by more than 5 %.
 
-    Measured is the rms over normals and channels of the error of irradiance of the environment light, relative to the
-    rms irradiance of the given one (`irradiance_error`); the largest of all examples.
+    The change is the rms error of irradiance over normals and channels,
+    relative to the rms irradiance of the given environment light
+    (`irradiance_error`). The largest change of all examples counts.
 
     Args:
         given: The scene before `AttackSettings.problem`.
         physical: The scene of that problem.
     """
-    where, harmonics = parts_of(given.basis)[0]
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
-    error = float(irradiance_error(physical.lights[:, where], given.lights[:, where]).max())
+    rows, harmonics = environment_light(given)
+    error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > NOTICED:
-        told = f"the light is negative in places, and without that its irradiance is off by {error:.0%} (rms)"
-        advice = "a higher scene.degree is closer, and attack.allow_negative=true leaves the light as it is"
-        warnings.warn(f"{told} in {harmonics}: {advice}", stacklevel=3)
+        problem = "the light is negative in places, and without that its irradiance is off by"
+        advice = "a higher scene.degree is closer, and attack.allow_negative=true leaves the light"
+        message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice} as it is"
+        warnings.warn(message, stacklevel=3)
+
+
+@torch.no_grad()
+def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
+    """Compute the logits of the views of examples.
+
+    Args:
+        model: Classifier with its preprocessing.
+        images: Images in [0, 1], shape (E, V, 3, H, W).
+        batch_size: Images per pass, fewer where memory runs out.
+
+    Returns:
+        Logits, shape (E, V, C).
+    """
+    all_images = images.flatten(0, 1)
+    batches = BatchSize(batch_size).map(lambda part: model(all_images[part]), len(all_images))
+    logits = torch.cat(list(progress(batches, "predictions")))
+    return logits.unflatten(0, images.shape[:2])
+
+
+def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tensor:
+    """Return the right class of each view.
+
+    Args:
+        scene: The scene, with E examples of V views.
+        logits: Logits of these views, which lie on the device of the result.
+        classifier: The classifier that has the classes.
+
+    Returns:
+        Classes, shape (E, V), int64.
+
+    Raises:
+        InputError: If the classifier lacks a class.
+    """
+    labels = [classifier.label(label) for label in scene.labels]
+    return torch.tensor(labels, device=logits.device)[:, None].expand(-1, scene.views)
+
+
+def require_clean_correct(
+    scene: Scene,
+    logits: Tensor,
+    source: Tensor,
+    classifier: Classifier,
+) -> None:
+    """Check that every image is classified correctly.
+
+    Args:
+        scene: The scene, with E examples of V views.
+        logits: Logits of the images, shape (E, V, C).
+        source: Right class of each image, shape (E, V).
+        classifier: The classifier that has the classes.
+
+    Raises:
+        InputError: If an image is misclassified. The sentence names the five
+            most probable classes of the first such image.
+    """
+    misclassified = (logits.argmax(2) != source).nonzero().tolist()
+    if not misclassified:
+        return
+    example, view = misclassified[0]
+    item = scene.objects[scene.examples[example].object]
+    shown_count = min(5, len(classifier.classes))
+    confidences, classes = logits[example, view].softmax(0).topk(shown_count)
+    most_probable = [
+        f"{classifier.classes[index]} {confidence:.1%}"
+        for confidence, index in zip(confidences.tolist(), classes.tolist(), strict=True)
+    ]
+    images = f"{len(misclassified)} of {source.numel()} images of {item.name}"
+    raise InputError(
+        f"{images} are not classified as {item.label!r} before any attack "
+        f"(the first: {', '.join(most_probable)}): change the scene, or set force=True"
+    )
 
 
 def target_labels(
     target: str | Sequence[str] | None, source: Tensor, logits: Tensor, classifier: Classifier
 ) -> Tensor | None:
-    """The target classes (E, V), given the right ones (E, V) and the logits (E, V, C) before; None for any error."""
+    """Return the class that an attack leads each view to.
+
+    Args:
+        target: A class, a class for each view, or "least_likely". None for any
+            error.
+        source: Right class of each view, shape (E, V).
+        logits: Logits before the attack, shape (E, V, C).
+        classifier: The classifier that has the classes.
+
+    Returns:
+        Classes, shape (E, V), int64. None for any error.
+
+    Raises:
+        InputError: If the classifier lacks a class, the number of classes is
+            not that of the views, or a target is the right class.
+    """
     if target is None:
         return None
     if isinstance(target, str) and target == LEAST_LIKELY:
         return logits.argmin(2)
-    views = logits.shape[1]
-    if isinstance(target, str):
-        names = [target] * views
-    else:
-        known = is_whole(target) and 0 <= int(target) < len(classifier.classes)  # type: ignore[call-overload]
-        example = classifier.classes[target] if known else classifier.classes[0]  # type: ignore[call-overload]
-        advice = f"the name of a class, such as {example!r}, or a name for each view"
-        names = [str(name) for name in as_list("target", target, str | Integral, advice)]
-    if len(names) != views:
-        counts = f"{len(names)} classes for {views} views that share what is attacked"
+    view_count = logits.shape[1]
+    names = [target] * view_count if isinstance(target, str) else _target_names(target, classifier)
+    if len(names) != view_count:
+        counts = f"{len(names)} classes for {view_count} views that share what is attacked"
         raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")
     indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
-    labels = torch.tensor(indices, device=logits.device).expand(len(logits), views)
+    labels = torch.tensor(indices, device=logits.device).expand(len(logits), view_count)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the right class of an example: name another class")
     return labels
 
 
-def final_images(problem: AttackProblem, values: Tensor, examples: Tensor, images: Tensor) -> Tensor:
-    """Images (A, V, 3, size, size) of examples (A,) under values (A, D), which `problem` rendered; where it holds
-    shadows and bounces fixed while shape, colors or gloss change, rendered again with those of the values."""
-    scene, after = problem.scene, problem.conditions(values, examples)
-    unmoved = after.vertices is after.albedo is after.gloss is None
-    if unmoved or not len(examples) or not scene.settings.global_illumination:
+def _target_names(target: Sequence[str], classifier: Classifier) -> list[str]:
+    """Return the names of a list of target classes, and refuse everything else."""
+    suggested = classifier.classes[0]
+    # Whoever gives the index of a class is told the name of this class.
+    index: Any = target
+    if is_whole(index) and 0 <= int(index) < len(classifier.classes):
+        suggested = classifier.classes[index]
+    advice = f"the name of a class, such as {suggested!r}, or a name for each view"
+    return [str(name) for name in as_list("target", target, str | Integral, advice)]
+
+
+def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Tensor]:
+    """Draw the values with which restarts begin.
+
+    Args:
+        problem: The attacked parameters, each with a radius.
+        count: The number of restarts.
+        seed: Seed of the attack.
+
+    Yields:
+        Values of all examples, shape (E, D).
+    """
+    for number in range(1, count + 1):
+        yield problem.sample(generator(seed, number, "restart"))
+
+
+def final_images(
+    problem: AttackProblem,
+    values: Tensor,
+    examples: Tensor,
+    images: Tensor,
+) -> Tensor:
+    """Return the images of a descent with the shadows and bounces of the attacked shape.
+
+    While shape, colors or gloss change, a descent holds shadows and bounces
+    fixed. Then the images are rendered again.
+
+    Args:
+        problem: The attacked scene and the parameters that were changed.
+        values: Values of the A examples, shape (A, D).
+        examples: Indices of the examples in the problem, shape (A,).
+        images: Images of the descent under these values,
+            shape (A, V, 3, size, size).
+
+    Returns:
+        Images, shape (A, V, 3, size, size).
+    """
+    scene = problem.scene
+    conditions = problem.conditions(values, examples)
+    changed = (conditions.vertices, conditions.albedo, conditions.gloss)
+    has_fixed_bounces = any(part is not None for part in changed)
+    if not has_fixed_bounces or not len(examples) or not scene.settings.global_illumination:
         return images
-    rows = zip(examples.tolist(), images, strict=True)
-    adversaries = (Adversary.of(scene, example, after, image, image, row) for row, (example, image) in enumerate(rows))
-    renders = progress((adversary.render(scene.rasterizer) for adversary in adversaries), "final images", len(images))
-    return torch.stack([*renders]).to(images)
-
-
-@torch.no_grad()
-def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
-    """(E, V, C) of images (E, V, 3, H, W)."""
-    flat = images.flatten(0, 1)
-    logits = BatchSize(batch_size).map(lambda part: model(flat[part]), len(flat))
-    return torch.cat([*progress(logits, "predictions")]).unflatten(0, images.shape[:2])
+    rendered = []
+    for row, example in enumerate(progress(examples.tolist(), "final images")):
+        image = images[row]
+        adversary = Adversary.of(scene, example, conditions, image, image, row)
+        rendered.append(adversary.render(scene.rasterizer))
+    return torch.stack(rendered).to(images)
 
 
 def fooled_in_views(
@@ -343,53 +537,62 @@ def fooled_in_views(
     settings: AttackSettings,
     seed: int,
 ) -> Tensor:
-    """Which views count as a success: this alone decides it, for attacks, their checks, sweeps, transfers and files.
+    """Decide which views count as a success.
 
-    A view counts if it reaches the goal as it is and in each of the images that a camera stores of it, as
-    `augment.attacks.eot.stored` makes them. An example has the same noise wherever it is counted under a seed, so that
-    a search with many tries does not draw the noise again.
+    Attacks, their checks, sweeps, transfers and files all decide by this
+    function. A view counts if it reaches the goal as it is and in each of the
+    images that a camera stores of it (`augment.attacks.eot.stored`). An example
+    has the same noise wherever it is counted under a seed, so that a search
+    with many tries does not draw the noise again.
 
     Args:
-        model: images (N, 3, H, W) in [0, 1] to logits, with its preprocessing.
-        images: (A, V, 3, H, W) in [0, 1], without noise.
-        predicted: (A, V) int64, the classes of these images.
-        examples: (A,) int64, the examples' numbers, on which their noise depends.
-        goal: of these A examples.
-        settings: of the attack; with `sensor_noise=0`, the images as they are decide.
-        seed: of the noise.
+        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
+            [0, 1] to logits.
+        images: Images in [0, 1] without noise, shape (A, V, 3, H, W).
+        predicted: Classes of these images, shape (A, V), int64.
+        examples: Indices of the A examples, on which their noise depends,
+            shape (A,), int64.
+        goal: Source and target classes of the A examples.
+        settings: Settings of the attack. With `sensor_noise=0`, the images as
+            they are decide.
+        seed: Seed of the noise.
 
     Returns:
-        (A, V) bool, on the device of `predicted`.
+        Whether each view counts, shape (A, V), bool, on the device of
+        `predicted`.
     """
     fooled = goal.reached_in_views(predicted)
     rows = torch.nonzero(fooled.any(1)).squeeze(1)
     if not settings.sensor_noise or not len(rows):
         return fooled
-    rows_of_images = rows.to(images.device)
-    noisy_images = stored(
-        images[rows_of_images], settings.sensor_noise, examples.to(rows.device)[rows], seed, "sensor noise"
+    images_of_rows = images[rows.to(images.device)]
+    examples_of_rows = examples.to(rows.device)[rows]
+    goal_of_rows = goal.of(rows)
+    noisy_versions = stored(
+        images_of_rows,
+        settings.sensor_noise,
+        examples_of_rows,
+        seed,
+        "sensor noise",
     )
-    for noisy in noisy_images:
-        classes = logits_of(model, noisy, settings.batch_size).argmax(2).to(fooled.device)
-        fooled[rows] &= goal.of(rows).reached_in_views(classes)
+    for noisy_images in noisy_versions:
+        logits = logits_of(model, noisy_images, settings.batch_size)
+        noisy_predicted = logits.argmax(2).to(fooled.device)
+        fooled[rows] &= goal_of_rows.reached_in_views(noisy_predicted)
     return fooled
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
-    """The predicted classes of logits (..., C) by name and their probabilities, as nested lists for JSON."""
-    best = logits.softmax(-1).max(-1)
-    return {"predicted": np.asarray(classes)[best.indices.cpu().numpy()].tolist(), "confidence": best.values.tolist()}
+    """Return the predicted classes by name, and their probabilities, for JSON.
 
+    Args:
+        logits: Logits, shape (..., C).
+        classes: Names of the C classes.
 
-def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:
-    """InputError, with the five most probable classes, unless every image (E, V) has its label (E,)."""
-    wrong = (logits.argmax(2) != labels[:, None]).nonzero().tolist()
-    if wrong:
-        example, view = wrong[0]
-        item = scene.objects[scene.examples[example].object]
-        confidence, best = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
-        names = (classifier.classes[index] for index in best.tolist())
-        most_probable = ", ".join(f"{name} {p:.1%}" for name, p in zip(names, confidence.tolist(), strict=True))
-        images = f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r}"
-        remedy = "change the scene, or set force=True"
-        raise InputError(f"{images} before any attack (the first: {most_probable}): {remedy}")
+    Returns:
+        Nested lists of shape (...): "predicted" of names, and "confidence" of
+        probabilities.
+    """
+    highest = logits.softmax(-1).max(-1)
+    names = np.asarray(classes)[highest.indices.cpu().numpy()]
+    return {"predicted": names.tolist(), "confidence": highest.values.tolist()}

@@ -1,70 +1,128 @@
-"""Projected gradient descent on the adversarial cost, over anything that renders differentiably.
+"""Projected gradient descent on the adversarial cost.
 
-An example's values x (light, shape, ...) render to V views I_v(x). With a source class s (what the views show) and,
-in a targeted attack, a target class t for each view, descent lowers the paper's equation 1,
+An example is attacked through its values x, such as the coefficients of its
+lighting. They render to V images I_v(x), one for each view v. A classifier f
+maps an image to logits, and CE(f(I), c) is the cross entropy of its prediction
+with class c. Each view has a source class s_v, the class that it shows. In a
+targeted attack it also has a target class t_v. The attack lowers the cost of
+the paper's equation 1,
 
-    cost(x) = Σ_v  −CE(f(I_v(x)), s_v) + CE(f(I_v(x)), t_v),        x ← project(x − length · step(∂cost/∂x)),
+    cost(x) = Σ_v −CE(f(I_v(x)), s_v) + CE(f(I_v(x)), t_v),
 
-where step() scales the gradient (`augment.attacks.norm_ball.StepSettings`) and project() returns into the norm-ball and
-the physically possible. The length is 1; with `shorten`, a step that did not lower the cost is undone and tried at half
-its length. One forward pass gives the cost, the gradient and the predictions. An example is a success once the
-criterion is met in every view by the image as the preprocessed classifier gets it; it leaves the batch once its
-logits also lead by `margin` there and, where the settings ask for it, by more than a sensor's noise changes. Until
-then, the success of lowest cost is kept. Whether it counts is decided after the descent, by `fooled_in_views`.
+by repeating the step
+
+    x ← project(x − length · step(∂cost/∂x)).
+
+`StepSettings.take_step` takes this step: it scales the gradient, and returns the
+nearest values that are feasible and lie in the norm-ball. The length is 1. With
+backtracking (`AttackSettings.shorten`), a step that does not lower the cost is
+undone and tried again at half its length.
+
+One forward and backward pass of the classifier gives the cost, its gradient and
+the predictions. An example succeeds when the predictions reach its goal in
+every view. It is finished when the logits also lead by `AttackSettings.margin`
+in every view and, if the settings ask for it, by more than the noise of a
+sensor changes them. Until then it stays active: it takes further steps, and its
+successful values of lowest cost are kept. Whether a success counts is decided
+after the descent (`augment.attacks.attack.fooled_in_views`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from augment.attacks.eot import ExpectationOverTransformations, stored
+from augment.batches import BatchSize, as_found
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
-from augment.utils import BatchSize, Phases, as_found, generator, progress
+from augment.progress import Phases, progress
+from augment.random_streams import generator
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     from augment.attacks.attack import AttackSettings
-    from augment.attacks.parameters import AttackProblem
+    from augment.attacks.problem import AttackProblem
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Source and target class of each view: an attack lowers the confidence in one and raises it in the other.
+    """Source and target class of each view of an attack.
 
-    source: NO_CLASS where only the target counts. target: NO_CLASS, or None for all views, where any error will do. A
-    goal is reached where every view is classified as its target or, without a target, as anything but its source.
+    An attack lowers the confidence in the source class of each view and raises
+    the confidence in its target class. A view reaches the goal when it is
+    classified as its target or, without a target, as any class except its
+    source. An example reaches the goal when all its views do.
+
+    Attributes:
+        source: Source class of each view. NO_CLASS removes the source from the
+            cost of a view, so that only its target counts.
+        target: Target class of each view. NO_CLASS makes the attack on a view
+            untargeted. None makes the attack on all views untargeted.
+
+    Example:
+        >>> goal = Goal(source=torch.tensor([[0, 0]]))
+        >>> goal.reached(torch.tensor([[2, 1]])), goal.reached(torch.tensor([[2, 0]]))
+        (tensor([True]), tensor([False]))
     """
 
     source: Int[Tensor, "E V"]
     target: Int[Tensor, "E V"] | None = None
 
-    def of(self, examples: Tensor) -> Goal:
-        """The goal of some of the examples."""
-        return Goal(self.source[examples], None if self.target is None else self.target[examples])
+    def of(self, examples: Tensor | slice) -> Goal:
+        """Return the goal of some of the examples.
+
+        Args:
+            examples: Indices of the examples, shape (A,), or a slice.
+        """
+        if self.target is None:
+            return Goal(self.source[examples])
+        return Goal(self.source[examples], self.target[examples])
+
+    def flatten(self) -> Goal:
+        """Return a goal with an entry for each view of each example, in shape (E · V,)."""
+        if self.target is None:
+            return Goal(self.source.flatten())
+        return Goal(self.source.flatten(), self.target.flatten())
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
-        """Whether the predicted classes reach the goal in all views of an example."""
+        """Return whether all views of each example are predicted as its goal demands."""
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
-        """Whether the predicted classes reach the goal, view by view."""
-        erred = predicted != self.source
-        return erred if self.target is None else torch.where(self.target == NO_CLASS, erred, predicted == self.target)
+        """Return whether each view is predicted as its goal demands."""
+        is_misclassified = predicted != self.source
+        if self.target is None:
+            return is_misclassified
+        is_untargeted = self.target == NO_CLASS
+        return torch.where(is_untargeted, is_misclassified, predicted == self.target)
 
 
 @dataclass(frozen=True)
 class DescentResult:
-    """The end of a descent, per example; all tensors lie on the values' device.
+    """Values that a descent found for E examples, with their images and costs.
 
-    values, images: of the step that reached the margin, else of the success of lowest cost, else of the last step that
-    was accepted. success: without noise. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first
-    one was exactly zero.
+    A candidate is a vector of values that the descent evaluated. For each
+    example, one candidate is returned: the one that reached the margin, else
+    the successful one of lowest cost, else the last one from which a step was
+    taken. All tensors lie on the device of the attacked values.
+
+    Attributes:
+        values: Values of the returned candidate.
+        images: Images of the returned candidate, in [0, 1].
+        steps: Number of steps taken, including those of restarts.
+        success_before: Whether the initial values reach the goal.
+        success: Whether the returned candidate reaches the goal, without noise.
+        cost_before: Cost of the initial values (equation 1).
+        cost: Cost of the returned candidate (equation 1).
+        predicted: Class predicted for each view of the returned candidate.
+        zero_gradient: Whether the gradient at the initial values is exactly
+            zero.
     """
 
     values: Float[Tensor, "E D"]
@@ -76,6 +134,48 @@ class DescentResult:
     cost: Float[Tensor, " E"]
     predicted: Int[Tensor, "E V"]
     zero_gradient: Bool[Tensor, " E"]
+
+    def allocate(self, example_count: int) -> DescentResult:
+        """Return an uninitialized result with rows for `example_count` examples.
+
+        The tensors have the dtypes, devices and remaining dimensions of the
+        tensors of this result.
+
+        Args:
+            example_count: Number of examples, that is, of rows of each tensor.
+        """
+        tensors = {}
+        for item in fields(self):
+            tensor = getattr(self, item.name)
+            tensors[item.name] = tensor.new_empty(example_count, *tensor.shape[1:])
+        return DescentResult(**tensors)
+
+    def write(self, rows: Tensor, group: DescentResult) -> None:
+        """Copy the result of a group of examples into the given rows of this result.
+
+        Args:
+            rows: Row of each example of the group, shape (A,).
+            group: Result of the A examples of the group.
+        """
+        for item in fields(self):
+            getattr(self, item.name)[rows] = getattr(group, item.name)
+
+    def add_restart(self, rows: Tensor, restart: DescentResult) -> None:
+        """Add the steps of a restart, and take over its result wherever it succeeds.
+
+        Args:
+            rows: Row of each restarted example, shape (A,). None of these
+                examples has succeeded before.
+            restart: Result of the restart of these A examples.
+        """
+        is_success = restart.success
+        successful_rows = rows[is_success]
+        self.steps[rows] += restart.steps
+        self.values[successful_rows] = restart.values[is_success]
+        self.images[successful_rows] = restart.images[is_success]
+        self.success[successful_rows] = restart.success[is_success]
+        self.cost[successful_rows] = restart.cost[is_success]
+        self.predicted[successful_rows] = restart.predicted[is_success]
 
 
 def descend(
@@ -90,144 +190,500 @@ def descend(
     restarts: Iterable[Tensor] = (),
     seed: int = 0,
 ) -> DescentResult:
-    """Descend from the problem's start and, for examples without success, from further starts. As many examples as the
-    problem renders at once are attacked in a round, so that memory holds no more than theirs.
+    """Attack examples by projected gradient descent, with restarts.
 
-    model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. goal: of
-    the examples. examples: (A,), some of the problem's. start: (A, D) instead of the problem's. restarts: further
-    starts (A, D); one replaces an example's result only if it succeeds; steps add up. seed: of `settings.eot` and of
-    the noise that a lead is compared with.
+    Examples are attacked in groups of at most `problem.at_once`, which limits
+    the memory that the gradients take. The model runs in evaluation mode, and
+    its state is restored afterwards.
+
+    Args:
+        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
+            [0, 1] to logits (N, C).
+        problem: Attacked parameters and the scene that renders them.
+        goal: Source and target classes of the A examples.
+        settings: Number of steps, margin, backtracking, batch size, and the
+            random transformations of EOT (expectation over transformations).
+        phases: Timer to which the seconds of the classifier passes are added.
+            None for no timer.
+        examples: Indices of the attacked examples in the problem, shape (A,).
+            None attacks all examples.
+        start: Initial values, shape (A, D). None starts at `problem.start`.
+        restarts: Further initial values, each of shape (A, D). They are tried
+            in turn for the examples that have not succeeded.
+        seed: Seed of the EOT transformations, and of the noise with which leads
+            are compared.
+
+    Returns:
+        Result of the A examples.
     """
-    phases = phases or Phases()
-    examples = torch.arange(len(problem.start), device=problem.start.device) if examples is None else examples
-    start = problem.start[examples] if start is None else start
+    if examples is None:
+        examples = torch.arange(len(problem.start), device=problem.start.device)
+    if start is None:
+        start = problem.start[examples]
     expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
-    rounds = torch.arange(len(start), device=start.device).split(problem.at_once)
-    restarts = restarts if len(rounds) <= 1 else list(restarts)
-    whole: dict[str, Tensor] = {}
-
-    def run(rows: Tensor, begin: Tensor) -> DescentResult:
-        chosen = examples[rows], begin[rows], goal.of(rows)
-        return _descend_once(model, problem, *chosen, settings, expectation, phases, seed)
-
-    for rows in progress(rounds, "groups of examples") if len(rounds) > 1 else rounds:
-        best = run(rows, start)
-        for restart in restarts:
-            left = torch.nonzero(~best.success).squeeze(1)
-            if not len(left):
-                break
-            again = run(rows[left], restart)
-            better = left[again.success]
-            best.steps[left] += again.steps
-            for name in ("values", "images", "success", "cost", "predicted"):
-                getattr(best, name)[better] = getattr(again, name)[again.success]
-        if len(rounds) == 1:
-            return best
-        for item in fields(best):
-            result = getattr(best, item.name)
-            whole.setdefault(item.name, result.new_empty(len(start), *result.shape[1:]))[rows] = result
-    return DescentResult(**whole)
-
-
-@torch.enable_grad()
-def _descend_once(
-    model: nn.Module,
-    problem: AttackProblem,
-    examples: Tensor,
-    start: Tensor,
-    goal: Goal,
-    settings: AttackSettings,
-    expectation: ExpectationOverTransformations,
-    phases: Phases,
-    seed: int,
-) -> DescentResult:
-    """Of examples (A,) from a start (A, D). Only examples that go on are rendered."""
-    values = start.detach().clone()
-    active = torch.arange(len(values), device=values.device)
-    steps, success = torch.zeros_like(active), torch.zeros_like(active).bool()
-    kept_cost, position_cost = values.new_full((2, len(values)), torch.inf)
-    candidate, position, position_gradient = values.clone(), values.clone(), torch.zeros_like(values)
-    length = values.new_ones(len(values), 1)
-    predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
-    with as_found(model):
-        for step in progress(range(settings.max_steps + 1), "attack, until all succeed"):
-            chosen, active_goal = candidate[active].requires_grad_(True), goal.of(active)
-            rendered = problem.render(chosen, examples[active])
-            shown = rendered.detach()
-            with phases("attack_classifier"):
-                cost, gap, classes, by_image = _classifier_pass(model, shown, active_goal, batch_size, expectation)
-            (gradient,) = torch.autograd.grad(rendered, chosen, by_image)
-            reached = active_goal.reached(classes)
-            if step == 0:
-                images, cost_before, success_before = shown.clone(), cost, reached
-                zero_gradient = gradient.abs().amax(1) == 0
-            done = reached & (gap >= settings.margin)
-            if settings.lead_over_noise:
-                with phases("attack_classifier"):
-                    leading = done.nonzero()[:, 0]
-                    of_leading = shown[leading], examples[active[leading]], active_goal.of(leading)
-                    done[leading] = _leads_over_noise(model, *of_leading, settings, seed)
-            # The next step starts from an accepted one; with `shorten`, from none that raised the cost.
-            accepted = done | (cost < position_cost[active]) if settings.shorten else torch.ones_like(done)
-            # Kept is what would be returned if this step were the last one.
-            better = done | torch.where(success[active], reached & (cost < kept_cost[active]), reached | accepted)
-            masks = torch.stack([accepted, better, ~done]).cpu()  # at once, since the host waits here for a GPU
-            on, rows, left = (mask.nonzero()[:, 0].to(values.device, non_blocking=True) for mask in masks)
-            length[active] /= 2 - accepted[:, None].to(length)
-            moved, kept = active[on], active[rows]
-            position[moved], position_gradient[moved] = candidate[moved], gradient[on]
-            position_cost[moved] = cost[on]
-            values[kept], images[kept], kept_cost[kept] = candidate[kept], shown[rows], cost[rows]
-            predicted[kept], success[kept] = classes[rows], reached[rows]
-            active = active[left]
-            if step == settings.max_steps or not len(active):
-                break
-            stepped = position[active] - length[active] * problem.step(position_gradient[active])
-            candidate[active] = problem.project(stepped, examples[active])
-            steps[active] += 1
-    return DescentResult(
-        values, images, steps, success_before, success, cost_before, kept_cost, predicted, zero_gradient
+    descent = Descent(
+        model=model,
+        problem=problem,
+        settings=settings,
+        expectation=expectation,
+        phases=phases or Phases(),
+        seed=seed,
     )
+    rows_by_group = torch.arange(len(start), device=start.device).split(problem.at_once)
+    if len(rows_by_group) == 1:
+        return descent.run_with_restarts(goal, examples, start, restarts)
+
+    # Every group needs all restarts, but an iterator yields them only once.
+    restarts = list(restarts)
+    result = None
+    for rows in progress(rows_by_group, "groups of examples"):
+        group_result = descent.run_with_restarts(
+            goal.of(rows),
+            examples[rows],
+            start[rows],
+            (restart[rows] for restart in restarts),
+        )
+        if result is None:
+            result = group_result.allocate(len(start))
+        result.write(rows, group_result)
+    assert result is not None, "there are at least two groups"
+    return result
 
 
-@torch.no_grad()
-def _leads_over_noise(
-    model: nn.Module, images: Tensor, examples: Tensor, goal: Goal, settings: AttackSettings, seed: int
-) -> Tensor:
-    """Whether images (A, V, 3, H, W) lead by more than noise changes, in every view, (A,) bool: whether the smallest
-    lead of their logits, with noise and without, is `settings.lead_over_noise` times the range of these leads. The
-    draws of noise are not those by which a success is counted."""
-    if not len(images):
-        return examples.new_zeros(0, dtype=torch.bool)
-    noisy_images = stored(images, settings.sensor_noise, examples, seed, "noise margin")
-    leads = []
-    for shown in (images, *noisy_images):
-        flat = shown.flatten(0, 1)
-        logits = torch.cat([model(part) for part in flat.split(settings.batch_size)])
-        leads.append(logit_gap(logits.unflatten(0, shown.shape[:2]), goal.source, goal.target))
-    smallest, largest = torch.stack(leads).aminmax(dim=0)
-    return (smallest >= settings.lead_over_noise * (largest - smallest)).all(1)
+@dataclass(frozen=True)
+class Descent:
+    """Projected gradient descent against one classifier.
+
+    Attributes:
+        model: Classifier with its preprocessing.
+        problem: Attacked parameters and the scene that renders them.
+        settings: Number of steps, margin, backtracking and batch size.
+        expectation: Average of the model output over random transformations of
+            an image.
+        phases: Timer of the classifier passes.
+        seed: Seed of the noise with which leads are compared.
+    """
+
+    model: nn.Module
+    problem: AttackProblem
+    settings: AttackSettings
+    expectation: ExpectationOverTransformations
+    phases: Phases
+    seed: int
+
+    def run_with_restarts(
+        self, goal: Goal, examples: Tensor, start: Tensor, restarts: Iterable[Tensor]
+    ) -> DescentResult:
+        """Attack examples from their start, and from each restart until they succeed.
+
+        Args:
+            goal: Source and target classes of the A examples.
+            examples: Indices of the attacked examples in the problem,
+                shape (A,).
+            start: Initial values, shape (A, D).
+            restarts: Further initial values, each of shape (A, D).
+
+        Returns:
+            Result of the A examples.
+        """
+        result = self.run(goal, examples, start)
+        for restart in restarts:
+            failed_rows = torch.nonzero(~result.success).squeeze(1)
+            if not len(failed_rows):
+                break
+            failed_goal = goal.of(failed_rows)
+            restarted = self.run(failed_goal, examples[failed_rows], restart[failed_rows])
+            result.add_restart(failed_rows, restarted)
+        return result
+
+    @torch.enable_grad()
+    def run(self, goal: Goal, examples: Tensor, start: Tensor) -> DescentResult:
+        """Take gradient steps until all examples are finished, or `max_steps` of them.
+
+        Only examples that are not finished are rendered and classified.
+
+        Args:
+            goal: Source and target classes of the A examples.
+            examples: Indices of the attacked examples in the problem,
+                shape (A,).
+            start: Initial values, shape (A, D).
+
+        Returns:
+            Result of the A examples.
+        """
+        state = _State.at_start(goal, examples, start, self.settings.batch_size)
+        with as_found(self.model):
+            # The initial values are evaluated before the first step, so there
+            # is one more evaluation than steps.
+            for step in progress(range(self.settings.max_steps + 1), "attack, until all succeed"):
+                evaluation = self._evaluate(state)
+                if step == 0:
+                    state.begin_result(evaluation)
+                decision = self._decide(state, evaluation)
+                state.record(evaluation, decision)
+                if step == self.settings.max_steps or not len(state.active_rows):
+                    break
+                self._step(state)
+        return state.result
+
+    def _evaluate(self, state: _State) -> _Evaluation:
+        """Render and classify the candidates of the N active examples."""
+        candidate = state.candidate[state.active_rows].requires_grad_(True)
+        goal = state.goal.of(state.active_rows)
+        rendered = self.problem.render(candidate, state.examples[state.active_rows])
+        images = rendered.detach()
+        with self.phases("attack_classifier"):
+            score, image_gradient = self._score(images, goal, state.batch_size)
+        # The chain rule continues the gradient from the images to the values.
+        (gradient,) = torch.autograd.grad(rendered, candidate, image_gradient)
+        return _Evaluation(
+            values=candidate.detach(),
+            images=images,
+            score=score,
+            is_goal_reached=goal.reached(score.predicted),
+            gradient=gradient,
+        )
+
+    def _score(self, images: Tensor, goal: Goal, batch_size: BatchSize) -> tuple[_Score, Tensor]:
+        """Compute the costs, logit gaps and predictions of N examples, batch by batch.
+
+        Args:
+            images: Rendered images, shape (N, V, 3, H, W).
+            goal: Source and target classes of the N examples.
+            batch_size: Images per classifier pass.
+
+        Returns:
+            The score of each example, and the gradient of its cost with respect
+            to its images, shape (N, V, 3, H, W).
+        """
+        view_count = images.shape[1]
+        all_images = images.flatten(0, 1)
+        all_gradients = torch.empty_like(all_images)
+        score_batch = partial(self._score_batch, all_images, goal.flatten(), all_gradients)
+        scores = list(batch_size.map(score_batch, len(all_images)))
+        # Each of these has shape (N, V).
+        cost = torch.cat([score.cost for score in scores]).unflatten(0, (-1, view_count))
+        gap = torch.cat([score.gap for score in scores]).unflatten(0, (-1, view_count))
+        predicted = torch.cat([score.predicted for score in scores]).unflatten(0, (-1, view_count))
+        image_gradient = all_gradients.unflatten(0, (-1, view_count))
+        return _Score(cost=cost.sum(1), gap=gap.amin(1), predicted=predicted), image_gradient
+
+    def _score_batch(
+        self,
+        all_images: Tensor,
+        goal: Goal,
+        all_gradients: Tensor,
+        batch_rows: slice,
+    ) -> _Score:
+        """Compute the cost, logit gap and prediction of each image of a batch.
+
+        The gradient of the cost with respect to the batch is written to its
+        rows of `all_gradients`.
+
+        Args:
+            all_images: The images of all examples and views, shape
+                (N · V, 3, H, W).
+            goal: Source and target class of each image, shape (N · V,).
+            all_gradients: Gradients of the costs with respect to all images,
+                shape (N · V, 3, H, W).
+            batch_rows: Rows of the batch among the N · V images.
+
+        Returns:
+            Score of each image of the batch.
+        """
+        batch = all_images[batch_rows].detach().requires_grad_(True)
+        classes = goal.of(batch_rows)
+        logits = self.model(batch)
+        expected_logits = self.expectation(self.model, batch, logits)
+        cost = adversarial_cost(expected_logits, classes.source, classes.target)
+        (batch_gradient,) = torch.autograd.grad(cost.sum(), batch)
+        # Copying keeps the memory layout of the images, whichever layout the
+        # network prefers.
+        all_gradients[batch_rows] = batch_gradient
+        return _Score(
+            cost=cost.detach(),
+            gap=logit_gap(expected_logits.detach(), classes.source, classes.target),
+            predicted=logits.detach().argmax(1),
+        )
+
+    def _decide(self, state: _State, evaluation: _Evaluation) -> _Decision:
+        """Decide which candidates are finished, accepted and kept (see `_Decision`)."""
+        active_rows = state.active_rows
+        is_success = evaluation.is_goal_reached
+        cost = evaluation.score.cost
+        is_finished = is_success & (evaluation.score.gap >= self.settings.margin)
+        if self.settings.lead_over_noise:
+            is_finished = self._with_lead_over_noise(is_finished, state, evaluation)
+        is_accepted = torch.ones_like(is_finished)
+        if self.settings.shorten:
+            is_accepted = is_finished | (cost < state.cost[active_rows])
+        # An example without success keeps its last accepted candidate, or its
+        # first success. Then only a success of lower cost replaces a success.
+        is_cheaper_success = is_success & (cost < state.result.cost[active_rows])
+        has_succeeded = state.result.success[active_rows]
+        is_better = torch.where(has_succeeded, is_cheaper_success, is_success | is_accepted)
+        return _Decision(
+            is_finished=is_finished,
+            is_accepted=is_accepted,
+            is_kept=is_finished | is_better,
+        )
+
+    def _with_lead_over_noise(
+        self,
+        is_finished: Tensor,
+        state: _State,
+        evaluation: _Evaluation,
+    ) -> Tensor:
+        """Return which of the finished examples also lead by more than noise changes, shape (N,).
+
+        Args:
+            is_finished: Mask of the examples that lead by the margin,
+                shape (N,).
+            state: State of the descent.
+            evaluation: Images of the N active examples.
+        """
+        chosen = is_finished.nonzero()[:, 0]
+        rows = state.active_rows[chosen]
+        with self.phases("attack_classifier"):
+            is_leading = self._leads_over_noise(
+                evaluation.images[chosen],
+                state.examples[rows],
+                state.goal.of(rows),
+            )
+        return is_finished.index_copy(0, chosen, is_leading)
+
+    @torch.no_grad()
+    def _leads_over_noise(self, images: Tensor, examples: Tensor, goal: Goal) -> Tensor:
+        """Return whether the views of examples lead by more than noise changes, shape (A,).
+
+        The lead of a view is its logit gap. The smallest lead, with noise and
+        without, must be `AttackSettings.lead_over_noise` times the range of
+        these leads. The noise is not the one by which a success is counted.
+
+        Args:
+            images: Images of the A examples, shape (A, V, 3, H, W).
+            examples: Indices of the examples in the problem, shape (A,).
+            goal: Source and target classes of the A examples.
+        """
+        if not len(images):
+            return examples.new_zeros(0, dtype=torch.bool)
+        noisy_versions = stored(
+            images,
+            self.settings.sensor_noise,
+            examples,
+            self.seed,
+            "noise margin",
+        )
+        leads = []
+        for version in (images, *noisy_versions):
+            batches = version.flatten(0, 1).split(self.settings.batch_size)
+            logits = torch.cat([self.model(batch) for batch in batches])
+            logits_of_views = logits.unflatten(0, version.shape[:2])
+            leads.append(logit_gap(logits_of_views, goal.source, goal.target))
+        smallest, largest = torch.stack(leads).aminmax(dim=0)
+        needed = self.settings.lead_over_noise * (largest - smallest)
+        return (smallest >= needed).all(1)
+
+    def _step(self, state: _State) -> None:
+        """Set the candidates of the active examples to one step from their accepted values."""
+        active_rows = state.active_rows
+        state.candidate[active_rows] = self.problem.take_step(
+            values=state.values[active_rows],
+            gradient=state.gradient[active_rows],
+            examples=state.examples[active_rows],
+            length=state.length[active_rows],
+        )
+        state.result.steps[active_rows] += 1
 
 
-def _classifier_pass(
-    model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize, expectation: ExpectationOverTransformations
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of images (A, V, 3, H, W): the sum of the cost (A,) and the least logit gap (A,) over views, the predicted
-    classes (A, V) of the images as they are, and the gradient of the cost by the images."""
-    views, flat = images.shape[1], images.flatten(0, 1)
-    source, target = goal.source.flatten(), None if goal.target is None else goal.target.flatten()
-    gradient = torch.empty_like(flat)
+@dataclass(frozen=True)
+class _Score:
+    """Cost, logit gap and predicted classes of N examples, or of N single images.
 
-    def compute(part: slice) -> tuple[Tensor, Tensor, Tensor]:
-        batch = flat[part].detach().requires_grad_(True)
-        logits = model(batch)
-        expected = expectation(model, batch, logits)
-        classes = source[part], None if target is None else target[part]
-        cost = adversarial_cost(expected, *classes)
-        (by_image,) = torch.autograd.grad(cost.sum(), batch)
-        gradient[part] = by_image  # laid out as the images are, not as the network's channels
-        return cost.detach(), logit_gap(expected.detach(), *classes), logits.detach().argmax(1)
+    Attributes:
+        cost: Cost (equation 1), summed over the views of an example,
+            shape (N,).
+        gap: Lead of the wanted class in the logits, shape (N,). For an example,
+            it is the smallest lead among the views. It is negative if the goal
+            is not reached.
+        predicted: Predicted classes of the images without EOT transformations.
+            Shape (N, V) for examples, (N,) for single images.
+    """
 
-    parts = zip(*batch_size.map(compute, len(flat)), strict=True)
-    cost, gap, predicted = (torch.cat(part).unflatten(0, (-1, views)) for part in parts)
-    return cost.sum(1), gap.amin(1), predicted, gradient.unflatten(0, (-1, views))
+    cost: Tensor
+    gap: Tensor
+    predicted: Tensor
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """Images, scores and gradients of the candidates of the N active examples.
+
+    Attributes:
+        values: The candidates, shape (N, D).
+        images: Rendered images, shape (N, V, 3, H, W).
+        score: Cost, logit gap and predictions of the N examples.
+        is_goal_reached: Mask of the examples whose predictions reach the goal
+            in every view, shape (N,).
+        gradient: Gradient of the cost with respect to the candidates,
+            shape (N, D).
+    """
+
+    values: Tensor
+    images: Tensor
+    score: _Score
+    is_goal_reached: Tensor
+    gradient: Tensor
+
+
+@dataclass(frozen=True)
+class _Decision:
+    """Decisions about the candidates of the N active examples, as masks of shape (N,).
+
+    Attributes:
+        is_finished: The candidate reaches the goal with the required margin,
+            also over noise.
+        is_accepted: The next step starts from the candidate.
+        is_kept: The candidate is the result of its example unless a later
+            candidate replaces it.
+    """
+
+    is_finished: Tensor
+    is_accepted: Tensor
+    is_kept: Tensor
+
+
+@dataclass
+class _State:
+    """State of a descent of A examples, of which N are still active.
+
+    A step starts from the accepted values and leads to the candidate, which is
+    evaluated next. A row is the position of an example in the tensors of the
+    state and the result.
+
+    Attributes:
+        goal: Source and target classes of the A examples.
+        examples: Indices of the examples in the problem, shape (A,).
+        batch_size: Images per classifier pass. It is halved when memory runs
+            out.
+        active_rows: Rows of the examples that are not finished, shape (N,).
+        values: Accepted values, shape (A, D).
+        gradient: Gradient of the cost at the accepted values, shape (A, D).
+        cost: Cost of the accepted values, shape (A,).
+        length: Length of the next step, shape (A, 1).
+        candidate: Values to evaluate next, shape (A, D).
+        result: Result if the descent ended now. It exists after the first
+            evaluation.
+    """
+
+    goal: Goal
+    examples: Tensor
+    batch_size: BatchSize
+    active_rows: Tensor
+    values: Tensor
+    gradient: Tensor
+    cost: Tensor
+    length: Tensor
+    candidate: Tensor
+    result: DescentResult = field(init=False)
+
+    @classmethod
+    def at_start(cls, goal: Goal, examples: Tensor, start: Tensor, batch_size: int) -> _State:
+        """Create the state before the first evaluation. The initial values are its candidates.
+
+        Args:
+            goal: Source and target classes of the A examples.
+            examples: Indices of the attacked examples in the problem,
+                shape (A,).
+            start: Initial values, shape (A, D).
+            batch_size: Images per classifier pass.
+        """
+        values = start.detach().clone()
+        return cls(
+            goal=goal,
+            examples=examples,
+            batch_size=BatchSize(batch_size),
+            active_rows=torch.arange(len(values), device=values.device),
+            values=values,
+            gradient=torch.zeros_like(values),
+            cost=values.new_full((len(values),), torch.inf),
+            length=values.new_ones(len(values), 1),
+            candidate=values.clone(),
+        )
+
+    def begin_result(self, evaluation: _Evaluation) -> None:
+        """Set `result` from the evaluation of the initial values, with 0 steps and no success.
+
+        All A examples are still active here. `record` then decides about the
+        initial values as about every candidate.
+        """
+        zeros = torch.zeros_like(self.active_rows)
+        self.result = DescentResult(
+            values=self.values.clone(),
+            images=evaluation.images.clone(),
+            steps=zeros,
+            success_before=evaluation.is_goal_reached,
+            success=zeros.bool(),
+            cost_before=evaluation.score.cost,
+            cost=self.cost.clone(),
+            predicted=torch.zeros_like(self.goal.source),
+            zero_gradient=evaluation.gradient.abs().amax(1) == 0,
+        )
+
+    def record(self, evaluation: _Evaluation, decision: _Decision) -> None:
+        """Carry out the decisions about the candidates of the N active examples.
+
+        Args:
+            evaluation: Images, scores and gradients of the candidates.
+            decision: Decisions about the candidates.
+        """
+        self._halve_length(~decision.is_accepted)
+        accepted, kept, unfinished = _indices_of_masks(
+            decision.is_accepted,
+            decision.is_kept,
+            ~decision.is_finished,
+        )
+        self._accept(accepted, evaluation)
+        self._keep(kept, evaluation)
+        self.active_rows = self.active_rows[unfinished]
+
+    def _halve_length(self, is_rejected: Tensor) -> None:
+        """Halve the next step of the active examples whose candidate was rejected."""
+        self.length[self.active_rows] *= torch.where(is_rejected, 0.5, 1.0)[:, None]
+
+    def _accept(self, chosen: Tensor, evaluation: _Evaluation) -> None:
+        """Make the chosen candidates the values from which the next step starts.
+
+        Args:
+            chosen: Indices of candidates among those of the evaluation.
+            evaluation: Images, scores and gradients of the N candidates.
+        """
+        rows = self.active_rows[chosen]
+        self.values[rows] = evaluation.values[chosen]
+        self.gradient[rows] = evaluation.gradient[chosen]
+        self.cost[rows] = evaluation.score.cost[chosen]
+
+    def _keep(self, chosen: Tensor, evaluation: _Evaluation) -> None:
+        """Write the chosen candidates to the result.
+
+        Args:
+            chosen: Indices of candidates among those of the evaluation.
+            evaluation: Images, scores and gradients of the N candidates.
+        """
+        rows = self.active_rows[chosen]
+        self.result.values[rows] = evaluation.values[chosen]
+        self.result.images[rows] = evaluation.images[chosen]
+        self.result.success[rows] = evaluation.is_goal_reached[chosen]
+        self.result.cost[rows] = evaluation.score.cost[chosen]
+        self.result.predicted[rows] = evaluation.score.predicted[chosen]
+
+
+def _indices_of_masks(*masks: Tensor) -> list[Tensor]:
+    """Return the indices of the true entries of each mask of shape (N,).
+
+    All masks are copied to the CPU at once, because each copy waits for the
+    GPU.
+    """
+    device = masks[0].device
+    masks_on_cpu = torch.stack(masks).cpu()
+    return [mask.nonzero()[:, 0].to(device, non_blocking=True) for mask in masks_on_cpu]

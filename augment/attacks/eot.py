@@ -1,5 +1,4 @@
-"""The image as a classifier gets it: rounded to 8 bits, with the noise of a sensor, or under random transformations, as
-of an unsteady camera."""
+"""Images as a classifier gets them: with 8 bits, sensor noise, or random transformations."""
 
 import io
 from collections.abc import Callable, Iterator
@@ -11,21 +10,34 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
-from augment.utils import generator
+from augment.random_streams import generator
 from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
 from renderer.validation import require_field_types
 
-NOISE_DRAWS = 3  # of the sensor's noise, all of which an adversary must survive
+# Draws of the noise of a sensor, all of which an adversary must survive.
+NOISE_DRAWS = 3
 
 
 @dataclass
 class EOTSettings:
-    """Random transformations of an image over which an attack takes the expectation (Athalye et al. 2018, EOT).
+    """Random transformations of an image over which an attack takes the expectation.
 
-    draws: transformations of each image at each step, beside the image as it is; 0 for none. jitter: of the camera, at
-    most this fraction of the image's width, radians and fraction of the distance. exposure: stops, up or down. noise:
-    standard deviation of pixel values. jpeg: the least quality, of at most 100.
+    The method is EOT (Athalye et al. 2018).
+
+    Attributes:
+        draws: Transformations of each image at each step, in addition to the
+            image as it is, from 0 to 1000.
+        jitter: Largest movement of the camera, as a fraction of the width of
+            the image, in radians, and as a fraction of the distance, from 0 to
+            0.5.
+        exposure: Largest change of the exposure, up or down, in stops from 0 to
+            5.
+        noise: Standard deviation of the noise of pixel values, from 0 to 1.
+        jpeg: Lowest quality of JPEG compression, from 1 to 100.
+
+    Raises:
+        InputError: If a setting is out of range.
     """
 
     draws: int = 0
@@ -37,79 +49,137 @@ class EOTSettings:
     def __post_init__(self) -> None:
         require_field_types(self)
         require_range("draws", self.draws, 0, 1000)
-        for name, most in (("jitter", 0.5), ("exposure", 5), ("noise", 1)):
-            require_range(name, getattr(self, name), 0, most)
+        require_range("jitter", self.jitter, 0, 0.5)
+        require_range("exposure", self.exposure, 0, 5)
+        require_range("noise", self.noise, 0, 1)
         require_range("jpeg", self.jpeg, 1, 100)
 
 
 class Rounded(nn.Module):
-    """A model whose images are rounded to 8 bits per channel; the derivative passes straight through."""
+    """Model whose images are rounded to 8 bits per channel. The derivative passes straight through.
+
+    Args:
+        model: Model of images in [0, 1].
+    """
 
     def __init__(self, model: nn.Module):
         super().__init__()
         self.model = model
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.model(straight_through(images, lambda exact: to_unit(to_bytes(exact)).to(exact)))
+        """Return the output of the model for rounded images (N, 3, H, W) in [0, 1]."""
+        return self.model(straight_through(images, _round_to_bytes))
+
+
+def _round_to_bytes(images: Tensor) -> Tensor:
+    """Return images in [0, 1], rounded to 8 bits, in their own type."""
+    return to_unit(to_bytes(images)).to(images)
 
 
 def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) -> Iterator[Tensor]:
-    """Images as a camera stores them, in each of `NOISE_DRAWS` draws of its noise.
+    """Yield images as a camera stores them, once for each draw of its noise.
 
-    A sensor adds its noise before the values are rounded, and so does this. An example's noise depends on the key and
-    on its number alone: not on the other examples, nor on the device, and no other random stream changes.
+    A sensor adds its noise before the values are rounded, and so does this
+    function. The noise of an example depends on the key and its index alone,
+    not on the other examples or the device. No other random stream changes.
 
     Args:
-        images: (A, V, 3, H, W) in [0, 1].
-        deviation: the standard deviation of the Gaussian noise, in steps of 8 bits (1/255).
-        examples: (A,) int64, the numbers of the examples.
-        key: of the random stream, such as the seed of an attack; see `augment.utils.stream_seed`.
+        images: Images in [0, 1], shape (A, V, 3, H, W).
+        deviation: Standard deviation of the Gaussian noise, in steps of 8 bits
+            (1/255).
+        examples: Indices of the examples, shape (A,), int64.
+        key: Key of the random stream, such as the seed of an attack; see
+            `augment.random_streams.stream_seed`.
 
     Yields:
-        (A, V, 3, H, W) in [0, 1], of 8 bits, with values of the images' type.
+        Images of 8 bits as values in [0, 1], of the type of `images`, shape
+        (A, V, 3, H, W), in each of `NOISE_DRAWS` draws.
     """
     draws = [generator(*key, example) for example in examples.tolist()]
     for _ in range(NOISE_DRAWS):
-        noise = [torch.randn(images.shape[1:], generator=draw) for draw in draws]
-        noisy = images + deviation / 255 * torch.stack(noise).to(images)
+        noise = torch.stack([torch.randn(images.shape[1:], generator=draw) for draw in draws])
+        noisy = images + deviation / 255 * noise.to(images)
         yield to_unit(to_bytes(clamp(noisy))).to(images)
 
 
 class ExpectationOverTransformations:
-    """The mean of a model's log-probabilities over images and random transformations of them, drawn anew in each call;
-    the derivative passes straight through their compression."""
+    """Average of the log-probabilities of a model over an image and random transformations of it.
+
+    The transformations are drawn anew in each call. The derivative passes
+    straight through their compression.
+
+    Args:
+        settings: How many transformations, and how strong they are.
+        draws: CPU generator of the random numbers.
+    """
 
     def __init__(self, settings: EOTSettings, draws: torch.Generator):
-        self.settings, self._draws = settings, draws
+        self.settings = settings
+        self._draws = draws
 
     def __call__(self, model: nn.Module, images: Tensor, logits: Tensor) -> Tensor:
-        """(N, C) of images (N, 3, H, W) with logits (N, C); the logits themselves, where nothing is to be drawn."""
+        """Return the average log-probabilities.
+
+        Args:
+            model: Classifier with its preprocessing.
+            images: Images in [0, 1], shape (N, 3, H, W).
+            logits: Logits of these images, shape (N, C).
+
+        Returns:
+            Average log-probabilities, shape (N, C). They are the logits
+            themselves if nothing is to be drawn.
+        """
         if not self.settings.draws:
             return logits
-        others = (model(self._transformed(images)) for _ in range(self.settings.draws))
-        return torch.stack([each.log_softmax(1) for each in (logits, *others)]).mean(0)
+        log_probabilities = [logits.log_softmax(1)]
+        for _ in range(self.settings.draws):
+            transformed_logits = model(self._transformed(images))
+            log_probabilities.append(transformed_logits.log_softmax(1))
+        return torch.stack(log_probabilities).mean(0)
 
     def _transformed(self, images: Tensor) -> Tensor:
-        """Images (N, 3, H, W), each with its own transformation."""
-        settings, count = self.settings, len(images)
-        moved = _moved(images, settings.jitter * self._uniform(count, 4).to(images))
-        brighter = clamp(moved * (2 ** (settings.exposure * self._uniform(count, 1, 1, 1))).to(images))
+        """Return images (N, 3, H, W), each after a transformation of its own.
+
+        The camera moves, the exposure changes, noise is added, and the images
+        are compressed, all with the same quality.
+        """
+        settings = self.settings
+        movements = settings.jitter * self._uniform(len(images), 4)
+        moved = _moved(images, movements.to(images))
+        stops = settings.exposure * self._uniform(len(images), 1, 1, 1)
+        exposed = clamp(moved * (2**stops).to(images))
         noise = settings.noise * torch.randn(images.shape, generator=self._draws)
-        noisy = clamp(brighter + noise.to(images))
+        noisy = clamp(exposed + noise.to(images))
         quality = int(torch.randint(settings.jpeg, 101, (), generator=self._draws))
         return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), quality).to(exact))
 
     def _uniform(self, *shape: int) -> Tensor:
+        """Draw numbers uniformly from -1 to 1."""
         return 2 * torch.rand(*shape, generator=self._draws) - 1
 
 
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
-    """Changed images whose derivative is that of the images as they are."""
-    return images + (change(images.detach()) - images.detach())
+    """Return changed images whose derivative is that of the images as they are.
+
+    Args:
+        images: Images, of any shape.
+        change: A function of images to images of the same shape. It need not be
+            differentiable.
+    """
+    exact = images.detach()
+    return images + (change(exact) - exact)
 
 
 def as_jpeg(images: Tensor, quality: int) -> Tensor:
-    """Images (..., 3, H, W) in [0, 1], float32 on the CPU, compressed at a quality from 1 to 100 and read back."""
+    """Compress images and read them back.
+
+    Args:
+        images: Images in [0, 1] on the CPU, shape (..., 3, H, W).
+        quality: Quality of the compression, from 1 to 100.
+
+    Returns:
+        Images in [0, 1], shape (..., 3, H, W), float32.
+    """
     compressed = []
     for image in to_bytes(images).flatten(0, -4):
         file = io.BytesIO()
@@ -119,11 +189,18 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
     return to_unit(torch.stack(compressed)).view(images.shape)
 
 
-def _moved(images: Tensor, amounts: Tensor) -> Tensor:
-    """Images (N, 3, H, W) shifted, rotated and scaled by amounts (N, 4): fractions of the width across and down,
-    radians, fraction of the size; pixels from outside repeat the border."""
-    across, down, angle, scale = amounts.unbind(1)
-    cos, sin = (1 + scale) * angle.cos(), (1 + scale) * angle.sin()
+def _moved(images: Tensor, movements: Tensor) -> Tensor:
+    """Shift, rotate and scale images. Pixels from outside repeat the border.
+
+    Args:
+        images: Images, shape (N, 3, H, W).
+        movements: Shift across and down as fractions of the width, angle in
+            radians, and growth as a fraction of the size, shape (N, 4).
+    """
+    across, down, angle, growth = movements.unbind(1)
+    cos = (1 + growth) * angle.cos()
+    sin = (1 + growth) * angle.sin()
+    # The rows of the affine maps; an image spans 2 in their coordinates.
     rows = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1)
     grid = F.affine_grid(rows.view(-1, 2, 3), list(images.shape), align_corners=False)
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False)

@@ -23,78 +23,285 @@ from augment.attacks.attack import (
     require_result,
 )
 from augment.attacks.descent import Goal, descend
-from augment.attacks.parameters import AttackProblem
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import parameter_class
+from augment.attacks.problem import AttackProblem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.utils import generator, progress
+from augment.progress import progress
+from augment.random_streams import generator
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.validation import as_list, require_number
 
-GROWTH = (3, 10)  # times as many steps as the attack had
-CHECKED = {  # results of `check` that `warnings` reads
+# `check` also takes so many times as many steps as the attack.
+GROWTH = (3, 10)
+
+# Results of `check` that `warnings` reads.
+CHECKED = {
     "success",
     "success_without_noise",
     "random_search",
     "cost_fell",
     "zero_gradient",
 }
-OF_MESH, OF_VIEW = ("geometry", "pose", "material", "albedo", "pixels"), ("pixels",)  # that no other mesh or view has
 
 
 def check(result: AttackResult) -> dict[str, Any]:
-    """Compare an attack with as many random draws as it has steps, and with descents of 3 and 10 times as many.
+    """Compare an attack with random draws and with longer descents.
 
-    Draws are as far from the start as the attack may go (uniform in the norm-ball) or, without a radius, went. A
-    success counts as in the result, with the noise of a sensor, and also for all longer descents. Returns fractions of
-    the examples and mean costs. cost_fell: of the examples without success before. success, success_with_margin,
-    random_search, success_by_steps, and NAME_without_noise of these but the second: of the clean-correct examples.
+    There are as many draws as the attack has steps. They are as far from the
+    start as the attack may go (uniform in the norm-balls) or, without a radius,
+    went. The longer descents have 3 and 10 times as many steps. A success
+    counts as in the result, with the noise of a sensor.
 
-    >>> checks = augment.check(result)
-    >>> checks["success"], checks["cost"] < checks["cost_before"]
-    (1.0, True)
+    Args:
+        result: The result of `augment.attack`.
+
+    Returns:
+        Fractions of examples, and mean costs. "cost_fell" is a fraction of the
+        examples without success before the attack, and "zero_gradient" one of
+        all examples. "success", "success_with_margin", "random_search",
+        "success_by_steps" (by number of steps), and the same names with
+        "_without_noise", are fractions of the clean-correct examples.
+
+    Raises:
+        InputError: If `result` is no result of an attack.
+
+    Example:
+        >>> checks = augment.check(result)
+        >>> checks["success"], checks["cost"] < checks["cost_before"]
+        (1.0, True)
     """
     require_result(result)
-    descent, problem, clean = result.descent, result.problem, result.clean_correct
-    open_cases = ~result.success_before
-    fell = (descent.cost < descent.cost_before) | result.success_without_noise
-    draw = partial(problem.sample, generator(result.seed, "random search"), descent.values)
+    descent = result.descent
+    is_clean = result.clean_correct
+    is_open = ~result.success_before
+    cost_fell = (descent.cost < descent.cost_before) | result.success_without_noise
+
+    draws = generator(result.seed, "random search")
+    draw = partial(result.problem.sample, draws, descent.values)
     random = _success_by_draws(result, Successes.before(result), draw)
-    by_steps = _success_by_steps(result)
+    counted_by_steps = {}
+    without_noise_by_steps = {}
+    for steps, found in _success_by_steps(result).items():
+        counted_by_steps[steps] = _fraction(found.counted[is_clean])
+        without_noise_by_steps[steps] = _fraction(found.without_noise[is_clean])
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
-        "cost_fell": _fraction(fell[open_cases]) if open_cases.any() else 1.0,
+        "cost_fell": _fraction(cost_fell[is_open]) if is_open.any() else 1.0,
         "zero_gradient": _fraction(descent.zero_gradient),
-        "success": _fraction(result.success[clean]),
-        "success_without_noise": _fraction(result.success_without_noise[clean]),
-        "success_with_margin": _fraction(result.success_with_margin[clean]),
-        "random_search": _fraction(random.counted[clean]),
-        "random_search_without_noise": _fraction(random.without_noise[clean]),
-        "success_by_steps": {steps: _fraction(found.counted[clean]) for steps, found in by_steps.items()},
-        "success_by_steps_without_noise": {
-            steps: _fraction(found.without_noise[clean]) for steps, found in by_steps.items()
-        },
+        "success": _fraction(result.success[is_clean]),
+        "success_without_noise": _fraction(result.success_without_noise[is_clean]),
+        "success_with_margin": _fraction(result.success_with_margin[is_clean]),
+        "random_search": _fraction(random.counted[is_clean]),
+        "random_search_without_noise": _fraction(random.without_noise[is_clean]),
+        "success_by_steps": counted_by_steps,
+        "success_by_steps_without_noise": without_noise_by_steps,
     }
+
+
+def warnings(checks: Mapping[str, Any]) -> list[str]:
+    """Return reasons to doubt an attack.
+
+    Args:
+        checks: The result of `check`.
+
+    Returns:
+        A sentence for each reason.
+    """
+    success = checks["success"]
+    lost_to_noise = checks["success_without_noise"] - success
+    reasons = []
+    if lost_to_noise > success:
+        reasons.append(
+            "most successes do not survive a sensor's noise, a larger attack.margin helps",
+        )
+    if 0 < success <= checks["random_search"]:
+        reasons.append("random search does as well or better")
+    if checks["cost_fell"] < 1:
+        reasons.append("the cost rose in some examples")
+    if checks["zero_gradient"] > 0:
+        reasons.append("some first gradients are exactly zero")
+    return reasons
+
+
+def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
+    """Search norm-balls around the start of an attack, from the smallest to the largest.
+
+    Each ball is searched by descent and at random. A success at one radius
+    counts at all larger radii. Only the other examples are attacked again, from
+    where they ended at the radius before, for `max_steps` more steps, and get
+    as many uniform draws.
+
+    Args:
+        result: The result of `augment.attack`.
+        scales: Factors of radii and steps or, for parameters without a radius,
+            the radii.
+
+    Returns:
+        A dict for each scale, in ascending order. "radii" are by parameter.
+        "adversarial" and "random", (N,) bool, tell of each of the N
+        clean-correct examples whether a descent or a random search succeeds. A
+        success counts as in the result, with the noise of a sensor.
+        "adversarial_without_noise" and "random_without_noise" are without it.
+
+    Raises:
+        InputError: If `result` is no result of an attack, or `scales` are not
+            positive numbers.
+
+    Example:
+        >>> small, large = augment.success_by_radius(result, [0.001, 1])
+        >>> small["radii"], small["adversarial"], large["adversarial"]
+        ({'lighting': 0.001}, tensor([False]), tensor([True]))
+    """
+    require_result(result)
+    scales = _as_scales(scales)
+    draws = generator(result.seed, "sweep")
+    values = result.problem.start.clone()
+    adversarial = Successes.before(result)
+    random = adversarial.clone()
+    rows = []
+    for scale in progress(sorted(set(scales)), "radii"):
+        parameters = result.settings.parameters.items()
+        balls = {name: _scaled(settings, scale) for name, settings in parameters}
+        scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
+        problem = scaled_settings.problem(result.problem.scene)
+        _descend_further(result, problem, values, adversarial)
+        random = _success_by_draws(result, random, partial(problem.sample, draws))
+        rows.append(
+            {
+                "radii": {name: ball.radius for name, ball in balls.items()},
+                **_of_clean_examples("adversarial", adversarial, result),
+                **_of_clean_examples("random", random, result),
+            }
+        )
+    return rows
+
+
+def transfer(
+    result: AttackResult,
+    classifiers: Sequence[Classifier] = (),
+    azimuths: Sequence[float] = (),
+    objects: Sequence[SceneObject] = (),
+) -> list[dict[str, Any]]:
+    """Show adversaries to other classifiers, from other sides and on other objects.
+
+    The A adversaries are the clean-correct examples with success. Added pixels
+    and the background are resized for another classifier.
+
+    Args:
+        result: The result of `augment.attack`.
+        classifiers: Other classifiers, for each of which the adversaries are
+            rendered at its size.
+        azimuths: Degrees by which all cameras are turned around the vertical.
+        objects: Objects that take the place of the attacked ones.
+
+    Returns:
+        A dict for each, for JSON. "network", "azimuth" or "mesh" tells which.
+        "clean_correct" and "success", A values each, tell whether every view is
+        classified correctly before the attack, and whether every view reaches
+        the goal after it, which counts as in the result, with the noise of a
+        sensor. "success_without_noise" is by the images as they are.
+        "predicted_before", "confidence_before", "predicted" and "confidence"
+        have A × V values.
+
+    Raises:
+        InputError: As `require_transferable` says, or if a classifier lacks a
+            class.
+
+    Example:
+        >>> function = result.classifier.function
+        >>> larger = augment.Classifier(function, size=12, classes=["orange", "other"])
+        >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])
+        >>> network["predicted"], turned["azimuth"]
+        ([['other']], '+20°')
+    """
+    require_result(result)
+    classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
+    objects = as_list(
+        "objects",
+        objects,
+        SceneObject,
+        "a list of scene objects, such as scene.objects",
+    )
+    azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
+    for azimuth in azimuths:
+        require_number("azimuths", azimuth)
+        require_range("azimuths", azimuth, -LARGEST, LARGEST)
+    names = [parameter.name for parameter in result.problem.parameters]
+    require_transferable(names, azimuths, objects)
+
+    adversaries = _Adversaries.of(result)
+    rows = []
+    for classifier in classifiers:
+        resized = adversaries.changed(partial(_resized, size=classifier.size))
+        rows.append({"network": classifier.name, **resized.shown_to(classifier)})
+    for azimuth in azimuths:
+        turned = adversaries.changed(partial(_turned, angle=math.radians(azimuth)))
+        rows.append({"azimuth": f"{azimuth:+g}°", **turned.shown_to(result.classifier)})
+    for item in objects:
+        exchanged = adversaries.changed(partial(replace, shown=item))
+        rows.append({"mesh": Path(item.name).name, **exchanged.shown_to(result.classifier)})
+    return rows
+
+
+def require_transferable(
+    parameters: Collection[str],
+    azimuths: Collection[float],
+    objects: Collection[Any],
+) -> None:
+    """Check that what an attack changed can be shown in other views and on other meshes.
+
+    Args:
+        parameters: Names of the attacked parameters.
+        azimuths: Degrees by which cameras are turned.
+        objects: Other meshes.
+
+    Raises:
+        InputError: If a parameter belongs to its view or its mesh alone.
+    """
+    kinds = [parameter_class(name) for name in parameters]
+    of_view = [kind.name for kind in kinds if not kind.fits_other_views]
+    of_mesh = [kind.name for kind in kinds if not kind.fits_other_meshes]
+    for argument, elsewhere, bound in (
+        ("azimuths", azimuths, of_view),
+        ("meshes", objects, of_mesh),
+    ):
+        if elsewhere and bound:
+            problem = f"attacked {bound[0]} cannot be transferred to others"
+            raise InputError(f"{argument}: {problem}, leave one of them out")
 
 
 @dataclass(frozen=True)
 class Successes:
-    """Which of E examples are a success, (E,) bool each: counted as `fooled_in_views` does, and without noise."""
+    """Which of E examples are a success. More successes are added in place.
+
+    Attributes:
+        counted: With the noise of a sensor, as `fooled_in_views` counts,
+            shape (E,), bool.
+        without_noise: By the images as they are, shape (E,), bool.
+    """
 
     counted: Tensor
     without_noise: Tensor
 
     @staticmethod
     def before(result: AttackResult) -> Successes:
-        """Those before any step, which nothing goes on with."""
+        """Return the successes before any step, with which nothing goes on.
+
+        Args:
+            result: The result of an attack.
+        """
         return Successes(result.success_before.clone(), result.success_before.clone())
 
     def clone(self) -> Successes:
+        """Return a copy, which changes on its own."""
         return Successes(self.counted.clone(), self.without_noise.clone())
 
     @property
     def left(self) -> Tensor:
-        """The numbers of the examples that are not counted."""
+        """Indices of the examples that are not counted, shape (A,)."""
         return torch.nonzero(~self.counted).squeeze(1)
 
     def add(
@@ -105,12 +312,21 @@ class Successes:
         examples: Tensor,
         images: Tensor,
     ) -> None:
-        """Count examples (A,) under values (A, D), by the images (A, V, 3, H, W) that the problem rendered of them.
+        """Count the examples that are a success under some values.
 
-        Where these show a success, the final images decide; see `final_images`.
+        Where the images of the problem show a success, the final images decide
+        (see `final_images`).
+
+        Args:
+            result: The attack, with its goal and classifier.
+            problem: What the values are of.
+            values: Values of the A examples, shape (A, D).
+            examples: Indices of the examples, shape (A,).
+            images: Images that the problem rendered of them,
+                shape (A, V, 3, H, W).
         """
-        reached = result.goal.of(examples).reached(_predicted(result, images))
-        rows = torch.nonzero(reached).squeeze(1)
+        is_reached = result.goal.of(examples).reached(_predicted(result, images))
+        rows = torch.nonzero(is_reached).squeeze(1)
         if not len(rows):
             return
         chosen = examples[rows]
@@ -118,44 +334,30 @@ class Successes:
         final = final_images(problem, values[rows], chosen, images[rows])
         predicted = _predicted(result, final)
         fooled = fooled_in_views(
-            result.preprocessed_model, final, predicted, chosen, goal, result.settings, result.seed
+            result.preprocessed_model,
+            final,
+            predicted,
+            chosen,
+            goal,
+            result.settings,
+            result.seed,
         )
         self.without_noise[chosen] |= goal.reached(predicted)
         self.counted[chosen] |= fooled.all(1)
 
 
-def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
-    """By number of steps, the successes of descents from the start; examples that count already are left out."""
-    settings, problem = result.settings, result.problem
-    found = Successes(result.success, result.success_without_noise)
-    by_steps = {settings.max_steps: found}
-    for factor in GROWTH:
-        longer = replace(settings, max_steps=factor * settings.max_steps)
-        found = found.clone()
-        left = found.left
-        if len(left):
-            goal = result.goal.of(left)
-            model = result.preprocessed_model
-            end = descend(model, problem, goal, longer, examples=left, seed=result.seed)
-            found.add(result, problem, end.values, left, end.images)
-        by_steps[longer.max_steps] = found
-    return by_steps
+def _predicted(result: AttackResult, images: Tensor) -> Tensor:
+    """Return the classes (A, V) that the attacked classifier sees in images (A, V, 3, H, W)."""
+    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    return logits.argmax(2)
 
 
-def warnings(checks: Mapping[str, Any]) -> list[str]:
-    """Reasons to doubt an attack with these results of `check`."""
-    lost = checks["success_without_noise"] - checks["success"]
-    reasons = {
-        "most successes do not survive a sensor's noise, a larger attack.margin helps": lost > checks["success"],
-        "random search does as well or better": 0 < checks["success"] <= checks["random_search"],
-        "the cost rose in some examples": checks["cost_fell"] < 1,
-        "some first gradients are exactly zero": checks["zero_gradient"] > 0,
-    }
-    return [warning for warning, holds in reasons.items() if holds]
-
-
-def _success_by_draws(result: AttackResult, found: Successes, draw: Callable[[], Tensor]) -> Successes:
-    """What was found, with what as many draws (E, D) as the attack had steps add to it."""
+def _success_by_draws(
+    result: AttackResult,
+    found: Successes,
+    draw: Callable[[], Tensor],
+) -> Successes:
+    """Return what was found, and what as many draws (E, D) as the attack had steps add to it."""
     found = found.clone()
     for _ in progress(range(result.settings.max_steps), "random search"):
         left = found.left
@@ -168,178 +370,205 @@ def _success_by_draws(result: AttackResult, found: Successes, draw: Callable[[],
     return found
 
 
-def _predicted(result: AttackResult, images: Tensor) -> Tensor:
-    return logits_of(result.preprocessed_model, images, result.settings.batch_size).argmax(2)
+def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
+    """Return the successes of the attack and of longer ones from its start, by number of steps.
 
-
-def _fraction(values: Tensor) -> float:
-    return float(values.double().mean()) if len(values) else 0.0
-
-
-def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
-    """Search norm-balls around an attack's start from the smallest to the largest, by descent and at random.
-
-    scales: factors of radii and steps or, without a radius, the radii. A success at one radius counts at all larger
-    radii; only the rest is attacked again, from where it ended at the radius before, for `max_steps` more steps, and
-    gets as many uniform draws. Returns for each scale, ascending: radii, by parameter; adversarial and random, (N,)
-    bool of the N clean-correct examples, whether a descent or a random search succeeds, which counts as in the result,
-    with the noise of a sensor; adversarial_without_noise and random_without_noise.
-
-    >>> small, large = augment.success_by_radius(result, [0.001, 1])
-    >>> small["radii"], small["adversarial"], large["adversarial"]
-    ({'lighting': 0.001}, tensor([False]), tensor([True]))
+    Examples that a shorter descent counts already are not attacked again.
     """
-    require_result(result)
-    scales = as_list("scales", scales, object, "a list of factors of the radii")
-    if not scales:
-        raise InputError("scales is empty: give factors of the radii")
-    for scale in scales:
-        require_number("scales", scale)
-        require_range("scales", scale, 1 / FACTOR, FACTOR)
-    settings, problem, goal, clean = result.settings, result.problem, result.goal, result.clean_correct
-    draws = generator(result.seed, "sweep")
-    values, found = problem.start.clone(), Successes.before(result)
-    random, rows = found.clone(), []
-    for scale in progress(sorted(set(scales)), "radii"):
-        balls: dict[str, Any] = {
-            name: replace(steps, radius=scale)
-            if steps.radius is None
-            else replace(steps, radius=scale * steps.radius, step_size=scale * steps.step_size)
-            for name, steps in settings.parameters.items()
-        }
-        scaled = replace(settings, **balls).problem(problem.scene)
+    settings = result.settings
+    found = Successes(result.success, result.success_without_noise)
+    by_steps = {settings.max_steps: found}
+    for factor in GROWTH:
+        longer = replace(settings, max_steps=factor * settings.max_steps)
+        found = found.clone()
         left = found.left
         if len(left):
             end = descend(
                 result.preprocessed_model,
-                scaled,
-                goal.of(left),
-                settings,
+                result.problem,
+                result.goal.of(left),
+                longer,
                 examples=left,
-                start=values[left],
                 seed=result.seed,
             )
-            values[left] = end.values
-            found.add(result, scaled, end.values, left, end.images)
-        random = _success_by_draws(result, random, partial(scaled.sample, draws))
-        row: dict[str, Any] = {"radii": {name: ball.radius for name, ball in balls.items()}}
-        for method, successes in (("adversarial", found), ("random", random)):
-            row[method] = successes.counted[clean].cpu()
-            row[f"{method}_without_noise"] = successes.without_noise[clean].cpu()
-        rows.append(row)
-    return rows
+            found.add(result, result.problem, end.values, left, end.images)
+        by_steps[longer.max_steps] = found
+    return by_steps
 
 
-def transfer(
+def _fraction(values: Tensor) -> float:
+    """Return the mean of values (N,), which is 0 of none."""
+    return float(values.double().mean()) if len(values) else 0.0
+
+
+def _as_scales(scales: Sequence[float]) -> list[float]:
+    """Return factors of radii as a list, and refuse everything else."""
+    listed = as_list("scales", scales, object, "a list of factors of the radii")
+    if not listed:
+        raise InputError("scales is empty: give factors of the radii")
+    for scale in listed:
+        require_number("scales", scale)
+        require_range("scales", scale, 1 / FACTOR, FACTOR)
+    return listed
+
+
+def _scaled(settings: StepSettings, scale: float) -> StepSettings:
+    """Return settings with a scaled norm-ball and steps, or with the scale as their radius."""
+    if settings.radius is None:
+        return replace(settings, radius=scale)
+    return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
+
+
+def _descend_further(
     result: AttackResult,
-    classifiers: Sequence[Classifier] = (),
-    azimuths: Sequence[float] = (),
-    objects: Sequence[SceneObject] = (),
-) -> list[dict[str, Any]]:
-    """Render an attack's A adversaries, its clean-correct examples with success, elsewhere: for other classifiers, each
-    at its size; for the attacked one, from cameras turned by degrees around the vertical, and with other objects.
+    problem: AttackProblem,
+    values: Tensor,
+    found: Successes,
+) -> None:
+    """Attack the examples that are left from their values (E, D), which change, as does `found`."""
+    left = found.left
+    if not len(left):
+        return
+    end = descend(
+        result.preprocessed_model,
+        problem,
+        result.goal.of(left),
+        result.settings,
+        examples=left,
+        start=values[left],
+        seed=result.seed,
+    )
+    values[left] = end.values
+    found.add(result, problem, end.values, left, end.images)
 
-    Returns a dict for each, for JSON. network, azimuth or mesh: which. clean_correct, success: A times whether every
-    view is classified correctly before the attack, and whether the goal is reached in every view after it, which counts
-    only of the clean-correct, and as in the result with the noise of a sensor; success_without_noise: by the images as
-    they are. predicted_before, confidence_before, predicted, confidence: A × V. Added pixels and the background are
-    resized for another network. InputError: as `require_transferable`, and a class that one lacks.
 
-    >>> larger = augment.Classifier(result.classifier.function, size=12, classes=["orange", "other"])
-    >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])
-    >>> network["predicted"], turned["azimuth"]
-    ([['other']], '+20°')
+def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
+    """Return which clean-correct examples a method of search found, with noise and without."""
+    is_clean = result.clean_correct
+    return {
+        method: found.counted[is_clean].cpu(),
+        f"{method}_without_noise": found.without_noise[is_clean].cpu(),
+    }
+
+
+@dataclass(frozen=True)
+class _Adversaries:
+    """Adversaries of an attack, with what they were before it.
+
+    Attributes:
+        result: The attack.
+        examples: Number of each of the A adversaries among the examples.
+        before: What they were before the attack.
+        after: What they are after it.
     """
-    require_result(result)
-    classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
-    objects = as_list("objects", objects, SceneObject, "a list of scene objects, such as scene.objects")
-    azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
-    for azimuth in azimuths:
-        require_number("azimuths", azimuth)
-        require_range("azimuths", azimuth, -LARGEST, LARGEST)
-    require_transferable([parameter.name for parameter in result.problem.parameters], azimuths, objects)
-    problem, attacked, scene = result.problem, result.classifier, result.problem.scene
-    ends = problem.conditions(problem.start, problem.everything), result.conditions
-    chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
-    images = [*zip(result.images_before, result.images, strict=True)]
-    sides = [[Adversary.of(scene, row, end, *images[row]) for row in chosen] for end in ends]
 
-    def elsewhere(
-        kind: str, name: str, change: Callable[[Adversary], Adversary], classifier: Classifier = attacked
-    ) -> dict[str, Any]:
-        before, after = ([change(adversary) for adversary in side] for side in sides)
-        source, target = labels([[adversary.shown.label] * scene.views for adversary in after], classifier), None
-        if result.goal.target is not None:
-            names = [[attacked.classes[index] for index in result.goal.target[example]] for example in chosen]
-            target = labels(names, classifier)
-        images_after = rendered(after, classifier)
-        logits_before = logits(rendered(before, classifier), classifier)
-        logits_after = logits(images_after, classifier)
+    result: AttackResult
+    examples: list[int]
+    before: list[Adversary]
+    after: list[Adversary]
+
+    @staticmethod
+    def of(result: AttackResult) -> _Adversaries:
+        """Return the clean-correct examples with success."""
+        problem = result.problem
+        chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
+        conditions_before = problem.conditions(problem.start, problem.everything)
+        conditions_after = result.conditions
+        before = []
+        after = []
+        for example in chosen:
+            images = result.images_before[example], result.images[example]
+            before.append(Adversary.of(problem.scene, example, conditions_before, *images))
+            after.append(Adversary.of(problem.scene, example, conditions_after, *images))
+        return _Adversaries(result, chosen, before, after)
+
+    def changed(self, change: Callable[[Adversary], Adversary]) -> _Adversaries:
+        """Return the same adversaries after a change of where they are shown."""
+        before = [change(adversary) for adversary in self.before]
+        after = [change(adversary) for adversary in self.after]
+        return replace(self, before=before, after=after)
+
+    def shown_to(self, classifier: Classifier) -> dict[str, Any]:
+        """Return what a classifier predicts for the adversaries; see `transfer`."""
+        settings = self.result.settings
+        goal = self._goal(classifier)
+        logits_before = self._logits(self._rendered(self.before, classifier), classifier)
+        images = self._rendered(self.after, classifier)
+        logits = self._logits(images, classifier)
         predicted_before = predictions(logits_before, classifier.classes)
-        goal = Goal(source, target)
-        success = fooled_in_views(
-            result.settings.preprocessed_model(classifier),
-            images_after,
-            logits_after.argmax(2),
-            torch.tensor(chosen, dtype=torch.long),
+        success_in_views = fooled_in_views(
+            settings.preprocessed_model(classifier),
+            images,
+            logits.argmax(2),
+            torch.tensor(self.examples, dtype=torch.long),
             goal,
-            result.settings,
-            result.seed,
+            settings,
+            self.result.seed,
         )
         return {
-            kind: name,
-            "clean_correct": (logits_before.argmax(2) == source).all(1).tolist(),
-            "success": success.all(1).tolist(),
-            "success_without_noise": goal.reached(logits_after.argmax(2)).tolist(),
-            **{f"{key}_before": values for key, values in predicted_before.items()},
-            **predictions(logits_after, classifier.classes),
+            "clean_correct": (logits_before.argmax(2) == goal.source).all(1).tolist(),
+            "success": success_in_views.all(1).tolist(),
+            "success_without_noise": goal.reached(logits.argmax(2)).tolist(),
+            "predicted_before": predicted_before["predicted"],
+            "confidence_before": predicted_before["confidence"],
+            **predictions(logits, classifier.classes),
         }
 
-    def labels(names: list[list[str]], classifier: Classifier) -> Tensor:
+    def _goal(self, classifier: Classifier) -> Goal:
+        """Return the goal of the adversaries in the classes of a classifier."""
+        view_count = self.result.problem.scene.views
+        sources = [[adversary.shown.label] * view_count for adversary in self.after]
+        source = self._labels(sources, classifier)
+        if self.result.goal.target is None:
+            return Goal(source)
+        attacked_classes = self.result.classifier.classes
+        targets = [
+            [attacked_classes[index] for index in self.result.goal.target[example].tolist()]
+            for example in self.examples
+        ]
+        return Goal(source, self._labels(targets, classifier))
+
+    def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
+        """Return the classes (A, V) of names of classes, A lists of V."""
         indices = [classifier.label(name) for views in names for name in views]
-        return torch.tensor(indices).long().view(-1, scene.views)
+        return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
 
-    def rendered(adversaries: Sequence[Adversary], classifier: Classifier) -> Tensor:
+    def _rendered(self, adversaries: list[Adversary], classifier: Classifier) -> Tensor:
+        """Render adversaries at the size of a classifier, (A, V, 3, size, size)."""
+        scene = self.result.problem.scene
+        size = classifier.size
         if not adversaries:
-            return result.images.new_empty(0, scene.views, 3, classifier.size, classifier.size)
-        renders = [adversary.render(scene.rasterizer) for adversary in progress(adversaries, "transfer")]
-        return torch.stack(renders).to(result.images)
+            return self.result.images.new_empty(0, scene.views, 3, size, size)
+        images = []
+        for adversary in progress(adversaries, "transfer"):
+            images.append(adversary.render(scene.rasterizer))
+        return torch.stack(images).to(self.result.images)
 
-    def logits(images: Tensor, classifier: Classifier) -> Tensor:
+    def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
+        """Return the logits (A, V, C) of images (A, V, 3, size, size), on the CPU."""
+        settings = self.result.settings
         if not len(images):
-            return torch.empty(0, scene.views, len(classifier.classes))
-        model = result.settings.preprocessed_model(classifier)
-        return logits_of(model, images, result.settings.batch_size).cpu()
-
-    return [
-        *(elsewhere("network", other.name, partial(_resized, size=other.size), other) for other in classifiers),
-        *(elsewhere("azimuth", f"{by:+g}°", partial(_turned, angle=math.radians(by))) for by in azimuths),
-        *(elsewhere("mesh", Path(item.name).name, partial(replace, shown=item)) for item in objects),
-    ]
-
-
-def require_transferable(parameters: Collection[str], azimuths: Collection[float], objects: Collection[Any]) -> None:
-    """InputError for parameters that another view or another mesh does not have."""
-    for name, elsewhere, bound in (("azimuths", azimuths, OF_VIEW), ("meshes", objects, OF_MESH)):
-        if elsewhere and (changed := [parameter for parameter in parameters if parameter in bound]):
-            raise InputError(f"{name}: attacked {changed[0]} cannot be transferred to others, leave one of them out")
+            return torch.empty(0, images.shape[1], len(classifier.classes))
+        model = settings.preprocessed_model(classifier)
+        return logits_of(model, images, settings.batch_size).cpu()
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:
+    """Return an adversary whose images have another size in pixels."""
     if adversary.settings.size == size:
         return adversary
+    background = _with_size(adversary.background[None], size)[0].clamp(0, 1)
+    pixels = None if adversary.pixels is None else _with_size(adversary.pixels, size)
+    settings = replace(adversary.settings, size=size)
+    return replace(adversary, settings=settings, background=background, pixels=pixels)
 
-    def fit(images: Tensor) -> Tensor:
-        return F.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
 
-    return replace(
-        adversary,
-        settings=replace(adversary.settings, size=size),
-        background=fit(adversary.background[None])[0].clamp(0, 1),
-        pixels=None if adversary.pixels is None else fit(adversary.pixels),
-    )
+def _with_size(images: Tensor, size: int) -> Tensor:
+    """Return images (N, C, H, W) in another size in pixels."""
+    return F.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    cameras = tuple(replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras)
-    return replace(adversary, cameras=cameras)
+    """Return an adversary seen by cameras that are turned around the vertical, in radians."""
+    cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
+    return replace(adversary, cameras=tuple(cameras))

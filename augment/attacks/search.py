@@ -3,26 +3,39 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import product
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from augment.attacks.attack import AttackSettings, logits_of
+from augment.attacks.attack import AttackSettings, logits_of, source_labels
 from augment.build import SceneSettings
 from augment.classifiers import Classifier
+from augment.progress import progress
 from augment.scene import Scene
-from augment.utils import progress
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
-POLAR, WIDTH = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
-CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within
-FOV = 45.0  # degrees, of every other camera that is drawn where the scene is orthographic
-LIGHT_GRAY = 0.9  # as things are shown in catalogs
-EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
-SURE = 0.5  # confidence, in every image, at which the search ends
+# Limits between which cameras are drawn: polar angle in degrees, and width of the
+# view in world units.
+POLAR = (20.0, 100.0)
+WIDTH = (1.8, 3.5)
+
+# World units from the middle of a mesh, which all of it is within.
+CLOSEST = 2.0
+
+# Field of view in degrees of every other camera that is drawn, if the scene is
+# orthographic.
+FOV = 45.0
+
+# Gray of a background as things are shown in catalogs.
+LIGHT_GRAY = 0.9
+
+# Exposures that are tried, as factors of the exposure of the scene.
+EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
+
+# Confidence in every image at which the search ends.
+SURE = 0.5
 
 Settings = TypeVar("Settings", bound=SceneSettings)
 
@@ -35,70 +48,121 @@ def find_scene(
     cameras: int,
     draws: torch.Generator,
 ) -> Settings:
-    """The settings of a scene, changed so that the classifier is right in every image where the attack would begin.
+    """Search for a scene in which a classifier is right in every image where an attack would begin.
 
-    build: a scene from settings. cameras: how many to try, each under the scene's light, the probes and uniform light
-    at several exposures, and before light gray. Returns the settings of the most confident scene; the settings as they
-    are, where the classifier is right in them, or in no candidate.
+    Each camera is tried under the light of the scene, the probes and uniform
+    light at several exposures, and also before light gray.
+
+    Args:
+        classifier: The classifier to attack.
+        settings: Settings of a scene.
+        attack: Settings of the attack.
+        build: A function from settings of a scene to the scene.
+        cameras: Number of cameras to try.
+        draws: CPU generator of the random cameras.
+
+    Returns:
+        The settings of the most confident scene. The settings as they are, if
+        the classifier is right in them, or in no candidate.
     """
-    if _confidence(build(settings), attack, classifier).item() > 0:
+    [confidence] = _confidences(build(settings), attack, classifier)
+    if confidence > 0:
         return settings
-    highest, chosen = 0.0, settings
+    highest = 0.0
+    chosen = settings
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
         confidence, lit = _best_light(build(candidate), candidate, attack, classifier)
         if confidence > highest:
-            highest, chosen = confidence, lit
+            highest = confidence
+            chosen = lit
         if highest >= SURE:
             break
     return chosen
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """The scene from several cameras, its own first, before its backgrounds and, instead of a gray, light gray."""
+    """Yield the scene from several cameras, its own first.
+
+    If it has one gray as background, the scene before light gray follows each.
+    """
+    has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
-        fov = FOV if settings.fov is None and index % 2 else settings.fov
-        candidate = _with_random_camera(replace(settings, fov=fov), draws) if index else settings
+        candidate = settings
+        if index > 0:
+            is_orthographic_turn = settings.fov is None and index % 2 == 1
+            fov = FOV if is_orthographic_turn else settings.fov
+            candidate = _with_random_camera(replace(settings, fov=fov), draws)
         yield candidate
-        if len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str):
+        if has_one_gray:
             yield replace(candidate, backgrounds=[LIGHT_GRAY])
+
+
+def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
+    """Return the scene from another side and another distance, with the same field of view."""
+    polar, azimuth, width = torch.rand(3, generator=draws).tolist()
+    lowest_polar, highest_polar = POLAR
+    narrowest, widest = WIDTH
+    if settings.fov is not None:
+        closest_width = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
+        narrowest = max(narrowest, closest_width)
+        widest = max(widest, 2 * closest_width)
+    return replace(
+        settings,
+        polar=round(lowest_polar + (highest_polar - lowest_polar) * polar, 1),
+        azimuth=round(360 * azimuth, 1),
+        width=round(narrowest + (widest - narrowest) * width, 2),
+    )
 
 
 def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """The highest confidence, and the settings with the light and exposure that reach it."""
-    names, degree = dict.fromkeys([settings.light, *PROBES, UNIFORM]), harmonics_of(scene.basis).degree
-    loaded, lights = {name: load_light(name, degree) for name in names}, list(product(names, EXPOSURES))
-    exposures = [settings.exposure * factor for _, factor in lights]
-    coefficients = [loaded[name] * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
-    sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(scene.lights.device)
-    lit = torch.cat([sky, scene.lights.repeat(len(lights), 1, 1)[:, sky.shape[1] :]], dim=1)  # projector and lamps stay
-    rows = replace(scene, examples=[*scene.examples] * len(lights), lights=lit)
-    confidence, index = _confidence(rows, attack, classifier, len(lights)).max(0)
-    return float(confidence), replace(settings, light=lights[index][0], exposure=exposures[index])
+    """Return the highest confidence, and the settings with the light that reaches it."""
+    names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
+    degree = harmonics_of(scene.basis).degree
+    candidates = []
+    coefficients = []
+    for name in names:
+        light = load_light(name, degree)
+        for factor in EXPOSURES:
+            exposure = settings.exposure * factor
+            candidates.append(replace(settings, light=name, exposure=exposure))
+            coefficients.append(light * exposure)
+    lit = _under_lights(scene, torch.stack(coefficients))
+    confidences = _confidences(lit, attack, classifier, groups=len(candidates))
+    highest, index = confidences.max(0)
+    return float(highest), candidates[index]
+
+
+def _under_lights(scene: Scene, skies: Tensor) -> Scene:
+    """Return the examples of a scene under each environment light (N, coefficients, 3) in turn.
+
+    Projector and lamps stay as they are.
+    """
+    count = len(skies)
+    sky = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
+    local_lights = scene.lights.repeat(count, 1, 1)[:, sky.shape[1] :]
+    lights = torch.cat([sky, local_lights], dim=1)
+    return replace(scene, examples=[*scene.examples] * count, lights=lights)
 
 
 @torch.no_grad()
-def _confidence(scene: Scene, attack: AttackSettings, classifier: Classifier, groups: int = 1) -> Tensor:
-    """(groups,) the least confidence in the label where an attack would begin, by group of rows; 0 for any error."""
+def _confidences(
+    scene: Scene,
+    attack: AttackSettings,
+    classifier: Classifier,
+    groups: int = 1,
+) -> Tensor:
+    """Return the lowest confidence in the right class where an attack would begin.
+
+    The examples are in as many groups of equal size, shape (groups,). An error
+    counts as a confidence of 0.
+    """
     problem = attack.problem(scene)
     images = problem.images(problem.start)
-    probabilities = logits_of(attack.preprocessed_model(classifier), images, attack.batch_size).softmax(2)
-    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=probabilities.device)[:, None]
-    confidence = probabilities.gather(2, labels[..., None].expand(-1, scene.views, 1))[..., 0]
-    return (confidence * (probabilities.argmax(2) == labels)).view(groups, -1).amin(1)
-
-
-def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
-    """The scene from another side and another distance, with the same field of view."""
-    polar, azimuth, width = torch.rand(3, generator=draws).tolist()
-    least, most = WIDTH
-    if settings.fov is not None:
-        narrowest = 2 * CLOSEST * math.tan(math.radians(settings.fov) / 2)
-        least, most = max(least, narrowest), max(most, 2 * narrowest)
-    return replace(
-        settings,
-        polar=round(POLAR[0] + (POLAR[1] - POLAR[0]) * polar, 1),
-        azimuth=round(360 * azimuth, 1),
-        width=round(least + (most - least) * width, 2),
-    )
+    logits = logits_of(attack.preprocessed_model(classifier), images, attack.batch_size)
+    probabilities = logits.softmax(2)
+    labels = source_labels(scene, logits, classifier)
+    confidence = probabilities.gather(2, labels[..., None])[..., 0]
+    is_right = probabilities.argmax(2) == labels
+    return (confidence * is_right).view(groups, -1).amin(1)

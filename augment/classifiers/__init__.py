@@ -20,7 +20,7 @@ from augment.classifiers.imagenet import (
     load_timm,
     load_torchvision,
 )
-from augment.utils import announced
+from augment.progress import announced
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
 

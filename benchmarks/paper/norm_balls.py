@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment import AttackSettings, StepSettings, attack
 from augment.attacks.attack import AttackResult, logits_of
-from augment.utils import generator
+from augment.random_streams import generator
 from benchmarks.paper import common
 from renderer.light.environment import light_radiance
 from renderer.light.harmonics import project

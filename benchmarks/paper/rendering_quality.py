@@ -12,7 +12,7 @@ import torch
 from augment import Classifier
 from augment.attacks.attack import logits_of
 from augment.objects import SceneObject
-from augment.utils import generator
+from augment.random_streams import generator
 from benchmarks.common import Row
 from benchmarks.paper import common
 from renderer import InputError, OrthographicCamera

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from augment.attacks.descent import Goal, descend
-from augment.utils import generator
+from augment.random_streams import generator
 from benchmarks.paper import common
 
 

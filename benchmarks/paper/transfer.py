@@ -15,9 +15,9 @@ from torch import Tensor
 
 from augment import AttackSettings, Classifier, load_classifier
 from augment.attacks.descent import Goal, descend
-from augment.attacks.parameters import AttackProblem
+from augment.attacks.problem import AttackProblem
 from augment.objects import SceneObject
-from augment.utils import generator
+from augment.random_streams import generator
 from benchmarks.paper import common
 from renderer.errors import FACTOR
 

@@ -2,7 +2,7 @@
 
 Environment light has one basis, `Harmonics`. Lights within the scene are frozen dataclasses of `LocalBasis`: see
 `Lamps` and `Projector` in light/local.py. `renderer.render` takes a new one as it is; to configure and to attack it,
-add it to augment/build.py and augment/attacks/parameters.py.
+add it to augment/build.py and give it a module in augment/attacks/parameters/.
 """
 
 from __future__ import annotations

@@ -86,17 +86,14 @@ def by_color() -> augment.Classifier:
 
 
 STEPS = {
-    "lighting": augment.StepSettings(step_size=0.1),
     "skylight": augment.SkylightSettings(step_size=0.1),
-    "projector": augment.StepSettings(step_size=0.1),
-    "lamps": augment.StepSettings(step_size=0.1),
-    "positions": augment.StepSettings(step_size=0.1),
     "geometry": augment.StepSettings("linf", 0.05, "sign", 0.01),
     "pose": augment.PoseSettings("linf", 1.0, "sign", 0.2),
     "material": augment.MaterialSettings("linf", 1.0, "sign", 0.2, hue=30.0),
     "albedo": augment.StepSettings("linf", 0.5, "sign", 0.1),
     "pixels": augment.StepSettings("linf", 0.3, "sign", 0.05),
 }
+OTHER_STEPS = augment.StepSettings(step_size=0.1)
 LOCAL = {
     "projector": augment.ProjectorSettings(pixels=4, pattern=0.2),
     "lamps": augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5),
@@ -113,7 +110,11 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
     orange = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.1))
 
     def run(parameters, scene=None, classifier=by_color, target=None, seed=0, force=False, **settings):
-        steps = parameters if isinstance(parameters, dict) else {name: STEPS[name] for name in parameters.split("+")}
+        steps = (
+            parameters
+            if isinstance(parameters, dict)
+            else {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}
+        )
         local = {light: LOCAL[light] for name in steps if (light := name.replace("positions", "lamps")) in LOCAL}
         shown = augment.build_scene(
             [(orange, classifier.classes[0])],

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.parameters import PARAMETERS, MaterialSettings
+from augment.attacks.parameters import make_parameter
+from augment.attacks.parameters.settings import MaterialSettings
 from augment.build import build_scene
 from augment.degree import Smoothest, degree_of_scene, reached_gloss
 from augment.objects import ObjectSettings, PropSettings
@@ -38,7 +39,7 @@ def scene_of(item, **options) -> tuple[Scene, str]:
 
 def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
     """That of the object's own faces, after the largest step there is towards less of it, within the norm-ball."""
-    attacked = PARAMETERS["material"](scene, settings)
+    attacked = make_parameter("material", scene, settings)
     rows = torch.arange(len(scene))
     values = attacked.project(attacked.start - torch.tensor([1e3, 0, 0, 0]), rows)
     own = torch.from_numpy(np.stack([scene.mesh(row).gloss[:, 1:].any(1) for row in rows.tolist()]))

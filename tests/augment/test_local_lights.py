@@ -7,7 +7,8 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem
+from augment.attacks.parameters import make_parameter
+from augment.attacks.problem import AttackProblem
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
@@ -34,7 +35,7 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
 def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parameter):
     """On an orange, on most of which no shadow moves with the lamps; two views share the lights."""
     shown, one = scene(exposure=0.3, shared=True, samples=4), torch.arange(1)
-    problem = AttackProblem(shown, [PARAMETERS[parameter](shown, StepSettings())])
+    problem = AttackProblem(shown, [make_parameter(parameter, shown, StepSettings())])
     draws = torch.Generator().manual_seed(0)
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, one)
@@ -53,7 +54,7 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parame
 def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm):
     shown = scene()
     for parameter, most in (("projector", 2.0), ("lamps", 10.0)):
-        changed = PARAMETERS[parameter](shown, StepSettings(norm, 0.4))
+        changed = make_parameter(parameter, shown, StepSettings(norm, 0.4))
         wanted = changed.start + 9 * torch.randn(changed.start.shape, generator=torch.Generator().manual_seed(1))
         for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2))):
             assert values.min() >= 0 and values.max() <= most
@@ -113,8 +114,11 @@ def test_a_table_receives_the_projection_and_the_shadow():
         (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.positions=nan"),
         (lambda: LampsSettings([[1, 0]]).build(), r"lamps: give positions"),
         (lambda: LampsSettings(start=[[11, 0, 0]] * 4).build(), r"start=.* to power=10$"),
-        (lambda: PARAMETERS["projector"](scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
-        (lambda: PARAMETERS["positions"](scene(lamps=None), StepSettings()), "the scene has no lamps"),
+        (
+            lambda: make_parameter("projector", scene(projector=None), StepSettings()),
+            r"no projector: set scene\.projector",
+        ),
+        (lambda: make_parameter("positions", scene(lamps=None), StepSettings()), "the scene has no lamps"),
     ],
 )
 def test_impossible_lights_are_refused_by_name(make, message):

@@ -12,7 +12,9 @@ import renderer
 from augment import relighting
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
+from augment.attacks.parameters import make_parameter
+from augment.attacks.parameters.settings import SkylightSettings
+from augment.attacks.problem import AttackProblem
 from augment.build import build_scene, count_views, load_background, load_backgrounds
 from augment.objects import ObjectSettings, load_object
 from augment.reshading import NEAR
@@ -111,10 +113,10 @@ def test_light_has_the_degree_that_gloss_needs_and_attacks_change_all_of_it(tmp_
     with pytest.warns(UserWarning, match="degree=7 shows the highlight"):
         assert build_scene([shiny], 16, degree=7, **options).basis == Harmonics(7)
     build_scene([shiny], 16, degree=12, **options)
-    sky = PARAMETERS["skylight"](scene, SkylightSettings())
+    sky = make_parameter("skylight", scene, SkylightSettings())
     of_sky = sky.apply(sky.start[1:], scene.conditions(torch.tensor([1])), torch.tensor([1])).light
     assert of_sky.shape == (1, 169, 3) and not of_sky[:, 49:].any()
-    problem, rows = AttackProblem(scene, [PARAMETERS["lighting"](scene, StepSettings(radius=0.3))]), torch.arange(2)
+    problem, rows = AttackProblem(scene, [make_parameter("lighting", scene, StepSettings(radius=0.3))]), torch.arange(2)
     values = problem.sample(torch.Generator().manual_seed(0))
     after, images = problem.conditions(values, rows), problem.images(values)
     write_adversary(Adversary.of(scene, 1, after, images[1], images[1]), tmp_path / "adversary")
@@ -189,7 +191,7 @@ def test_several_meshes_are_rendered_as_each_is_alone(several, examples, by):
 @pytest.mark.parametrize("parameter", ["geometry", "albedo"])
 def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_only_its_values(several, parameter):
     """Unused values have no gradient and are never drawn; the L2 ball is that of the used values."""
-    own = PARAMETERS[parameter](several, StepSettings("l2", 0.2))
+    own = make_parameter(parameter, several, StepSettings("l2", 0.2))
     sizes = [len(item.mesh.vertices if parameter == "geometry" else item.mesh.faces) for item in several.objects]
     everything, used = torch.arange(4), torch.tensor([3 * sizes[row.object] for row in several.examples])
     assert len(set(sizes)) == 2 and own.start.shape == (4, 3 * max(sizes))

@@ -16,8 +16,8 @@ import augment
 from augment.build import LampsSettings, ProjectorSettings, load_background
 from augment.camera_effects import draw_camera_effects, draw_patterns
 from augment.objects import ObjectSettings, PropSettings
+from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.utils import generator
 from augment.variation import VariationSettings, VarnishSettings, vary
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode

@@ -11,7 +11,7 @@ import trimesh
 
 from augment import Classifier, attack
 from augment.objects import SceneObject
-from augment.utils import generator
+from augment.random_streams import generator
 from benchmarks.paper import common, light_change, norm_balls, rendering_quality, run_time, survival, table, transfer
 from renderer import orbit_cameras
 from renderer.mesh import Mesh

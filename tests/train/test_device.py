@@ -111,7 +111,7 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
     assert len(caplog.messages) == (not works)  # once
     assert compiles("always", GPU) and not compiles("never", GPU) and not compiles("auto", CPU)
     compiles.cache_clear()
-    monkeypatch.setattr(device.utils, "world_size", lambda: 2)
+    monkeypatch.setattr(device.distributed, "world_size", lambda: 2)
     assert not compiles("auto", GPU)
     compiles.cache_clear()
 

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from augment.progress import Phases
 from augment.service import AugmentationService, AugmentationSettings
-from augment.utils import Phases
 from renderer.errors import InputError
 from train import checkpoint
 from train.data import Split
@@ -157,7 +157,7 @@ def test_several_processes_that_resume_count_a_loss_once_between_them(tmp_path, 
     assert saved[0]["under_way"]["step"] == 3 and whole[0] > 0
     parts = []
     for rank in range(2):
-        monkeypatch.setattr("train.loop.utils.rank", lambda rank=rank: rank)
+        monkeypatch.setattr("train.loop.distributed.rank", lambda rank=rank: rank)
         resumed = make_trainer(tmp_path, epochs=1, batch_size=8)
         resumed.load_state_dict(saved[0])
         parts.append(resumed.state_dict()["under_way"]["sums"])

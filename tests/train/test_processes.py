@@ -15,7 +15,8 @@ import torch.multiprocessing as multiprocessing
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment import AugmentationService, AugmentationSettings, utils
+from augment import AugmentationService, AugmentationSettings, distributed
+from augment.progress import Phases
 from augment.scene import Scene
 from tests.runs import completed_run
 from train import checkpoint, loop
@@ -57,7 +58,7 @@ def random_arm(file: Path) -> None:
         patch.setattr(Scene, "render", lambda self, *args: (count.append(len(args[1])), render(self, *args))[1])
         settings = AugmentationSettings(arm="random")
         service = AugmentationService.from_meshes(meshes, 8, settings, views=3, samples=1, rasterizer="numpy")
-        service.rank, service.world_size = utils.rank(), utils.world_size()
+        service.rank, service.world_size = distributed.rank(), distributed.world_size()
         torch.manual_seed(0)
         made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0)
     torch.save((made.images, made.diagnostics, count[0]), file)
@@ -67,8 +68,8 @@ def folder_arm(file: Path) -> None:
     torch.manual_seed(0)
     images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
     settings = AugmentationSettings(arm="folder", folder="unread", examples=5)
-    process = (), utils.rank(), utils.world_size()
-    service = AugmentationService(settings, None, labels, 0, utils.Phases(), *process, images)
+    process = (), distributed.rank(), distributed.world_size()
+    service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
     made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
     torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
 
@@ -79,7 +80,7 @@ def run_until_a_signal(config: Path, folder: Path) -> None:
 
     def signalled(split, batch_size, seed, now, *rest):
         for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
-            if (now.epoch, count, utils.rank()) == (1, 2, 1):
+            if (now.epoch, count, distributed.rank()) == (1, 2, 1):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 

@@ -6,12 +6,12 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from augment import utils
+from augment import distributed
 from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
-from train.recipe import AUGMENTATIONS, PGD_RADIUS, SCHEDULES, TRANSFORMS, TrainSettings, augmentation, training_loss
+from train.recipe import AUGMENTATIONS, PGD, SCHEDULES, TRANSFORMS, TrainSettings, augmentation, training_loss
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
@@ -131,13 +131,13 @@ def test_every_image_is_changed_by_draws_of_its_own_whatever_the_number_of_proce
     same = images[:1].expand(6, -1, -1, -1)
     whole = augmentation(name, model, 0)(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1
-    monkeypatch.setattr(utils, "rank", lambda: 1)
+    monkeypatch.setattr(distributed, "rank", lambda: 1)
     assert torch.equal(augmentation(name, model, 0)(same[3:], LABELS[3:], 1), whole[3:])
 
 
 def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
     adversarial = augmentation("pgd", model, 0)(images, LABELS, 0)
-    assert (to_unit(adversarial) - to_unit(images)).abs().max() <= PGD_RADIUS + 1e-6
+    assert (to_unit(adversarial) - to_unit(images)).abs().max() <= PGD.radius + 1e-6
     model.eval()
     before, after = (F.cross_entropy(model(to_unit(batch)), LABELS) for batch in (images, adversarial))
     noise = torch.randint(-8, 9, images.shape, generator=torch.Generator().manual_seed(1))

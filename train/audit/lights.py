@@ -27,12 +27,13 @@ from augment.attacks.attack import (
 from augment.attacks.descent import Goal
 from augment.attacks.evaluate import success_by_radius
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import SkylightSettings
+from augment.attacks.parameters.settings import SkylightSettings
 from augment.build import LampsSettings, ProjectorSettings
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
+from augment.progress import progress
+from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.utils import generator, progress
 from augment.variation import VariationSettings, vary
 from renderer.camera import orbit_cameras
 from renderer.errors import FACTOR

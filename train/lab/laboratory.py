@@ -16,7 +16,8 @@ from PIL import Image
 
 from augment.classifiers.adapter import label_names
 from augment.objects import load_object
-from augment.utils import progress, stream_seed
+from augment.progress import progress
+from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.files import write_whole

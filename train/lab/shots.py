@@ -16,7 +16,7 @@ import torch
 from omegaconf import MISSING
 from scipy.spatial.transform import Rotation
 
-from augment.utils import stream_seed
+from augment.random_streams import stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import equirectangular

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import Label, class_index, label_names, nearest
-from augment.utils import progress, require_memory
+from augment.memory import require_memory
+from augment.progress import progress
 from renderer.errors import InputError, in_one_line
 from renderer.io.images import read_square
 from train import console

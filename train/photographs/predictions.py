@@ -9,9 +9,10 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
+from augment.batches import eval_mode
 from augment.classifiers.adapter import Label, NetworkCall, label_names
 from augment.losses import log_odds
-from augment.utils import eval_mode, progress
+from augment.progress import progress
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_unit
 from renderer.io.files import write_whole

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from augment.classifiers.adapter import Label, OperatingPoint, as_class_names, label_names
-from augment.utils import progress
+from augment.progress import progress
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.io.files import remove_unfinished, write_whole

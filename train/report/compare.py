@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from augment.progress import progress
 from augment.service import ARMS
-from augment.utils import progress
 from renderer.errors import InputError
 from train.photographs import metrics
 from train.photographs.metrics import LABEL, METRICS, OVERALL, Pool, find_metric, metric_title

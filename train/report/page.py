@@ -13,8 +13,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from augment.classifiers.adapter import label_names
+from augment.progress import announced
 from augment.service import ARMS
-from augment.utils import announced
 from renderer.errors import InputError
 from renderer.io.files import write_whole
 from train.errors import one_sentence

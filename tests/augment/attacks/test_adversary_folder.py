@@ -12,7 +12,7 @@ import torch
 
 import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.attacks.parameters import PARAMETERS
+from augment.attacks.parameters.settings import PARAMETER_NAMES
 from augment.objects import SceneObject, on_ground, with_props
 from augment.scene import Example, Scene
 from renderer.errors import InputError
@@ -60,7 +60,7 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
         ({"geometry"}, "srgb"),
         ({"albedo"}, "linear"),
         ({"albedo"}, "srgb"),
-        (set(PARAMETERS) - OTHERS, "srgb"),
+        (set(PARAMETER_NAMES) - OTHERS, "srgb"),
     ],
     ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else value,
 )

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 import augment
 from augment.attacks import eot
 from augment.attacks.eot import EOTSettings, ExpectationOverTransformations, Rounded, as_jpeg
-from augment.utils import generator
+from augment.random_streams import generator
 
 
 class Means(nn.Module):

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from skinned_arm import ARM, BIND, GLOVE, LOCAL, ROOT, STONE, WEIGHTS
 
 import renderer
-from augment.utils import rotation_matrices
 from renderer.errors import InputError
 from renderer.mesh import Y_UP_TO_Z_UP, concatenate
+from renderer.vectors import rotation_matrices
 
 FLOAT32 = dict(rtol=0, atol=3e-6)
 VECTORS = torch.tensor([[0.3, -0.2, 0.5], [-0.9, 0.4, 0.1], [0.2, 0.8, -0.3]], dtype=torch.float64)

@@ -12,12 +12,14 @@ from torch.nn.functional import pad
 
 import augment
 import renderer
-from augment.attacks.parameters import POSE, AttackProblem, pose
+from augment.attacks.parameters.pose import Pose
+from augment.attacks.parameters.settings import POSE
+from augment.attacks.problem import AttackProblem
 from augment.scene import Scene
 from renderer.errors import InputError
 
 ONLY = dict.fromkeys(POSE, 0.0)
-MESHES = Path(__file__).parents[3] / "shared" / "data" / "meshes"
+MESHES = Path(__file__).parents[5] / "shared" / "data" / "meshes"
 ONE = torch.zeros(1, dtype=torch.int64)
 
 
@@ -28,7 +30,7 @@ def scene_of(size: int = 24, **options) -> Scene:
 
 
 def problem_of(scene: Scene, **units) -> AttackProblem:
-    return AttackProblem(scene, [pose(scene, augment.PoseSettings(radius=1.0, **units))])
+    return AttackProblem(scene, [Pose(scene, augment.PoseSettings(radius=1.0, **units))])
 
 
 @pytest.mark.parametrize("ground", [None, [0.5, 0.5, 0.5]])
@@ -55,7 +57,7 @@ def test_the_camera_moves_as_another_scenes_camera_stands(fov):
 
 def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
     scene = scene_of(fov=85.0, width=2.0)
-    parameter, far = pose(scene, augment.PoseSettings()), torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
+    parameter, far = Pose(scene, augment.PoseSettings()), torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
     with pytest.raises(InputError, match="reaches to a camera"):
         AttackProblem(scene, [parameter]).render(far, ONE)
     AttackProblem(scene, [parameter]).render(parameter.domain(far), ONE)
@@ -108,7 +110,7 @@ def test_joints_bend_before_the_object_turns_as_far_as_their_limits_and_others_n
     scene = augment.build_scene([(arm, "arm")], 16, silhouettes=True, rasterizer="numpy", ground=[0.5, 0.5, 0.5])
     settings = augment.PoseSettings(radius=3.0, joints={"elbow": 60.0, "wrist": 30})
     scene = replace(scene, lights=scene.lights.double())
-    problem = AttackProblem(scene, [pose(scene, settings)])
+    problem = AttackProblem(scene, [Pose(scene, settings)])
     draws = torch.cat([problem.sample(torch.Generator().manual_seed(seed)) for seed in range(100)])
     assert (draws[:, 9:12] == 0).all() and (draws[:, 12:].abs().amax(0) == 1).all() and draws[:, :9].max() > 2.5
     values = torch.zeros(1, 18, dtype=torch.float64)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.parameters import PARAMETERS
+from augment.attacks.parameters.settings import PARAMETER_NAMES
 from augment.losses import adversarial_cost
 from renderer.errors import InputError
 from renderer.light.nonnegative import project_nonnegative
@@ -13,7 +13,7 @@ from renderer.light.nonnegative import project_nonnegative
 SHARED = {"views": 2, "shared": True}
 
 
-@pytest.mark.parametrize("parameters", [*PARAMETERS, "lighting+geometry+pixels"])
+@pytest.mark.parametrize("parameters", [*PARAMETER_NAMES, "lighting+geometry+pixels"])
 def test_every_parameter_alone_and_with_others_lowers_the_cost_of_its_own_images(attacked, by_color, parameters):
     """The numbers are those of the images: the cost and the predictions follow from the logits."""
     result = attacked(parameters, {"backgrounds": [0.4, 0.5]}, max_steps=3)
@@ -33,7 +33,7 @@ def test_every_parameter_alone_and_with_others_lowers_the_cost_of_its_own_images
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("parameters", [*PARAMETERS, "lighting+geometry+albedo+pixels"])
+@pytest.mark.parametrize("parameters", [*PARAMETER_NAMES, "lighting+geometry+albedo+pixels"])
 def test_a_gpu_attacks_as_a_cpu_does_to_rounding(attacked, by_color, parameters):
     """After one step; a gradient's sign may differ where it is nearly zero, hence not every pixel is compared."""
     expected, found = (

@@ -12,7 +12,9 @@ import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
 from augment.attacks.files import render_again
-from augment.attacks.parameters import MATERIAL, AttackProblem, material
+from augment.attacks.parameters.material import Material
+from augment.attacks.parameters.settings import MATERIAL
+from augment.attacks.problem import AttackProblem
 from augment.objects import SceneObject, on_ground
 from augment.scene import Scene
 from renderer.albedo import changed_albedo
@@ -51,7 +53,7 @@ def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Sce
 
 def problem_of(scene: Scene, **settings) -> AttackProblem:
     units = dict(zip(MATERIAL, [*UNITS[:3].tolist(), 40.0], strict=True))
-    return AttackProblem(scene, [material(scene, augment.MaterialSettings(**units | settings))])
+    return AttackProblem(scene, [Material(scene, augment.MaterialSettings(**units | settings))])
 
 
 @pytest.mark.parametrize(

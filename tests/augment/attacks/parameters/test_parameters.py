@@ -16,7 +16,9 @@ from augment import reshading
 from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
+from augment.attacks.parameters import make_parameter, parameter_class
+from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSettings
+from augment.attacks.problem import AttackProblem
 from augment.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
@@ -46,7 +48,7 @@ def split(problem: AttackProblem, values: Tensor) -> list[Tensor]:
 
 
 def problem_of(scene: Scene, **settings: StepSettings) -> AttackProblem:
-    return AttackProblem(scene, [PARAMETERS[name](scene, steps) for name, steps in settings.items()])
+    return AttackProblem(scene, [make_parameter(name, scene, steps) for name, steps in settings.items()])
 
 
 def free(*names: str) -> dict[str, StepSettings]:
@@ -62,6 +64,16 @@ def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
     """Every image's class 0 falls and another, or none in particular, rises."""
     classes = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
     return Goal(classes, None if target is None else classes + target)
+
+
+@pytest.mark.parametrize("name", PARAMETER_NAMES)
+def test_each_field_of_the_settings_has_a_class_of_its_name(name):
+    assert parameter_class(name).name == name and parameter_class(name).__doc__
+
+
+def test_a_parameter_that_does_not_exist_is_refused():
+    with pytest.raises(InputError, match="name=settings"):
+        parameter_class("settings")
 
 
 @pytest.mark.parametrize("wrong", [{"zenith": 120}, {"zenith": -1}, {"turbidity": 1}, {"azimuth": math.nan}])
@@ -217,7 +229,7 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
     """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
     into it, the center, and the light's own way there and beyond."""
     scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
-    light = PARAMETERS["lighting"](scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
+    light = make_parameter("lighting", scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
     assert not torch.equal(light.start, scene.lights.flatten(1))
     values = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
     nearest, offset = light.project(values, EVERY), light.start - values
@@ -234,7 +246,7 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
 def test_a_descent_in_nonnegative_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
     """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
     scene = ringing(make_scene())
-    light = PARAMETERS["lighting"](scene, StepSettings(step_size=0.5), nonnegative=True)
+    light = make_parameter("lighting", scene, StepSettings(step_size=0.5), nonnegative=True)
     problem = AttackProblem(scene, [light])
     result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=4)
     assert (result.values - problem.start).norm(dim=1).min() > 1
@@ -263,7 +275,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     )
     @settings(max_examples=30, deadline=None)
     def check(start: tuple, values: tuple, radius: float | None):
-        sky = PARAMETERS["skylight"](scene, sky_at(start, norm=norm, radius=radius))
+        sky = make_parameter("skylight", scene, sky_at(start, norm=norm, radius=radius))
         problem = AttackProblem(scene, [sky])
         center, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
         torch.testing.assert_close(center * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
@@ -373,13 +385,17 @@ def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
         parameter.settings = replace(parameter.settings, step_size=size)
         parameter.start = parameter.start + torch.arange(3)[:, None]
     values = problem.start + 0.1 * torch.randn(problem.start.shape, generator=draws)
-    parts, steps = split(problem, values), split(problem, problem.step(values))
+    parts = split(problem, values)
     chosen = torch.tensor([2, 0])
+    length = torch.tensor([[0.5], [2.0]]).double()
     projected = split(problem, problem.project(values[chosen], chosen))
-    for parameter, part, step, nearest in zip(problem.parameters, parts, steps, projected, strict=True):
+    stepped = split(problem, problem.take_step(values[chosen], values[chosen], chosen, length))
+    for parameter, part, nearest, after in zip(problem.parameters, parts, projected, stepped, strict=True):
+        part, center = part[chosen], parameter.start[chosen]
+        assert torch.equal(nearest, parameter.settings.project(part, center))
         unit = part / part.norm(dim=1, keepdim=True)
-        torch.testing.assert_close(step, parameter.settings.step_size * unit, rtol=0, atol=16 * EPS)
-        assert torch.equal(nearest, parameter.settings.project(part[chosen], parameter.start[chosen]))
+        expected = parameter.settings.project(part - length * parameter.settings.step_size * unit, center)
+        torch.testing.assert_close(after, expected, rtol=0, atol=64 * EPS)
 
 
 def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):

@@ -56,11 +56,9 @@ class LinearScene:
         images = torch.einsum("ad,vdp->avp", values, CAMERAS[: self.views])
         return (images * (1 + examples.double() / 10)[:, None, None]).unflatten(2, PIXELS)
 
-    def step(self, gradient: Tensor) -> Tensor:
-        return StepSettings(step=self.rule, step_size=self.size).along(gradient)
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.ball.project(values, self.center[examples])
+    def take_step(self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor) -> Tensor:
+        step = StepSettings(step=self.rule, step_size=self.size).along(gradient)
+        return self.ball.project(values - length * step, self.center[examples])
 
 
 def settings_of(max_steps: int = 30, **others) -> AttackSettings:
@@ -176,11 +174,8 @@ class Axis:
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return values[:, :, None, None, None]
 
-    def step(self, gradient: Tensor) -> Tensor:
-        return 1.5 * gradient.sign()
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return values
+    def take_step(self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor) -> Tensor:
+        return values - length * 1.5 * gradient.sign()
 
 
 def on_the_axis(steps: int, shorten: bool) -> DescentResult:

@@ -1,0 +1,62 @@
+"""Quantities of a scene that an attack changes: light, shape, pose, material, colors and pixels.
+
+Each quantity is a subclass of `Parameter`. The class `Pose` of the quantity
+"pose" is in the module `pose`, and `ParameterSettings` has the field `pose` for
+its settings. An attack can change several quantities at once (see
+`augment.attacks.problem`).
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from augment.attacks.parameters.settings import PARAMETER_NAMES
+from renderer.errors import require_choice
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from augment.attacks.norm_ball import StepSettings
+    from augment.attacks.parameters.parameter import Parameter
+    from augment.scene import Scene
+
+
+def parameter_class(name: str) -> type[Parameter]:
+    """Return the class of a quantity that an attack changes.
+
+    Args:
+        name: Name of the quantity, such as "pose".
+
+    Returns:
+        The class, such as `Pose`.
+
+    Raises:
+        InputError: If there is no such quantity.
+    """
+    require_choice("name", name, PARAMETER_NAMES)
+    module = import_module(f"{__name__}.{name}")
+    kind: type[Parameter] = getattr(module, name.capitalize())
+    return kind
+
+
+def make_parameter(name: str, scene: Scene, settings: StepSettings, **options: Any) -> Parameter:
+    """Create the parameter of a scene with which an attack changes a quantity.
+
+    Args:
+        name: Name of the quantity, such as "pose".
+        scene: Scene to attack.
+        settings: Norm-ball, steps and units of the attack, of the type that the
+            class of the quantity takes.
+        options: Further arguments of the class, such as `nonnegative` of
+            `Lighting`.
+
+    Returns:
+        The parameter.
+
+    Raises:
+        InputError: If there is no such quantity, or if the scene lacks what is
+            to be changed.
+    """
+    constructor: Callable[..., Parameter] = parameter_class(name)
+    return constructor(scene, settings, **options)

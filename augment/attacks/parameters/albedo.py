@@ -1,0 +1,29 @@
+"""Attacks on the colors of an object."""
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters.mesh import MeshParameter
+from augment.scene import Conditions, Scene
+
+
+class Albedo(MeshParameter):
+    """Linear RGB color that is added to the albedo of each face of the object.
+
+    The renderer clamps the sum to [0, 1].
+
+    Args:
+        scene: Scene to attack. Props and table stay as they are.
+        settings: Norm-ball and steps of the attack.
+    """
+
+    name = "albedo"
+    fits_other_meshes = False
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, settings, [item.own_faces for item in scene.objects])
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, albedo=self.offsets(values, examples))

@@ -1,0 +1,34 @@
+"""Attacks on the shape of an object."""
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters.mesh import MeshParameter
+from augment.scene import Conditions, Scene
+
+
+class Geometry(MeshParameter):
+    """Displacement of each vertex of the object in world units. The object spans [-1, 1].
+
+    The gradient takes into account that normals turn as vertices move. If
+    `ImageSettings.silhouettes` is set, it also takes into account that the
+    outline of the object moves.
+
+    Args:
+        scene: Scene to attack. Props and table stay as they are.
+        settings: Norm-ball and steps of the attack.
+    """
+
+    name = "geometry"
+    fits_other_meshes = False
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        self._vertices = scene.vertices
+        self._object_of = scene.object_of
+        super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        vertices = self._vertices[self._object_of[examples]]
+        return replace(conditions, vertices=vertices + self.offsets(values, examples))

@@ -1,0 +1,229 @@
+"""Attacks on the material of an object: its specular reflection and the hue of its albedo."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import MaterialSettings
+from augment.objects import SceneObject
+from augment.scene import Conditions, Scene
+from renderer.light.basis import Ball, nearest_in_box
+from renderer.microfacets import LEAST
+
+# Positions among the four attack values of an example (`MATERIAL`): roughness,
+# metallic and strength together, roughness and metallic alone, and the hue.
+GLOSS = slice(0, 3)
+ROUGHNESS = 0
+METALLIC = 1
+HUE = slice(3, 4)
+
+# Roughness, metallic and strength of an object that neither reflects specularly
+# nor is metallic. `initial_surface` gives it to meshes without a gloss.
+MATTE = (1.0, 0.0, 0.0)
+# Roughness, metallic and strength with which `Material` starts to attack a
+# matte object.
+VARNISH = (0.5, 0.0, 1.0)
+
+# `Material` keeps average roughness, metallic and strength this far from 0 and
+# 1, because the renderer clamps there, which makes the gradient zero.
+ROUNDING = 1e-6
+
+
+class Material(Parameter):
+    """Roughness, metallic and strength of an object, averaged over its faces, and its hue.
+
+    The four values of an example are divided by the units of
+    `MaterialSettings`. An attack changes all faces of the object by the same
+    amount, so differences between faces remain. The averages stay in [0, 1],
+    and the roughness does not fall below the lowest value that the renderer
+    shows.
+
+    A matte object starts with the material `VARNISH`. Otherwise its strength
+    would be zero, and so would the gradient with respect to its roughness. A
+    descent that lowers the strength would stay there.
+
+    Args:
+        scene: Scene to attack. Props and table stay as they are.
+        settings: Norm-ball, steps and units of the attack.
+    """
+
+    name = "material"
+    fits_other_meshes = False
+    needs_noise_margin = True
+
+    def __init__(self, scene: Scene, settings: MaterialSettings):
+        self._object_of = scene.object_of
+        self._face_count = max(len(item.mesh.faces) for item in scene.objects)
+
+        gloss_units = [settings.roughness, settings.metallic, settings.strength]
+        units = torch.tensor([*gloss_units, math.radians(settings.hue)]).to(scene.lights)
+        attacked_mask = units > 0
+        self._changes_gloss = bool(attacked_mask[GLOSS].any())
+        self._changes_hue = settings.hue > 0
+        # Division by a unit of 0 is impossible. Values that are not attacked
+        # have a unit of 1 instead.
+        self._unit = torch.where(attacked_mask, units, 1)
+
+        # F is the number of faces of the largest mesh below.
+        surfaces = [initial_surface(item) for item in scene.objects]
+        averages = [surface.average() for surface in surfaces]
+        # Shape (objects, 3).
+        self._average_gloss = torch.stack(averages).to(scene.lights)
+        if all(surface.is_uniform() for surface in surfaces):
+            # A single row then stands for all faces, which saves memory.
+            surfaces = [surface.first_face() for surface in surfaces]
+        # Shapes (objects, F, 3) and (objects, F), or F = 1 for a single row.
+        face_gloss = _stack_padded([surface.face_gloss for surface in surfaces])
+        object_mask = _stack_padded([surface.object_mask for surface in surfaces])
+        self._face_gloss = face_gloss.to(scene.lights)
+        self._object_mask = object_mask.to(scene.lights)
+
+        # `LEAST` is the lowest roughness that the renderer shows. The hue has
+        # no limits: its lowest value is -∞, and its highest is 1 - (-∞) = ∞.
+        lowest_material = self._unit.new_tensor([LEAST + ROUNDING, 0, 0, -math.inf])
+        highest_material = 1 - self._unit.new_tensor([ROUNDING, ROUNDING, ROUNDING, -math.inf])
+        self._lowest_values = lowest_material / self._unit
+        self._highest_values = highest_material / self._unit
+        # The rotation of the hue starts at 0.
+        initial_material = F.pad(self._average_gloss, (0, 1))
+        start = initial_material.clamp(lowest_material, highest_material) / self._unit
+        used_mask = attacked_mask.repeat(len(start), 1)
+        # Objects that are not metallic stay so.
+        used_mask[:, METALLIC] &= self._average_gloss[:, METALLIC] > 0
+        super().__init__(
+            settings,
+            start=start[scene.object_of],
+            used_mask=used_mask[scene.object_of],
+        )
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with the given gloss and hue of the objects.
+
+        Args:
+            values: Average roughness, metallic and strength, and rotation of
+                the hue, divided by the units of the settings, shape (A, 4).
+            conditions: Conditions of the A examples.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions with the gloss and the hue of each face, differentiable
+            with respect to the values.
+        """
+        if self.used_mask is not None:
+            values = torch.where(self.used_mask[examples], values, self.start[examples])
+        material = values * self._unit
+        objects = self._object_of[examples]
+        if self._changes_gloss:
+            conditions = self._with_gloss(conditions, material[:, GLOSS], objects)
+        if self._changes_hue:
+            conditions = self._with_hue(conditions, material[:, HUE], objects)
+        return conditions
+
+    def _with_gloss(
+        self,
+        conditions: Conditions,
+        average_gloss: Tensor,
+        objects: Tensor,
+    ) -> Conditions:
+        """Return a copy of the conditions in which the gloss of the objects has given averages.
+
+        Args:
+            conditions: Conditions of the A examples.
+            average_gloss: Average roughness, metallic and strength,
+                shape (A, 3).
+            objects: Index of the object of each example, shape (A,).
+        """
+        change = average_gloss - self._average_gloss[objects]
+        # Shape (A, F, 3). Faces of props and table do not change.
+        face_change = change[:, None] * self._object_mask[objects][..., None]
+        return replace(conditions, gloss=(self._face_gloss[objects] + face_change).clamp(0, 1))
+
+    def _with_hue(self, conditions: Conditions, angle: Tensor, objects: Tensor) -> Conditions:
+        """Return a copy of the conditions in which the hue of the objects is rotated.
+
+        Args:
+            conditions: Conditions of the A examples.
+            angle: Rotation angles in radians, shape (A, 1).
+            objects: Index of the object of each example, shape (A,).
+        """
+        hue = (angle * self._object_mask[objects]).expand(-1, self._face_count)
+        albedo_offset = conditions.albedo
+        if albedo_offset is None:
+            # The renderer rotates hues only if a color is added to the albedo,
+            # which may be black.
+            albedo_offset = angle.new_zeros(len(angle), self._face_count, 3)
+        return replace(conditions, hue=hue, albedo=albedo_offset)
+
+    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        return nearest_in_box(values, self._lowest_values, self._highest_values, within)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Specular material of the F faces of a mesh: an object, its props and its table.
+
+    Attributes:
+        face_gloss: Roughness, metallic and strength of each face, shape (F, 3).
+        object_mask: Mask of the faces that belong to the object itself,
+            shape (F,).
+    """
+
+    face_gloss: Tensor
+    object_mask: Tensor
+
+    def average(self) -> Tensor:
+        """Average roughness, metallic and strength over the object's faces, shape (3,)."""
+        return self.face_gloss[self.object_mask].mean(0)
+
+    def is_uniform(self) -> bool:
+        """Return whether all faces belong to the object and have the same material."""
+        has_same_gloss = (self.face_gloss == self.face_gloss[0]).all()
+        return bool(self.object_mask.all() and has_same_gloss)
+
+    def first_face(self) -> Surface:
+        """Select the first face, which stands for all faces of a uniform surface."""
+        return Surface(face_gloss=self.face_gloss[:1], object_mask=self.object_mask[:1])
+
+
+def initial_surface(item: SceneObject) -> Surface:
+    """Return the surface with which an attack on the material of an object starts.
+
+    It is the material of the mesh. If the object itself is matte, which means
+    that metallic and strength are zero on all its faces, it gets `VARNISH`.
+
+    Args:
+        item: The object, whose mesh has F faces.
+
+    Returns:
+        The material of all faces, and which faces are the object's own.
+    """
+    object_mask = torch.from_numpy(item.own_faces)
+    if item.mesh.gloss is None:
+        face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
+    else:
+        face_gloss = torch.from_numpy(item.mesh.gloss)
+    metallic_and_strength = face_gloss[object_mask, METALLIC:]
+    is_matte = not metallic_and_strength.any()
+    if is_matte:
+        varnish = face_gloss.new_tensor(VARNISH)
+        face_gloss = torch.where(object_mask[:, None], varnish, face_gloss)
+    return Surface(face_gloss=face_gloss, object_mask=object_mask)
+
+
+def _stack_padded(tensors: list[Tensor]) -> Tensor:
+    """Stack tensors with a row for each face of an object, and fill up the shorter ones with 0.
+
+    Args:
+        tensors: One tensor for each object, shape (faces of the object, ...).
+
+    Returns:
+        Stacked tensors, shape (objects, faces of the largest object, ...).
+    """
+    return pad_sequence(tensors, batch_first=True)

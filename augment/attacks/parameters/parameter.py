@@ -1,0 +1,144 @@
+"""Base class of the quantities that an attack changes."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from augment.attacks.norm_ball import StepSettings, anywhere
+from augment.scene import Conditions
+from renderer.light.basis import Ball
+
+
+class Parameter(ABC):
+    """Quantity of a scene that an attack changes, such as its lighting.
+
+    Each of the E examples of a scene has D values of the quantity. The
+    constructor of a subclass computes the values at which an attack starts. The
+    subclass defines `apply`, which puts values into the conditions under which
+    a scene is rendered. If not all values are feasible, it also overrides
+    `domain`.
+
+    Attributes:
+        name: Name of the quantity in settings, messages and files. It is also
+            the name of the module.
+        fits_other_meshes: Whether the values can be given to another mesh.
+        fits_other_views: Whether the values can be given to another view.
+        needs_noise_margin: Whether adversaries often end where the noise of a
+            sensor still decides, so that an attack should go on beyond it
+            (see `AttackSettings.noise_margin`).
+        settings: Norm-ball and steps of the attack.
+        start: Values at which attacks start and on which the norm-balls are
+            centered, shape (E, D).
+        used_mask: Mask of the values that an attack may change, shape (E, D).
+            The other values have no effect on the image. None if every example
+            uses all values.
+    """
+
+    name: ClassVar[str]
+    fits_other_meshes: ClassVar[bool] = True
+    fits_other_views: ClassVar[bool] = True
+    needs_noise_margin: ClassVar[bool] = False
+
+    def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
+        self.settings = settings
+        self.start = start
+        self.used_mask = used_mask
+        if used_mask is not None and used_mask.all():
+            self.used_mask = None
+
+    @abstractmethod
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions in which this quantity has the given values.
+
+        Args:
+            values: Values of the quantity, shape (A, D).
+            conditions: Conditions of the A examples. Other parameters may have
+                changed them already.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions of the A examples, differentiable with respect to the
+            values.
+        """
+
+    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """Find the nearest feasible values. By default, all values are feasible.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            within: Norm-ball that must contain the result. Its centers are
+                feasible. None for no norm-ball.
+
+        Returns:
+            Feasible values, shape (A, D), nearest in the Euclidean sense.
+        """
+        return anywhere(values, within)
+
+    def take_step(
+        self,
+        values: Tensor,
+        gradient: Tensor,
+        examples: Tensor,
+        length: Tensor,
+    ) -> Tensor:
+        """Take a step of projected gradient descent.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            gradient: Gradient of the cost with respect to the values,
+                shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+            length: Factor of the step of each example, shape (A, 1).
+
+        Returns:
+            Values after the step, shape (A, D).
+        """
+        center = self.start[examples]
+        return self.settings.take_step(values, gradient, center, self.domain, length)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Find the nearest values that are feasible and lie in the norm-balls around the start.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Projected values, shape (A, D).
+        """
+        return self.settings.project(values, self.start[examples], self.domain)
+
+    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+        """Draw random feasible values for all examples.
+
+        With a radius, values are drawn uniformly from the norm-balls and then
+        projected. Without a radius, they are drawn in random directions, as far
+        from the start as the values that an attack reached.
+
+        Args:
+            generator: CPU generator of the random numbers.
+            reached: Values that an attack reached, shape (E, D). Needed only
+                without a radius.
+
+        Returns:
+            Random values, shape (E, D).
+
+        Raises:
+            InputError: If there is neither a radius nor `reached`.
+                `StepSettings.sample` raises it.
+        """
+        if self.settings.radius is None and reached is not None:
+            return self._sample_as_far_as(reached, generator)
+        drawn = self.settings.sample(self.start, generator, self.used_mask)
+        return self.settings.project(drawn, self.start, self.domain)
+
+    def _sample_as_far_as(self, reached: Tensor, generator: torch.Generator) -> Tensor:
+        """Draw values in random directions, as far from the start as `reached`, shape (E, D)."""
+        direction = torch.randn(reached.shape, generator=generator).to(reached)
+        if self.used_mask is not None:
+            direction = direction * self.used_mask
+        distance = (reached - self.start).norm(dim=1, keepdim=True)
+        offset = direction * distance / direction.norm(dim=1, keepdim=True)
+        return self.domain(self.start + offset)

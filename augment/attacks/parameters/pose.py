@@ -1,0 +1,242 @@
+"""Attacks on the pose of an object and of its cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import PoseSettings
+from augment.objects import SceneObject
+from augment.scene import Conditions, Scene
+from renderer.camera import PerspectiveCamera
+from renderer.errors import InputError
+from renderer.light.basis import Ball, nearest_in_box
+from renderer.skin import Skin
+from renderer.vectors import rotation_matrices
+
+# Positions among the attack values of an example: the rotation vector of the
+# object, its shift along x and y, its scale, and three values for the cameras,
+# of which the last is their distance. JOINTS is the position of the first value
+# of the joints, which come last.
+ROTATION = slice(0, 3)
+SHIFT = slice(3, 5)
+SCALE = 5
+CAMERA = slice(6, 9)
+DISTANCE = 8
+JOINTS = 9
+
+# An object that grows and a camera that approaches may each close this share of
+# the gap between them (see `Pose._largest_values`). They never meet because the
+# two shares add up to less than 1.
+MAX_APPROACH = 0.45
+
+
+class Pose(Parameter):
+    """Pose of an object and of its cameras, divided by the units of `PoseSettings`.
+
+    The first nine values of an example are the rotation vector of the object
+    about the origin, its shift along x and y, the logarithm of its scale, and
+    the changes of the polar angle, the azimuth and the logarithm of the
+    distance of all cameras. They are followed by a rotation vector for each
+    joint, if joints are attacked.
+
+    A displacement of vertices (see `Geometry`) comes first, then the rotation
+    of the joints, and then that of the object. If an object has props or a
+    table, it keeps standing on the same ground.
+
+    Args:
+        scene: Scene to attack, with `ImageSettings.silhouettes`.
+        settings: Norm-ball, steps and units of the attack.
+
+    Raises:
+        InputError: If `ImageSettings.silhouettes` of the scene is False. Also
+            if an object has no skin or lacks a named joint, which
+            `PoseSettings.joint_limits` finds.
+    """
+
+    name = "pose"
+    fits_other_meshes = False
+    needs_noise_margin = True
+
+    def __init__(self, scene: Scene, settings: PoseSettings):
+        if not scene.settings.silhouettes:
+            raise InputError(
+                "attack=pose needs gradients of outlines: set renderer.silhouettes=true",
+            )
+        self._object_of = scene.object_of
+        self._vertices = scene.vertices
+        self._movable_objects = _movable_objects(scene, settings)
+        units = [_pose_units(settings, item) for item in scene.objects]
+        # Shape (objects, D). Objects with fewer joints have units of 0 for the
+        # joints that they lack.
+        self._unit = pad_sequence(units, batch_first=True).to(scene.lights)
+        self._limit = self._largest_values(scene, settings)
+        used_mask = (self._unit > 0)[scene.object_of]
+        start = self._unit.new_zeros(used_mask.shape)
+        super().__init__(settings, start=start, used_mask=used_mask)
+
+    def _largest_values(self, scene: Scene, settings: PoseSettings) -> Tensor:
+        """Compute the largest magnitude of each attack value, shape (D,).
+
+        Scale and distance are limited, so that the object and a perspective
+        camera do not meet. Joints rotate at most by their unit, which is an
+        attack value of 1. The other values have no limit.
+        """
+        all_cameras = chain.from_iterable(scene.cameras)
+        cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
+        distances = [camera.distance for camera in cameras]
+        object_radius = float(scene.vertices.norm(dim=-1).max()) + settings.shift
+        # The scale of the object and the distance of the camera change by
+        # factors, so the gap between them is measured as a logarithm. Without
+        # perspective cameras it is infinite.
+        log_gap = math.log(min(distances, default=math.inf) / object_radius)
+        largest_log_factor = max(MAX_APPROACH * log_gap, 0.0)
+
+        limit = self._unit.new_full((self._unit.shape[1],), math.inf)
+        # These two units are the same for all objects. They can be 0.
+        units = self._unit[0, [SCALE, DISTANCE]].clamp(min=1e-9)
+        limit[[SCALE, DISTANCE]] = largest_log_factor / units
+        limit[JOINTS:] = 1.0
+        return limit
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with moved objects and cameras.
+
+        Args:
+            values: Pose of the A examples divided by the units of the settings,
+                shape (A, D).
+            conditions: Conditions of the A examples. If another parameter has
+                displaced the vertices, the displaced vertices are moved.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions with moved vertices and cameras, differentiable with
+            respect to the values.
+        """
+        objects = self._object_of[examples]
+        changes = values * self._unit[objects]
+        vertices = conditions.vertices
+        if vertices is None:
+            vertices = self._vertices[objects]
+        moved_vertices = []
+        for index, unmoved, change in zip(objects.tolist(), vertices, changes, strict=True):
+            moved_vertices.append(self._movable_objects[index].move(unmoved, change))
+        # There is nothing to stack if A is 0.
+        if moved_vertices:
+            vertices = torch.stack(moved_vertices)
+        return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
+
+    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        return nearest_in_box(values, -self._limit, self._limit, within)
+
+
+def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
+    """Return how far the pose of an object and its cameras changes per attack value of 1.
+
+    Returns:
+        Rotation vector in radians (3 values), shift in world units (2),
+        logarithm of the scale (1), polar angle and azimuth of the cameras in
+        radians (2), logarithm of their distance (1), and a rotation vector in
+        radians for each joint that rotates (3 each), shape (D,).
+    """
+    object_angle = math.radians(settings.rotation)
+    view_angle = math.radians(settings.view)
+    units = [object_angle, object_angle, object_angle]
+    units += [settings.shift, settings.shift]
+    units += [math.log1p(settings.scale)]
+    units += [view_angle, view_angle]
+    units += [math.log1p(settings.distance)]
+    for degrees in settings.joint_limits(item):
+        joint_angle = math.radians(degrees)
+        units += [joint_angle, joint_angle, joint_angle]
+    return torch.tensor(units, dtype=torch.float64)
+
+
+def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObject]:
+    """Create a `_MovableObject` for each object of a scene, in the order of `scene.objects`."""
+    masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
+    # Shape (objects, N), with N vertices in the largest mesh.
+    object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
+    movable_objects = []
+    for item, object_mask in zip(scene.objects, object_masks, strict=True):
+        # `item.own` is the number of faces of the object itself. It is None if
+        # the mesh contains no props or table.
+        stands_on_ground = item.own is not None
+        movable_objects.append(
+            _MovableObject(
+                object_mask=object_mask,
+                ground_height=item.lowest if stands_on_ground else None,
+                skin=item.mesh.skin,
+                rotated_joint_count=len(settings.joint_limits(item)),
+            )
+        )
+    return movable_objects
+
+
+@dataclass(frozen=True)
+class _MovableObject:
+    """Object that moves while its props and its table stay as they are.
+
+    Attributes:
+        object_mask: Mask of the vertices that belong to the object itself and
+            not to props or table, shape (N,).
+        ground_height: z coordinate of the ground on which the object stands.
+            None for an object without props or table, which may float.
+        skin: Joints of the mesh and the vertices that they carry. None for a
+            rigid object.
+        rotated_joint_count: Number of joints that rotate: all joints of the
+            skin, or 0 if joints are not attacked.
+    """
+
+    object_mask: Tensor
+    ground_height: float | None
+    skin: Skin | None
+    rotated_joint_count: int
+
+    def move(self, vertices: Tensor, change: Tensor) -> Tensor:
+        """Return the vertices after rotation of the joints and movement of the object.
+
+        Args:
+            vertices: Vertices of the object, its props and its table,
+                shape (N, 3).
+            change: Change of the pose in radians, world units and logarithms,
+                in the order of `Pose`, shape (D,).
+
+        Returns:
+            Moved vertices, shape (N, 3). If the object has a ground, its lowest
+            vertex lies on it.
+        """
+        bent = self._bend(vertices, change[JOINTS : JOINTS + 3 * self.rotated_joint_count])
+        scaled = change[SCALE].exp() * bent
+        rotated = scaled @ rotation_matrices(change[ROTATION]).T
+        # The shift along z is 0.
+        shift = F.pad(change[SHIFT], (0, 1))
+        moved = rotated + shift
+        if self.ground_height is not None:
+            lift = self.ground_height - moved[self.object_mask, 2].amin()
+            moved = moved + lift * moved.new_tensor([0, 0, 1])
+        return torch.where(self.object_mask[:, None], moved, bent)
+
+    def _bend(self, vertices: Tensor, joint_rotations: Tensor) -> Tensor:
+        """Return the vertices after rotation of the J joints, shape (N, 3).
+
+        Args:
+            vertices: Vertices of the object, its props and its table,
+                shape (N, 3).
+            joint_rotations: Rotation vectors of the joints in radians, one
+                after the other, shape (3 J,).
+        """
+        if self.skin is None or not self.rotated_joint_count:
+            return vertices
+        rotations = rotation_matrices(joint_rotations.view(-1, 3))
+        displacement = self.skin.displacements(rotations)
+        # The scene pads the vertices of smaller meshes to those of the largest.
+        padding_count = len(vertices) - len(displacement)
+        return vertices + F.pad(displacement, (0, 0, 0, padding_count))

@@ -1,0 +1,39 @@
+"""Attacks on the positions of lamps."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters.light import find_light
+from augment.attacks.parameters.parameter import Parameter
+from augment.scene import Conditions, Scene
+from renderer.light.local import Lamps
+
+
+class Positions(Parameter):
+    """Position of each lamp, as x, y and z in world units.
+
+    The shadows of each image are those of the changed positions. The gradient
+    treats shadows as fixed.
+
+    Args:
+        scene: Scene to attack.
+        settings: Norm-ball and steps of the attack.
+
+    Raises:
+        InputError: If the scene has no lamps.
+    """
+
+    name = "positions"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        _, lamps = find_light(scene, Lamps.name, self.name)
+        assert isinstance(lamps, Lamps)
+        # Shape (L, 3) for L lamps. All examples start at the same positions.
+        positions = torch.tensor(lamps.positions).to(scene.lights)
+        super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, positions=values.unflatten(1, (-1, 3)))

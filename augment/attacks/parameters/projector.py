@@ -1,0 +1,23 @@
+"""Attacks on the pattern of a projector."""
+
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters.light import LightParameter, find_light
+from augment.scene import Scene
+
+
+class Projector(LightParameter):
+    """RGB value of each pixel of a projector, from 0 to `renderer.light.local.Projector.power`.
+
+    Args:
+        scene: Scene to attack.
+        settings: Norm-ball and steps of the attack.
+
+    Raises:
+        InputError: If the scene has no projector.
+    """
+
+    name = "projector"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        rows, basis = find_light(scene, "projector", self.name)
+        super().__init__(scene, settings, rows=rows, basis=basis, nonnegative=True)

@@ -1,0 +1,83 @@
+"""Attacks on the position of the sun and the haze of a daylight sky."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from augment.attacks.parameters.light import environment_light, replace_light
+from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import SkylightSettings
+from augment.scene import Conditions, Scene
+from renderer.light.basis import Ball, nearest_in_box
+from renderer.light.presets import mean_luminance
+from renderer.light.skylight import TURBIDITY, ZENITH
+from renderer.light.skylight import coefficients as sky_coefficients
+
+# `Skylight` divides the turbidity by this unit to get an attack value. The
+# turbidity then has a range of 2 (from 2 / 4 to 10 / 4). This is of the same
+# order as the ranges of the zenith angle (1.6 radians) and of the azimuth (6.3
+# radians), so one radius and one step size suit all three values.
+TURBIDITY_UNIT = 4.0
+
+
+class Skylight(Parameter):
+    """Zenith angle and azimuth of the sun in radians, and turbidity divided by `TURBIDITY_UNIT`.
+
+    The sky replaces the environment lighting of the scene. It is multiplied by
+    a constant factor, so that the initial sky has the mean luminance of the
+    lighting that it replaces. Projector and lamps stay as they are.
+
+    Args:
+        scene: Scene to attack.
+        settings: Norm-ball, steps and initial sky of the attack.
+    """
+
+    name = "skylight"
+
+    def __init__(self, scene: Scene, settings: SkylightSettings):
+        self._rows, self._basis = environment_light(scene)
+        zenith = math.radians(settings.zenith)
+        azimuth = math.radians(settings.azimuth)
+        turbidity = settings.turbidity
+
+        sky_luminance = mean_luminance(sky_coefficients(zenith, azimuth, turbidity))
+        replaced_lights = scene.lights[:, self._rows]
+        scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
+        # Factor of the sky for each example, shape (E,).
+        self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
+
+        values = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64)
+        super().__init__(settings, start=values.to(scene.lights).expand(len(scene), -1))
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """Return a copy of the conditions with the sky in place of the environment lighting.
+
+        Args:
+            values: Zenith angle and azimuth in radians, and turbidity divided
+                by `TURBIDITY_UNIT`, shape (A, 3).
+            conditions: Conditions of the A examples.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Conditions with the light of the sky, differentiable with respect to
+            the values.
+        """
+        zenith, azimuth, scaled_turbidity = values.unbind(1)
+        # Shape (A, 49, 3).
+        sky = sky_coefficients(zenith, azimuth, scaled_turbidity * TURBIDITY_UNIT)
+        sky = sky * self._scale[examples, None, None]
+        # The environment lighting may have a higher degree than the sky model.
+        # The sky then has zeros as its last coefficients.
+        missing_count = self._basis.size - sky.shape[-2]
+        sky = F.pad(sky, (0, 0, 0, missing_count))
+        return replace_light(conditions, self._rows, sky.to(conditions.light))
+
+    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        # The sky model is defined for these ranges, and for any azimuth.
+        lowest_zenith, highest_zenith = ZENITH
+        lowest_turbidity, highest_turbidity = TURBIDITY
+        low = values.new_tensor([lowest_zenith, -math.inf, lowest_turbidity / TURBIDITY_UNIT])
+        high = values.new_tensor([highest_zenith, math.inf, highest_turbidity / TURBIDITY_UNIT])
+        return nearest_in_box(values, low, high, within)

@@ -1,0 +1,160 @@
+"""All parameters that an attack changes, as one vector of values."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from augment.attacks.parameters.parameter import Parameter
+from augment.progress import progress
+from augment.scene import Conditions, Scene
+
+
+class AttackProblem:
+    """Scene and the parameters that an attack changes.
+
+    Each of the E examples of the scene has a vector of D values. It contains
+    the values of the first parameter, then those of the second, and so on.
+
+    Args:
+        scene: Scene to attack.
+        parameters: Parameters to change, made for this scene.
+
+    Attributes:
+        scene: Scene to attack.
+        parameters: Parameters to change, made for this scene.
+        start: Values at which attacks start, shape (E, D).
+        everything: Indices of all examples, shape (E,).
+        at_once: Largest number of examples that are rendered at the same time,
+            which limits the memory.
+    """
+
+    def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
+        self.scene = scene
+        self.parameters = parameters
+        self.at_once = scene.at_once
+        starts = [parameter.start.to(scene.lights) for parameter in parameters]
+        self.start = torch.cat(starts, dim=1)
+        self.everything = torch.arange(len(scene), device=self.start.device)
+        self._value_counts = [parameter.start.shape[1] for parameter in parameters]
+
+    def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
+        """Return the conditions of the scene in which the parameters have the given values.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Light, shape, colors and other conditions of the A examples,
+            differentiable with respect to the values.
+        """
+        conditions = self.scene.conditions(examples)
+        for parameter, parameter_values in self.by_parameter(values):
+            conditions = parameter.apply(parameter_values, conditions, examples)
+        return conditions
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Render the V views of each example with the given values of the parameters.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Images in [0, 1], shape (A, V, 3, size, size), differentiable with
+            respect to the values.
+        """
+        return self.scene.render(self.conditions(values, examples), examples)
+
+    @torch.no_grad()
+    def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
+        """Render examples without gradients, at most `at_once` of them at a time.
+
+        Args:
+            values: Values of all E examples, shape (E, D).
+            examples: Indices of the examples to render, shape (A,). None
+                renders all examples.
+
+        Returns:
+            Images in [0, 1], shape (A, V, 3, size, size).
+        """
+        if examples is None:
+            examples = self.everything
+        size = self.scene.settings.size
+        images = values.new_empty(len(examples), self.scene.views, 3, size, size)
+        image_parts = images.split(self.at_once)
+        example_parts = examples.split(self.at_once)
+        parts = list(zip(image_parts, example_parts, strict=True))
+        for image_part, example_part in progress(parts, "images") if len(parts) > 1 else parts:
+            image_part.copy_(self.render(values[example_part], example_part))
+        return images
+
+    def take_step(
+        self,
+        values: Tensor,
+        gradient: Tensor,
+        examples: Tensor,
+        length: Tensor,
+    ) -> Tensor:
+        """Take a step of projected gradient descent with each parameter.
+
+        Args:
+            values: Values of A examples, shape (A, D).
+            gradient: Gradient of the cost with respect to the values,
+                shape (A, D).
+            examples: Indices of the examples in the scene, shape (A,).
+            length: Factor of the steps of each example, shape (A, 1).
+
+        Returns:
+            Values after the step, which are feasible and lie in the
+            norm-balls, shape (A, D).
+        """
+        parts = zip(self.by_parameter(values), self.by_parameter(gradient), strict=True)
+        moved = [
+            parameter.take_step(part, gradient_part, examples, length)
+            for (parameter, part), (_, gradient_part) in parts
+        ]
+        return torch.cat(moved, dim=1)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Find the nearest values that are feasible and lie in the norm-balls.
+
+        Args:
+            values: Values of A examples, shape (A, D). The values of each
+                parameter are projected by `Parameter.project`.
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Projected values, shape (A, D).
+        """
+        parts = self.by_parameter(values)
+        projected = [parameter.project(part, examples) for parameter, part in parts]
+        return torch.cat(projected, dim=1)
+
+    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+        """Draw random feasible values for all examples, one parameter after the other.
+
+        Args:
+            generator: CPU generator of the random numbers.
+            reached: Values that an attack reached, shape (E, D). Parameters
+                with a radius ignore them.
+
+        Returns:
+            Random values, shape (E, D). See `Parameter.sample`.
+
+        Raises:
+            InputError: If a parameter has no radius and `reached` is None.
+                `StepSettings.sample` raises it.
+        """
+        if reached is None:
+            samples = [parameter.sample(generator) for parameter in self.parameters]
+        else:
+            parts = self.by_parameter(reached)
+            samples = [parameter.sample(generator, part) for parameter, part in parts]
+        return torch.cat([sample.to(self.start) for sample in samples], dim=1)
+
+    def by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
+        """Split values of shape (A, D) into pairs of a parameter and its values."""
+        parts = values.split(self._value_counts, dim=1)
+        return list(zip(self.parameters, parts, strict=True))

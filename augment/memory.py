@@ -1,0 +1,119 @@
+"""Memory: how much of it is free, and how much renders, operators and attacks take."""
+
+from pathlib import Path
+
+import torch
+
+from renderer.errors import InputError
+
+MEMORY = Path("/proc/meminfo")  # Where Linux says how much memory is free.
+GROUP = Path("/sys/fs/cgroup")  # Where Linux says what a container may use (cgroup v2).
+GIB = 2**30
+
+# Numbers that an attack on the light holds beside the operators: for each
+# value of the light of an example, for each pixel of all images, and for each
+# pixel of the images that are rendered at once, without and with effects of
+# the camera.
+NUMBERS_PER_LIGHT_VALUE = 12
+NUMBERS_PER_PIXEL = 10
+NUMBERS_PER_RENDERED_PIXEL = 16
+NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA = 48
+
+# Bytes that an operator takes for each pixel and each coefficient of the light:
+# two channels of float32.
+OPERATOR_BYTES = 8
+
+
+def require_memory(name: str, needed: int, device: torch.device) -> None:
+    """Check that there is memory for something, before the system ends the process for it.
+
+    Args:
+        name: What needs the memory, in the plural, such as "40 renders".
+        needed: The bytes that it needs.
+        device: The device on which it needs them.
+
+    Raises:
+        InputError: If fewer bytes are free.
+    """
+    if not has_memory(needed, device):
+        free = free_memory(device) or 0
+        sizes = f"{needed / GIB:.1f} GB of memory and {free / GIB:.1f} GB are free"
+        raise InputError(f"{name} need {sizes}: ask for fewer or smaller ones")
+
+
+def has_memory(needed: int, device: torch.device) -> bool:
+    """Return whether as many bytes are free on a device, or the system does not say.
+
+    Args:
+        needed: The number of bytes.
+        device: The device.
+    """
+    free = free_memory(device)
+    return free is None or needed <= free
+
+
+def free_memory(device: torch.device) -> int | None:
+    """Return the free memory of a GPU, the machine or the container.
+
+    Args:
+        device: The device.
+
+    Returns:
+        The number of bytes. None if the system does not say.
+    """
+    if device.type == "cuda":
+        # Memory that torch has reserved and does not use is free for torch.
+        reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + reserved
+    try:
+        lines = dict(line.split(":") for line in MEMORY.read_text().splitlines())
+        free = 1024 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return None
+    try:
+        limit = int((GROUP / "memory.max").read_text())
+        used = int((GROUP / "memory.current").read_text())
+    # Without a container, there is no such file, or its text is "max".
+    except (OSError, ValueError):
+        return free
+    return min(free, limit - used)
+
+
+def attack_bytes(
+    pixels: int,
+    pixels_at_once: int,
+    lights: torch.Tensor,
+    camera_effects: bool,
+) -> int:
+    """Estimate the memory that an attack on the light of a scene takes beside the operators.
+
+    Args:
+        pixels: The pixels of all images, on one channel.
+        pixels_at_once: The pixels of the images that are rendered at once.
+        lights: The light of each example, shape (E, coefficients, 3).
+        camera_effects: Whether effects of a camera follow the renders.
+
+    Returns:
+        The number of bytes.
+    """
+    per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL
+    if camera_effects:
+        per_rendered_pixel = NUMBERS_PER_RENDERED_PIXEL_WITH_CAMERA
+    numbers = NUMBERS_PER_PIXEL * pixels
+    numbers += per_rendered_pixel * pixels_at_once
+    numbers += NUMBERS_PER_LIGHT_VALUE * lights.numel()
+    return lights.element_size() * numbers
+
+
+def operator_bytes(degree: int, pixels: int) -> int:
+    """Estimate the memory of the operators that map light to images.
+
+    Args:
+        degree: The degree of the light.
+        pixels: The pixels of all views.
+
+    Returns:
+        The number of bytes.
+    """
+    coefficient_count = (degree + 1) ** 2
+    return OPERATOR_BYTES * coefficient_count * pixels
