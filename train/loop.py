@@ -28,12 +28,14 @@ from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
 from train.averages import Averages
+from train.baselines import Baseline
 from train.batches import Round, TrainingImages, rounds_of_epoch, training_batches
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
 from train.device import GraphedModel, MixedPrecision, compiles
+from train.loss import TrainingLoss
 from train.processes import Interruption, replicated, summed
-from train.recipe import TrainSettings, augmentation, build_optimizer, training_loss
+from train.recipe import TrainSettings, build_optimizer
 from train.run_folder import PHASES, RunLog
 
 # Images that are evaluated at a time.
@@ -184,8 +186,8 @@ class Trainer:
         is_scaled = self.model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
         teacher = self.initial if settings.distillation else None
-        self._loss = training_loss(replica, settings, studied, teacher, labeled)
-        self._augment = augmentation(settings.augmentation, self.model, self.seed, studied[1:])
+        self._loss = TrainingLoss(replica, settings, studied, teacher, labeled).compute
+        self._baseline = Baseline(settings.augmentation, self.model, self.seed, studied[1:])
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
         if compiles(settings.compile, self.device):
@@ -327,7 +329,7 @@ class Trainer:
         done = progress if settings.soup else (self.epoch + progress) / settings.epochs
         for group in self.optimizer.param_groups:
             group["lr"] = settings.rate(done)
-        images = self._augment(images, labels, number)
+        images = self._baseline.apply(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
         sums = torch.zeros(2, device=self.device)
         parts = zip(

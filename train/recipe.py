@@ -1,37 +1,22 @@
-"""How a network is trained: settings, learning-rate schedules, the loss, averaged weights, baseline augmentations."""
+"""How a network is trained: settings, learning-rate schedules, the optimizer, frozen layers."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from augment import distributed
-from augment.attacks.norm_ball import StepSettings
-from augment.batches import as_found
 from augment.classifiers.adapter import nearest
-from augment.losses import divergence, is_right, label_loss, ranking_loss
-from augment.random_streams import generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
-from renderer.image import to_bytes, to_unit
-from renderer.light.basis import nearest_in_box
 from train.batches import FLIPS
 from train.device import COMPILE
-
-Augment = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
-Loss = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 OPTIMIZERS = ("sgd", "adamw")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 ALL_BUT_LAST = "all_but_last"  # of train.freeze: only the last layer learns, as in Kirichenko et al. 2023
-# Norm-ball and steps of `pgd`. Madry et al. 2018 have a radius of 8/255 on
-# CIFAR-10.
-PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)
-PGD_STEPS = 3
 LARGEST = dict(
     epochs=10**6, images_per_epoch=10**9, batch_size=10**6, accumulate=10**6, checkpoint_every=10**6, threads=1024
 )
@@ -128,101 +113,3 @@ def freeze(network: nn.Module, stage: str) -> None:
         raise InputError(f"train.freeze={stage} is no part of the network: choose one, such as {parts}")
     for parameter in list(network.parameters())[: frozen[-1] + 1]:
         parameter.requires_grad_(False)
-
-
-def training_loss(
-    model: nn.Module, settings: TrainSettings, studied: Sequence[int], teacher: nn.Module | None, labeled: bool = True
-) -> Loss:
-    """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and how many
-    predictions are correct.
-
-    The loss is the mean `label_loss` plus, by their weights, the mean `ranking_loss` of the classes `studied` and the
-    `divergence` from the teacher's predictions: on renders, of all classes but these, or none without any. Unless the
-    data are labeled, only renders have a `label_loss`, and the teacher's answers are the others' labels.
-    """
-
-    def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
-        logits = model(to_unit(images))
-        if teacher is not None:
-            with torch.no_grad():
-                targets = teacher(to_unit(images))
-            if not labeled:
-                labels = torch.where(rendered, labels, targets.argmax(1))
-        losses = label_loss(logits, labels, settings.label_smoothing, studied[1:])
-        loss = (losses if labeled else losses * rendered).mean()
-        if teacher is not None:
-            changed = divergence(logits, targets) * ~rendered
-            if studied:
-                classes = torch.arange(logits.shape[1], device=logits.device)
-                kept = torch.stack([classes != label for label in studied]).all(0)
-                changed = changed + divergence(logits[:, kept], targets[:, kept]) * rendered
-            loss = loss + settings.distillation * changed.mean()
-        if studied and settings.ranking:
-            ranked = sum(ranking_loss(logits, labels, label) for label in studied)
-            loss = loss + settings.ranking * ranked / len(studied)
-        return loss, is_right(logits.detach().argmax(1), labels, studied[1:]).sum()
-
-    return loss_and_hits
-
-
-def augmentation(name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()) -> Augment:
-    """One of `AUGMENTATIONS`: PGD against the model's `label_loss`, which takes `absent`; or a transform of
-    torchvision's, the jitter at half the strengths of Chen et al. 2020, as is usual for small images. The draws for an
-    image depend on seed, step and its index."""
-    if name == "none":
-        return lambda images, labels, step: images
-    if name == "pgd":
-        return lambda images, labels, step: pgd(
-            model, images, labels, generator(seed, step, "pgd", distributed.rank()), absent
-        )
-    from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
-
-    jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
-    transform = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide(), "augmix": v2.AugMix()}[name]
-
-    def transform_each(images: Tensor, labels: Tensor, step: int) -> Tensor:
-        """torchvision's transforms draw once for a whole batch, and from the global generator."""
-        transformed = []
-        with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-            for index, image in enumerate(images, distributed.rank() * len(images)):
-                torch.manual_seed(stream_seed(seed, step, index, "distortion"))
-                transformed.append(transform(image))
-        return torch.stack(transformed)
-
-    return transform_each
-
-
-@torch.enable_grad()
-def pgd(
-    model: nn.Module,
-    images: Tensor,
-    labels: Tensor,
-    draws: torch.Generator,
-    absent: Sequence[int] = (),
-) -> Tensor:
-    """Attack images by projected gradient descent from a random start (Madry et al. 2018).
-
-    The steps are those of an attack on the pixels of a scene
-    (`StepSettings.take_step`), without a criterion to stop at.
-
-    Args:
-        model: Classifier of images in [0, 1], which is in eval mode meanwhile.
-        images: Images, shape (B, 3, H, W), uint8.
-        labels: Labels, shape (B,); see `augment.losses.label_loss`.
-        draws: CPU generator of the random start.
-        absent: Further classes that no image of a complementary label shows.
-
-    Returns:
-        Images within the norm-balls of `PGD`, rounded to 8 bits,
-        shape (B, 3, H, W), uint8.
-    """
-    clean = to_unit(images)
-    possible = partial(nearest_in_box, low=0, high=1)
-    adversarial = PGD.project(PGD.sample(clean, draws), clean, possible)
-    with as_found(model):
-        for _ in range(PGD_STEPS):
-            adversarial.requires_grad_(True)
-            cost = -label_loss(model(adversarial), labels, absent=absent).sum()
-            (gradient,) = torch.autograd.grad(cost, adversarial)
-            adversarial = PGD.take_step(adversarial.detach(), gradient, clean, possible)
-    return to_bytes(adversarial)
