@@ -10,9 +10,9 @@ from augment import distributed
 from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
-from train.networks import WideResNet
 from train.baselines import PGD, Baseline
 from train.loss import TrainingLoss
+from train.networks import WideResNet
 from train.recipe import AUGMENTATIONS, SCHEDULES, TRANSFORMS, TrainSettings
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
