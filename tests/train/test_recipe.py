@@ -84,7 +84,8 @@ def test_unlabeled_images_have_the_teachers_answers_as_labels_but_no_cross_entro
     studied = (int(answers[-1]),)
     labeled, hits = TrainingLoss(model.eval(), settings, studied, teacher).compute(images, answers, rendered)
     cross_entropy = F.cross_entropy(model(images / 255)[2:], answers[2:], reduction="sum") / 6
-    unlabeled = TrainingLoss(model, settings, studied, teacher, labeled=False).compute(images, LABELS * rendered, rendered)
+    loss = TrainingLoss(model, settings, studied, teacher, labeled=False)
+    unlabeled = loss.compute(images, LABELS * rendered, rendered)
     torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
 
 
