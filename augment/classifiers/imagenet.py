@@ -5,7 +5,6 @@ Each source has a function that builds a network with fresh weights, and one tha
 Files of weights are read without running code from them, and checked against the network that they are to fill.
 """
 
-import hashlib
 import importlib
 import re
 import textwrap
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
-_CAFFE_BIAS = "0e39fe11b7decc597cc07679a428b0259045b62c49580144774961387f92626e"  # SHA-256 of its first bias
 _CAFFE_MEAN = (104, 117, 123)  # blue, green, red, of 255
 
 
@@ -52,12 +50,12 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     published = published_weights(model, weights)
     state = _download(published, name) if weights is None else read_weights(weights)
     source = weights or published.url
-    bias = state.get("features.0.bias")
-    if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
-        units = f"on images in other units than {name} takes: set classifier={SQUEEZENET_CAFFE}"
-        raise InputError(f"weights={source} were trained in Caffe, {units}")
-    if model.startswith("densenet"):  # the published files are older than the rule that a module's name holds no dot
-        state = {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
+    if model.startswith("densenet"):
+        # The published files are older than the rule that a module's name holds no dot.
+        state = {
+            re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
+            for key, value in state.items()
+        }
     return fill(build_torchvision(model, None, published), state, source)
 
 

@@ -160,14 +160,6 @@ def test_squeezenet_of_caffe_gets_blue_first_and_unscaled_images(squeezenet_file
     torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=3 * 255 * EPS32)
 
 
-@pytest.mark.realdata
-@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
-def test_weights_of_caffe_are_not_loaded_as_torchvisions():
-    path = DATA / "weights" / "squeezenet1_0.pth"
-    with pytest.raises(InputError, match=re.escape(f"weights={path} were trained in Caffe, ")):
-        load_classifier("torchvision:squeezenet1_0", path)
-
-
 def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
     """So 56 of the 15 × 15 values that are averaged are the bias alone."""
     classifier, plain = load_classifier("squeezenet_caffe", squeezenet_file), squeezenet1_0()
