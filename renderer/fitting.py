@@ -29,12 +29,13 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
+from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
 from renderer.shapes import sphere
 from renderer.transfer import COEFFICIENTS, DEGREE
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, UInt8
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
@@ -53,8 +54,21 @@ LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Betw
 MOST_EXCHANGES = 100  # Iterations of non-negative least squares per direction; three are usual.
 FIRST_DIRECTIONS = 16  # Every so many directions of a grid constrain the first solution.
 SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
-WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
-LEAST = 16  # pixels that the object must cover
+# Pixels with a larger share are the object's. A hundredth of a background may be brighter than the blue of a banana.
+WHOLE = 0.999
+BORDER = 2  # Other pixels take their color from the object's pixels that are so near.
+MARGIN = 1.6  # The side of an object's window, in those of its box.
+OPAQUE = 127  # A mask with larger values holds the object.
+USUAL_POLAR = math.radians(60)  # The first guess of how far the camera looks from straight down.
+TILTED = 1e-3  # Radians that a window may be turned about its middle.
+LEAST = 16  # Pixels that the object must cover.
+
+
+class FittedPhotograph(NamedTuple):
+    """A scene whose camera looks at the mesh's middle, and the part of the photograph that this camera shows."""
+
+    scene: FittedScene
+    window: Window
 
 
 class FittedScene(NamedTuple):
@@ -74,6 +88,87 @@ class FittedScene(NamedTuple):
     overlap: float
 
 
+def fit_photograph(
+    photograph: UInt8[NDArray[Any], "height width 3"],
+    mask: UInt8[NDArray[Any], "height width"],
+    mesh: Mesh,
+    size: int = 64,
+    *,
+    fov: float | None = None,
+    encoding: str = "srgb",
+    **options: Any,
+) -> FittedPhotograph:
+    """Find the camera and the light of an object anywhere in a photograph.
+
+    The object's window is turned to it (`renderer.photograph`). Which way is up there depends on how high the camera
+    stands, so that the window and the camera are found anew if a first fit says that the window was tilted.
+
+    Args:
+        photograph: Pixels of 8 bits, shape (H, W, 3). Its camera is upright, and its optical axis passes through the
+            photograph's middle.
+        mask: White where the object is, shape (H, W).
+        mesh: The mesh, normalized and upright.
+        size: Pixels per side that are compared.
+        fov: Angle across a square `MARGIN` times as wide as the object, in radians. None for a camera without
+            perspective.
+        encoding: Encoding of the photograph and of the images that are to be rendered, linear or srgb.
+        **options: Further arguments of `fit_scene`.
+
+    Returns:
+        The scene and its window of the photograph.
+
+    Raises:
+        InputError: If the mask holds no object.
+    """
+    rows, columns = (np.flatnonzero((mask > OPAQUE).any(axis)) for axis in (1, 0))
+    if not len(rows):
+        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
+    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
+    side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
+    whole = Photograph(photograph, None if fov is None else side / 2 / math.tan(fov / 2))
+    options = {**options, "fov": fov, "encoding": encoding}
+
+    def fit(window: Window, start: Camera | None) -> FittedScene:
+        linear = window.cut(photograph, size, encoding)
+        share = window.cut(mask[..., None], size, beyond=0)[0]
+        return fit_scene(linear, share, mesh, start=start, **options)
+
+    window = whole.window(center, side, np.array([0.0, math.sin(USUAL_POLAR), math.cos(USUAL_POLAR)]))
+    scene = fit(window, None)
+    above = _direction_above(scene.camera, window)
+    above[0] = 0  # The photograph's camera is upright.
+    upright = whole.window(center, side, above)
+    if np.abs(upright.axes - window.axes).max() > TILTED:
+        window = upright
+        scene = fit(window, scene.camera)
+    camera = scene.camera
+    above = _direction_above(camera, window)
+    middle = window.pixels(*(np.array([camera.right, camera.up]) * side / camera.width))
+    turned = _turned_to_mesh(camera)
+    return FittedPhotograph(scene._replace(camera=turned), whole.window(np.array(middle), side, above))
+
+
+def _direction_above(camera: Camera, window: Window) -> NDArray[Any]:
+    """Return the world's z axis in the axes of the photograph's camera, of a camera that shows a window."""
+    return window.axes.T @ camera.axes()[:, 2]
+
+
+def _turned_to_mesh(camera: Camera) -> Camera:
+    """Turn a camera at its place, so that it looks at the mesh's middle.
+
+    A camera with perspective sees the mesh from another angle than that of its optical axis if the mesh is not in the
+    middle of the image.
+    """
+    if not isinstance(camera, PerspectiveCamera):
+        return replace(camera, right=0.0, up=0.0)
+    x, y, z = camera.eye()[:3].tolist()
+    distance = math.hypot(x, y, z)
+    polar = math.acos(z / distance)
+    azimuth = math.atan2(y, x)
+    width = camera.width * distance / camera.distance
+    return replace(camera, polar=polar, azimuth=azimuth, width=width, right=0.0, up=0.0, distance=distance)
+
+
 def fit_scene(
     photograph: Float[Tensor, "3 size size"],
     mask: Float[Tensor, "size size"],
@@ -85,6 +180,7 @@ def fit_scene(
     normals: str = "smooth",
     bounces: int = 0,
     rasterizer: str = "auto",
+    start: Camera | None = None,
 ) -> FittedScene:
     """Find the camera and the environment light under which renders of a normalized mesh resemble a photograph most.
 
@@ -102,6 +198,7 @@ def fit_scene(
         bounces: Bounces of the returned light, with shadows. Without them, the light of a concave mesh is too bright
             or too dim. The search for the camera ignores shadows.
         rasterizer: auto, opengl, numba or numpy.
+        start: A camera near the one that is sought. None searches for one.
 
     Returns:
         The camera, the light, and how well they fit.
@@ -117,8 +214,19 @@ def fit_scene(
         raise InputError(f"the mask covers {float(mask.sum()):.0f} pixels of {size}²: give one that shows the object")
     options = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals, "rasterizer": rasterizer}
     photograph, mask = photograph.double(), mask.double()
-    coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
     fine = _Target.of(photograph, mask, mesh, size, options)
+    if start is None:
+        coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
+        starts = _plausible_cameras(coarse, mask, fov)
+    else:
+        starts = [start]
+    _, camera = fine.ranked(fine.descended(camera) for camera in starts)[0]
+    return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+
+
+def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
+    """Search for cameras at a coarse size, of which one is near the best one."""
+    mesh = coarse.mesh
     cameras = [
         camera.seeing(float(np.linalg.norm(mesh.vertices, axis=1).max()))
         for polar in POLAR
@@ -130,9 +238,7 @@ def fit_scene(
     starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
     descended = coarse.ranked(coarse.descended(camera) for camera in starts)
     least = descended[0][0]
-    plausible = _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])
-    _, camera = fine.ranked(fine.descended(camera) for camera in plausible[:KEPT])[0]
-    return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+    return _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])[:KEPT]
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
