@@ -46,8 +46,9 @@ DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
 SAMPLES = 8  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
 PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
-SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.
-DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of the channels.
+# Weight of the squared Laplacian of the light, or of its difference from what the best channel lets expect, relative to
+# what that channel shows of a constant light. It bounds light that is not seen.
+SMOOTH = 1e-6
 CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
 CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
 LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
@@ -297,15 +298,15 @@ class _Target(NamedTuple):
             known = shown * used[:, None]
             squares = known @ shown.mT
             penalty = self.penalty(squares)
-            wanted = known @ (image - behind[operator.pixels])[..., None]
-            light = _nonnegative_light(squares + torch.diag_embed(penalty), wanted[..., 0], grid)
+            wanted = (known @ (image - behind[operator.pixels])[..., None])[..., 0]
+            light, expected = _light_of_channels(squares, wanted, penalty, grid)
             predicted = (light.T[:, None] @ shown)[:, 0] + behind[operator.pixels]
             brighter = seen & ~(clipped & (predicted > 1))  # A clipped pixel may be brighter than the photograph.
             if torch.equal(brighter, used):
                 break
             used = brighter
         whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
-        residuals = torch.cat([(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * light.T).flatten()])
+        residuals = torch.cat([(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * (light - expected).T).flatten()])
         return residuals, light, coverage
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
@@ -314,12 +315,11 @@ class _Target(NamedTuple):
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
-        """Weights (3, 49) of the light's squared coefficients, in proportion to the squares (3, 49, 49) of what they
-        show, so that the result does not depend on the albedo's scale."""
-        constant = squares[:, 0, 0]
-        weight = torch.maximum(constant, DARKEST * constant.mean() + 1e-12 * self.mask.sum())
+        """Weights (49,) of a light's squared coefficients, in proportion to the squares (3, 49, 49) of what they show,
+        so that the result does not depend on the albedo's scale."""
+        brightest = squares[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
-        return SMOOTH * weight[:, None] * (1 + (band * (band + 1)).square())
+        return SMOOTH * brightest * (1 + (band * (band + 1)).square())
 
     def descended(self, camera: Camera) -> Camera:
         """Return the camera after descent by the Gauss-Newton method in a trust region.
@@ -369,6 +369,28 @@ class _Target(NamedTuple):
         return FittedScene(camera, light, float(error), float(overlap))
 
 
+def _light_of_channels(squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int) -> tuple[Tensor, Tensor]:
+    """Fit the light of the channel that the object shows best, and then of the others, which are expected to resemble
+    it: a yellow object hardly says from where blue light comes.
+
+    Args:
+        squares: The products of what the light's coefficients show, shape (3, 49, 49).
+        wanted: Their products with what is to be shown, shape (3, 49).
+        penalty: Weights of the squared differences from the expected light, shape (49,).
+        grid: Subdivisions of the grid of directions.
+
+    Returns:
+        The lights and the expected lights, shapes (49, 3). In the first channel, none is expected.
+    """
+    regular = squares + torch.diag(penalty)
+    best = int(squares[:, 0, 0].argmax())
+    seen = _nonnegative_light(regular[best, None], wanted[best, None], grid)[:, 0]
+    brightness = (wanted @ seen) / ((squares @ seen) @ seen).clamp(min=torch.finfo(torch.float64).tiny)
+    expected = seen[:, None] * brightness.clamp(min=0)
+    expected[:, best] = 0
+    return _nonnegative_light(regular, wanted + (penalty[:, None] * expected).T, grid), expected
+
+
 def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     """Minimize xᵀ S x / 2 − wᵀ x for each channel over lights x of nowhere negative radiance.
 
@@ -377,12 +399,12 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     that minimizes |L⁻¹ w + Gᵀ μ|.
 
     Args:
-        squares: The positive definite matrices S, shape (3, 49, 49).
-        wanted: The vectors w, shape (3, 49).
+        squares: The positive definite matrices S, shape (C, 49, 49).
+        wanted: The vectors w, shape (C, 49).
         grid: Subdivisions of the grid of directions.
 
     Returns:
-        The lights, shape (49, 3).
+        The lights, shape (49, C).
     """
     rows = _radiance_above_least(grid)
     lights = []
