@@ -306,7 +306,9 @@ class _Target(NamedTuple):
                 break
             used = brighter
         whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
-        residuals = torch.cat([(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * (light - expected).T).flatten()])
+        residuals = torch.cat(
+            [(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * (light - expected).T).flatten()]
+        )
         return residuals, light, coverage
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
