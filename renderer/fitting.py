@@ -29,12 +29,13 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.light.harmonics import bands, basis
 from renderer.mesh import Mesh
+from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
 from renderer.shapes import sphere
 from renderer.transfer import COEFFICIENTS, DEGREE
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, UInt8
 
 POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
 COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
@@ -45,16 +46,30 @@ DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
 SAMPLES = 8  # Samples per side of a pixel.
 DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
 PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
-SMOOTH = 1e-5  # Weight of the light's squared Laplacian relative to a constant light. It bounds light that is not seen.
-DARKEST = 1e-4  # Least weight of a dark color channel relative to the mean of the channels.
+# Weight of the squared Laplacian of the light, or of its difference from what the best channel lets expect, relative to
+# what that channel shows of a constant light. It bounds light that is not seen.
+SMOOTH = 1e-6
 CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
 CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
 LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
 MOST_EXCHANGES = 100  # Iterations of non-negative least squares per direction; three are usual.
 FIRST_DIRECTIONS = 16  # Every so many directions of a grid constrain the first solution.
 SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
-WHOLE, BORDER = 0.98, 2  # a pixel with a larger share is the object's; others take its color from so near
-LEAST = 16  # pixels that the object must cover
+# Pixels with a larger share are the object's. A hundredth of a background may be brighter than the blue of a banana.
+WHOLE = 0.999
+BORDER = 2  # Other pixels take their color from the object's pixels that are so near.
+MARGIN = 1.6  # The side of an object's window, in those of its box.
+OPAQUE = 127  # A mask with larger values holds the object.
+USUAL_POLAR = math.radians(60)  # The first guess of how far the camera looks from straight down.
+TILTED = 1e-3  # Radians that a window may be turned about its middle.
+LEAST = 16  # Pixels that the object must cover.
+
+
+class FittedPhotograph(NamedTuple):
+    """A scene whose camera looks at the mesh's middle, and the part of the photograph that this camera shows."""
+
+    scene: FittedScene
+    window: Window
 
 
 class FittedScene(NamedTuple):
@@ -74,6 +89,87 @@ class FittedScene(NamedTuple):
     overlap: float
 
 
+def fit_photograph(
+    photograph: UInt8[NDArray[Any], "height width 3"],
+    mask: UInt8[NDArray[Any], "height width"],
+    mesh: Mesh,
+    size: int = 64,
+    *,
+    fov: float | None = None,
+    encoding: str = "srgb",
+    **options: Any,
+) -> FittedPhotograph:
+    """Find the camera and the light of an object anywhere in a photograph.
+
+    The object's window is turned to it (`renderer.photograph`). Which way is up there depends on how high the camera
+    stands, so that the window and the camera are found anew if a first fit says that the window was tilted.
+
+    Args:
+        photograph: Pixels of 8 bits, shape (H, W, 3). Its camera is upright, and its optical axis passes through the
+            photograph's middle.
+        mask: White where the object is, shape (H, W).
+        mesh: The mesh, normalized and upright.
+        size: Pixels per side that are compared.
+        fov: Angle across a square `MARGIN` times as wide as the object, in radians. None for a camera without
+            perspective.
+        encoding: Encoding of the photograph and of the images that are to be rendered, linear or srgb.
+        **options: Further arguments of `fit_scene`.
+
+    Returns:
+        The scene and its window of the photograph.
+
+    Raises:
+        InputError: If the mask holds no object.
+    """
+    rows, columns = (np.flatnonzero((mask > OPAQUE).any(axis)) for axis in (1, 0))
+    if not len(rows):
+        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
+    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
+    side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
+    whole = Photograph(photograph, None if fov is None else side / 2 / math.tan(fov / 2))
+    options = {**options, "fov": fov, "encoding": encoding}
+
+    def fit(window: Window, start: Camera | None) -> FittedScene:
+        linear = window.cut(photograph, size, encoding)
+        share = window.cut(mask[..., None], size, beyond=0)[0]
+        return fit_scene(linear, share, mesh, start=start, **options)
+
+    window = whole.window(center, side, np.array([0.0, math.sin(USUAL_POLAR), math.cos(USUAL_POLAR)]))
+    scene = fit(window, None)
+    above = _direction_above(scene.camera, window)
+    above[0] = 0  # The photograph's camera is upright.
+    upright = whole.window(center, side, above)
+    if np.abs(upright.axes - window.axes).max() > TILTED:
+        window = upright
+        scene = fit(window, scene.camera)
+    camera = scene.camera
+    above = _direction_above(camera, window)
+    middle = window.pixels(*(np.array([camera.right, camera.up]) * side / camera.width))
+    turned = _turned_to_mesh(camera)
+    return FittedPhotograph(scene._replace(camera=turned), whole.window(np.array(middle), side, above))
+
+
+def _direction_above(camera: Camera, window: Window) -> NDArray[Any]:
+    """Return the world's z axis in the axes of the photograph's camera, of a camera that shows a window."""
+    return window.axes.T @ camera.axes()[:, 2]
+
+
+def _turned_to_mesh(camera: Camera) -> Camera:
+    """Turn a camera at its place, so that it looks at the mesh's middle.
+
+    A camera with perspective sees the mesh from another angle than that of its optical axis if the mesh is not in the
+    middle of the image.
+    """
+    if not isinstance(camera, PerspectiveCamera):
+        return replace(camera, right=0.0, up=0.0)
+    x, y, z = camera.eye()[:3].tolist()
+    distance = math.hypot(x, y, z)
+    polar = math.acos(z / distance)
+    azimuth = math.atan2(y, x)
+    width = camera.width * distance / camera.distance
+    return replace(camera, polar=polar, azimuth=azimuth, width=width, right=0.0, up=0.0, distance=distance)
+
+
 def fit_scene(
     photograph: Float[Tensor, "3 size size"],
     mask: Float[Tensor, "size size"],
@@ -85,6 +181,7 @@ def fit_scene(
     normals: str = "smooth",
     bounces: int = 0,
     rasterizer: str = "auto",
+    start: Camera | None = None,
 ) -> FittedScene:
     """Find the camera and the environment light under which renders of a normalized mesh resemble a photograph most.
 
@@ -102,6 +199,7 @@ def fit_scene(
         bounces: Bounces of the returned light, with shadows. Without them, the light of a concave mesh is too bright
             or too dim. The search for the camera ignores shadows.
         rasterizer: auto, opengl, numba or numpy.
+        start: A camera near the one that is sought. None searches for one.
 
     Returns:
         The camera, the light, and how well they fit.
@@ -117,8 +215,19 @@ def fit_scene(
         raise InputError(f"the mask covers {float(mask.sum()):.0f} pixels of {size}²: give one that shows the object")
     options = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals, "rasterizer": rasterizer}
     photograph, mask = photograph.double(), mask.double()
-    coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
     fine = _Target.of(photograph, mask, mesh, size, options)
+    if start is None:
+        coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
+        starts = _plausible_cameras(coarse, mask, fov)
+    else:
+        starts = [start]
+    _, camera = fine.ranked(fine.descended(camera) for camera in starts)[0]
+    return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+
+
+def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
+    """Search for cameras at a coarse size, of which one is near the best one."""
+    mesh = coarse.mesh
     cameras = [
         camera.seeing(float(np.linalg.norm(mesh.vertices, axis=1).max()))
         for polar in POLAR
@@ -130,9 +239,7 @@ def fit_scene(
     starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
     descended = coarse.ranked(coarse.descended(camera) for camera in starts)
     least = descended[0][0]
-    plausible = _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])
-    _, camera = fine.ranked(fine.descended(camera) for camera in plausible[:KEPT])[0]
-    return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+    return _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])[:KEPT]
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
@@ -191,15 +298,17 @@ class _Target(NamedTuple):
             known = shown * used[:, None]
             squares = known @ shown.mT
             penalty = self.penalty(squares)
-            wanted = known @ (image - behind[operator.pixels])[..., None]
-            light = _nonnegative_light(squares + torch.diag_embed(penalty), wanted[..., 0], grid)
+            wanted = (known @ (image - behind[operator.pixels])[..., None])[..., 0]
+            light, expected = _light_of_channels(squares, wanted, penalty, grid)
             predicted = (light.T[:, None] @ shown)[:, 0] + behind[operator.pixels]
             brighter = seen & ~(clipped & (predicted > 1))  # A clipped pixel may be brighter than the photograph.
             if torch.equal(brighter, used):
                 break
             used = brighter
         whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
-        residuals = torch.cat([(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * light.T).flatten()])
+        residuals = torch.cat(
+            [(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * (light - expected).T).flatten()]
+        )
         return residuals, light, coverage
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
@@ -208,12 +317,11 @@ class _Target(NamedTuple):
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
-        """Weights (3, 49) of the light's squared coefficients, in proportion to the squares (3, 49, 49) of what they
-        show, so that the result does not depend on the albedo's scale."""
-        constant = squares[:, 0, 0]
-        weight = torch.maximum(constant, DARKEST * constant.mean() + 1e-12 * self.mask.sum())
+        """Weights (49,) of a light's squared coefficients, in proportion to the squares (3, 49, 49) of what they show,
+        so that the result does not depend on the albedo's scale."""
+        brightest = squares[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
-        return SMOOTH * weight[:, None] * (1 + (band * (band + 1)).square())
+        return SMOOTH * brightest * (1 + (band * (band + 1)).square())
 
     def descended(self, camera: Camera) -> Camera:
         """Return the camera after descent by the Gauss-Newton method in a trust region.
@@ -263,6 +371,28 @@ class _Target(NamedTuple):
         return FittedScene(camera, light, float(error), float(overlap))
 
 
+def _light_of_channels(squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int) -> tuple[Tensor, Tensor]:
+    """Fit the light of the channel that the object shows best, and then of the others, which are expected to resemble
+    it: a yellow object hardly says from where blue light comes.
+
+    Args:
+        squares: The products of what the light's coefficients show, shape (3, 49, 49).
+        wanted: Their products with what is to be shown, shape (3, 49).
+        penalty: Weights of the squared differences from the expected light, shape (49,).
+        grid: Subdivisions of the grid of directions.
+
+    Returns:
+        The lights and the expected lights, shapes (49, 3). In the first channel, none is expected.
+    """
+    regular = squares + torch.diag(penalty)
+    best = int(squares[:, 0, 0].argmax())
+    seen = _nonnegative_light(regular[best, None], wanted[best, None], grid)[:, 0]
+    brightness = (wanted @ seen) / ((squares @ seen) @ seen).clamp(min=torch.finfo(torch.float64).tiny)
+    expected = seen[:, None] * brightness.clamp(min=0)
+    expected[:, best] = 0
+    return _nonnegative_light(regular, wanted + (penalty[:, None] * expected).T, grid), expected
+
+
 def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     """Minimize xᵀ S x / 2 − wᵀ x for each channel over lights x of nowhere negative radiance.
 
@@ -271,12 +401,12 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     that minimizes |L⁻¹ w + Gᵀ μ|.
 
     Args:
-        squares: The positive definite matrices S, shape (3, 49, 49).
-        wanted: The vectors w, shape (3, 49).
+        squares: The positive definite matrices S, shape (C, 49, 49).
+        wanted: The vectors w, shape (C, 49).
         grid: Subdivisions of the grid of directions.
 
     Returns:
-        The lights, shape (49, 3).
+        The lights, shape (49, C).
     """
     rows = _radiance_above_least(grid)
     lights = []

@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from PIL import Image
 from augment.objects import ObjectSettings, load_object
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_choice, require_range
-from renderer.fitting import fit_scene
+from renderer.fitting import fit_photograph
 from renderer.image import ENCODINGS, MOST_BOUNCES, decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.presets import save_light
@@ -28,7 +28,6 @@ from train.errors import writable_folder
 from train.results import require_replaceable
 from train.settings import compose, read_object, read_settings
 
-MARGIN = 1.6  # the image's side, in those of the object's box
 DETAIL = 448  # pixels per side of the background that is written
 ATTACKED = 224  # pixels per side of the images that the printed attack renders, for its default classifier
 WHOLE = 0.98  # a pixel with a larger share is the object's
@@ -67,53 +66,31 @@ def main(settings: Settings) -> None:
     require_replaceable(out, "out", settings.overwrite)
     mask = read_mask(settings.mask, image) if settings.mask else grab_cut(image, settings.box)
     mesh = load_object(ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)).mesh
-    rows, columns = np.flatnonzero((mask > 127).any(1)), np.flatnonzero((mask > 127).any(0))
-    if not len(rows):
-        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
-    center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
-    side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
-    fov = None if settings.fov is None else math.radians(settings.fov)
-    share = mask[..., None]
-    found = fit_scene(
-        cropped(image, center, side, settings.size, settings.encoding),
-        cropped(share, center, side, settings.size, beyond=0)[0],
+    found = fit_photograph(
+        image,
+        mask,
         mesh,
-        fov=fov,
+        settings.size,
+        fov=None if settings.fov is None else math.radians(settings.fov),
         albedo_scale=settings.albedo_scale,
         encoding=settings.encoding,
         bounces=settings.bounces,
     )
-    # The scene's cameras look at the mesh's middle, so the background is cut out around it.
-    center = center + np.array([found.camera.right, -found.camera.up]) / found.camera.width * side
-    behind = cropped(image, center, side, DETAIL, settings.encoding)
+    behind = found.window.cut(image, DETAIL, settings.encoding)
+    share = found.window.cut(mask[..., None], DETAIL, beyond=0)
     out.mkdir(parents=True, exist_ok=True)
     write_values(out / "background.png", encode(behind, settings.encoding))
-    write_values(out / "mask.png", cropped(share, center, side, DETAIL, beyond=0).expand(3, -1, -1))
-    save_light(out / "light.json", found.light)
-    command = attack_command(settings, turned_to_mesh(found.camera), out)
+    write_values(out / "mask.png", share.expand(3, -1, -1))
+    save_light(out / "light.json", found.scene.light)
+    command = attack_command(settings, found.scene.camera, out)
     photograph, shown = rendered_by(command)
     inside = read_image(out / "mask.png", ATTACKED)[0] > WHOLE
     error = relative_error(shown[:, inside], photograph[:, inside], settings.encoding)
     write_values(out / "comparison.png", torch.cat([photograph, shown], dim=2))
-    print(f"outlines overlap by {found.overlap:.1%}; the object's pixels differ by {error:.1%}")
-    if found.overlap < DOUBTFUL or error > WRONG:
+    print(f"outlines overlap by {found.scene.overlap:.1%}; the object's pixels differ by {error:.1%}")
+    if found.scene.overlap < DOUBTFUL or error > WRONG:
         print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")
     print(shlex.join(command))
-
-
-def turned_to_mesh(camera: Camera) -> Camera:
-    """Turn a camera at its place, so that it looks at the mesh's middle. Its image is cut out there, too.
-
-    A camera with perspective sees the mesh from another angle than that of its optical axis if the mesh is not in the
-    middle of the image.
-    """
-    if not isinstance(camera, PerspectiveCamera):
-        return replace(camera, right=0.0, up=0.0)
-    x, y, z = camera.eye()[:3].tolist()
-    distance = math.hypot(x, y, z)
-    polar = math.acos(z / distance)
-    azimuth = math.atan2(y, x)
-    return replace(camera, polar=polar, azimuth=azimuth, right=0.0, up=0.0, distance=distance)
 
 
 def attack_command(settings: Settings, camera: Camera, out: Path) -> list[str]:
@@ -179,44 +156,6 @@ def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
     rectangle = box[0], box[1], box[2] - box[0], box[3] - box[1]
     cv2.grabCut(image[..., ::-1].copy(), labels, rectangle, *models, 5, cv2.GC_INIT_WITH_RECT)
     return np.where(labels % 2 == 1, 255, 0).astype(np.uint8)  # certain and probable foreground
-
-
-def cropped(
-    image: np.ndarray,
-    center: np.ndarray,
-    side: float,
-    size: int,
-    encoding: str = "linear",
-    beyond: int | None = None,
-) -> torch.Tensor:
-    """Cut out a square, decode it and resample it.
-
-    Args:
-        image: Pixels of 8 bits, shape (H, W, C).
-        center: The middle of the square (x, y) in pixels.
-        side: Pixels of the image per side of the square.
-        size: Pixels per side of the result.
-        encoding: Encoding of the pixels.
-        beyond: Value outside the image, 0 to 255. None repeats its border.
-
-    Returns:
-        Linear values in [0, 1], shape (C, size, size), float32.
-    """
-    left, top = center - side / 2
-    columns = np.arange(math.floor(left), math.ceil(left + side))
-    rows = np.arange(math.floor(top), math.ceil(top + side))
-    height, width = image.shape[:2]
-    window = image[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1)]
-    if beyond is not None:
-        outside = ((rows < 0) | (rows >= height))[:, None] | (columns < 0) | (columns >= width)
-        window[outside] = beyond
-    linear = decode(torch.from_numpy(window).permute(2, 0, 1) / 255, encoding)
-    left, top = left - math.floor(left), top - math.floor(top)
-    box = left, top, left + side, top + side
-    # The box filter is the renderer's. Where pixels are enlarged, it would leave steps.
-    method = Image.Resampling.BOX if side >= size else Image.Resampling.BICUBIC
-    channels = [Image.fromarray(channel.numpy()).resize((size, size), method, box=box) for channel in linear]
-    return torch.from_numpy(np.stack([np.array(channel) for channel in channels])).clamp(0, 1)
 
 
 def write_values(path: Path, image: torch.Tensor) -> None:

@@ -1,0 +1,67 @@
+"""A window of a photograph is what a camera that is turned to it renders."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import renderer
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.image import to_bytes
+from renderer.photograph import Photograph
+
+SIZE = 384  # pixels per side of the photographs
+
+
+def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
+    return float((actual.double() - expected).norm() / expected.norm())
+
+
+def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndarray:
+    image = renderer.render(mesh, camera, renderer.load_light("grace").double(), SIZE, 0.0)[0]
+    return to_bytes(image.permute(1, 2, 0)).numpy()
+
+
+@pytest.mark.parametrize(("size", "side"), [(48, 260.0), (160, 120.0)])
+def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, side):
+    mesh = renderer.solid("pear")
+    camera = PerspectiveCamera(1.0, 0.7, 6.0, 1.2, -0.9, distance=5.0)
+    pixels = photographed(mesh, camera)
+    focal_length = SIZE * camera.distance / camera.width
+    photograph = Photograph(pixels, focal_length)
+    origin = np.array([camera.right, -camera.up]) / camera.width * SIZE + SIZE / 2
+    above = np.array([0.0, math.sin(camera.polar), math.cos(camera.polar)])
+    window = photograph.window(origin, side, above)
+    eye = camera.eye()[:3]
+    distance = float(np.linalg.norm(eye))
+    turned = PerspectiveCamera(
+        polar=math.acos(eye[2] / distance),
+        azimuth=math.atan2(eye[1], eye[0]),
+        width=side * distance / focal_length,
+        distance=distance,
+    )
+    expected = renderer.render(mesh, turned, renderer.load_light("grace").double(), size, 0.0, samples=8)[0]
+    straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
+    assert error(window.cut(pixels, size), expected) < 0.04
+    assert error(straight, expected) > 0.1
+
+
+def test_a_window_without_perspective_is_what_the_moved_camera_renders():
+    mesh = renderer.solid("pear")
+    pixels = photographed(mesh, OrthographicCamera(1.0, 0.7, 6.0, 1.25, -0.9375))
+    origin = np.array([1.25, 0.9375]) / 6 * SIZE + SIZE / 2  # At corners of pixels.
+    window = Photograph(pixels, None).window(origin, SIZE / 2, np.array([0.0, 1.0, 0.0]))
+    expected = renderer.render(
+        mesh, OrthographicCamera(1.0, 0.7, 3.0), renderer.load_light("grace").double(), 48, 0.0, samples=8
+    )[0]
+    assert error(window.cut(pixels, 48), expected) < 0.02
+
+
+def test_a_window_beyond_the_photograph_repeats_the_border_or_has_the_given_value():
+    pixels = np.full((20, 20, 1), 51, np.uint8)
+    window = Photograph(pixels, None).window(np.array([0.0, 10.0]), 20.0, np.array([0.0, 1.0, 0.0]))
+    torch.testing.assert_close(window.cut(pixels, 4), torch.full((1, 4, 4), 0.2))
+    left, right = window.cut(pixels, 4, beyond=255)[0].split(2, dim=1)
+    torch.testing.assert_close(left, torch.ones(4, 2))
+    torch.testing.assert_close(right, torch.full((4, 2), 0.2))
