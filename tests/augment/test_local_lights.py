@@ -13,8 +13,8 @@ from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
-from renderer.transport import local as sparse
+from renderer.transport import lamp_paths as sparse
+from renderer.transport.operators import build_operators
 
 SIZE, EVERY = 16, torch.arange(2)
 PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.1)

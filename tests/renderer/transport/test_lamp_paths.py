@@ -19,12 +19,13 @@ from renderer.io import mitsuba
 from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
 from renderer.light.environment import write_map
-from renderer.light.local import Lamps, Projector, moved
+from renderer.light.lamps import Lamps, moved
+from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.rasterizer import choose
-from renderer.transfer import TransferOperator, build_operators
-from renderer.transport import local as sparse
-from renderer.transport.local import local_radiance, unoccluded
+from renderer.transport import lamp_paths as sparse
+from renderer.transport.lamp_paths import local_radiance, unoccluded
+from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.rays import Rays, Surface
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
