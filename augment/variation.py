@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from augment import room
-from augment.camera_effects import CameraEffectSettings, draw_camera_effects, pixel_middles, random_colors
+from augment.camera_effects import CameraEffectSettings, draw_camera_effects
 from augment.objects import another_instance, rotated, varnished
+from augment.patterns import pixel_middles, random_colors
 from augment.progress import progress
 from augment.scene import Example, Scene
 from renderer.camera import Camera, PerspectiveCamera

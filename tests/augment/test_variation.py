@@ -14,8 +14,9 @@ from torch import Tensor
 
 import augment
 from augment.build import LampsSettings, ProjectorSettings
-from augment.camera_effects import draw_camera_effects, draw_patterns
+from augment.camera_effects import draw_camera_effects
 from augment.objects import ObjectSettings, PropSettings
+from augment.patterns import draw_patterns
 from augment.random_streams import generator
 from augment.scene import Conditions, Scene
 from augment.variation import VariationSettings, VarnishSettings, vary
