@@ -85,6 +85,9 @@ class LampsSettings:
         return Lamps.from_settings(self)
 
 
+LOCAL_LIGHT_SETTINGS = {"projector": ProjectorSettings, "lamps": LampsSettings}
+
+
 @dataclass
 class SceneSettings:
     """What `build_scene` shows, and how; the schema of a command's `scene`, too.
