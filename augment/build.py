@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -27,11 +26,13 @@ from renderer.errors import (
     require_range,
 )
 from renderer.image import ImageSettings, samples_per_side
-from renderer.io.images import read_image
+from renderer.io.images import gray_or_image
 from renderer.light.basis import Basis, with_local_lights
 from renderer.light.harmonics import MAX_DEGREE, degree_of
-from renderer.light.local import Lamps, Projector
-from renderer.light.presets import load_light, read_light
+from renderer.light.lamps import Lamps
+from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.presets import load_light
+from renderer.light.projector import Projector
 from renderer.mesh import MOST_VERTICES, Mesh, normalize, require_mesh, subdivide
 from renderer.rasterizer import NAMES, Rasterizer, choose
 from renderer.validation import (
@@ -62,15 +63,9 @@ class ProjectorSettings:
     pattern: Any = 0.0
 
     def build(self) -> tuple[Projector, Tensor]:
-        """The basis, and the pattern (pixels², 3)."""
+        """Return the projector and the pattern (pixels², 3) that attacks begin with."""
         require_field_types(self)
-        require_range("polar", self.polar, 0, 180)
-        require_range("azimuth", self.azimuth, -360, 360)
-        require_range("fov", self.fov, 0.1, 170)
-        polar, azimuth, fov = map(math.radians, (self.polar, self.azimuth, self.fov))
-        basis = Projector(self.pixels, polar, azimuth, self.distance, fov, self.power)
-        pattern = load_background(self.pattern, self.pixels, "pattern").expand(3, -1, -1)
-        return basis, self.power * pattern.flatten(1).T
+        return Projector.from_settings(self)
 
 
 @dataclass
@@ -85,23 +80,12 @@ class LampsSettings:
     start: Any = 0.0
 
     def build(self) -> tuple[Lamps, Tensor]:
-        """The basis, and the powers (L, 3)."""
+        """Return the lamps and the powers (L, 3) that attacks begin with."""
         require_field_types(self)
-        if isinstance(self.start, str | Path):
-            lamps, powers = read_light(self.start, Lamps)
-            return lamps, lamps.project_nonnegative(powers)
-        try:
-            positions = tuple((float(x), float(y), float(z)) for x, y, z in self.positions)
-            start = as_tensor("start", self.start).float().expand(len(positions), 3)
-        except InputError:
-            raise
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            remedy = "give positions [x, y, z], and a number or [r, g, b]s as start"
-            raise InputError(f"lamps: {remedy} ({error})") from error
-        basis = Lamps(positions, self.power, self.radius)
-        if not ((start >= 0) & (start <= self.power)).all():  # NaN is not
-            raise InputError(f"start={self.start}: give powers from 0 to power={self.power:g}")
-        return basis, basis.project_nonnegative(start)
+        return Lamps.from_settings(self)
+
+
+LOCAL_LIGHT_SETTINGS = {"projector": ProjectorSettings, "lamps": LampsSettings}
 
 
 @dataclass
@@ -276,7 +260,8 @@ def _lights(
     of a roughness."""
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
-    local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
+    settings = [getattr(shown, kind.name) for kind in LOCAL_LIGHTS]
+    local = [light.build() for light in settings if light is not None]
     return with_local_lights(environment * shown.exposure, local)
 
 
@@ -285,27 +270,9 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
     choices = as_list("backgrounds", choices, object, "a list of gray values in [0, 1] or image files")
     if not choices:
         raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
-    images = [load_background(choice, size) for choice in choices]
+    images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
-
-
-def load_background(choice: float | str | Path, size: int, name: str = "backgrounds") -> Tensor:
-    """A gray value (1, size, size), or an image's center square (3, size, size), in [0, 1]. name: for errors."""
-    if isinstance(choice, bool):
-        raise InputError(f"{name}={choice}: give gray values in [0, 1] or image files")
-    try:
-        gray = float(choice)  # type: ignore[arg-type]  # of a path it raises
-    except (ValueError, TypeError, OverflowError):
-        gray = math.nan
-    if math.isnan(gray) and isinstance(choice, str | Path):
-        try:
-            return read_image(Path(choice), size)
-        except InputError as error:
-            raise InputError(f"{name}: {error} or a gray value") from error
-    if not 0 <= gray <= 1:
-        raise InputError(f"{name}={reprlib.repr(choice)}: give gray values in [0, 1] or image files")
-    return torch.full((1, size, size), gray)
 
 
 def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:

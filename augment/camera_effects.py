@@ -1,12 +1,12 @@
 """Effects of a camera on images, and patterns of a projector beneath them, drawn for each example."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from augment.patterns import draw_patterns
 from renderer.errors import require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 from renderer.validation import require_field_types
@@ -76,48 +76,3 @@ def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
     matrix = images.new_zeros(len(images), size, size)
     matrix.scatter_add_(2, columns.expand(len(images), -1, -1), weights[:, None].expand(-1, size, -1))
     return torch.einsum("aij,avcjk,alk->avcil", matrix, images, matrix)
-
-
-def pixel_middles(size: int) -> Tensor:
-    """(2, 1, size, size) of the pixels, right and down in an image that spans [-1, 1]."""
-    middles = (torch.arange(size) + 0.5) / size * 2 - 1
-    return torch.stack(torch.meshgrid(middles, middles, indexing="xy"))[:, None]
-
-
-def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor | None = None) -> Tensor:
-    """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
-    random colors, at a random angle, scale and position. points: as of `draw_camera_effects`."""
-    points = pixel_middles(size) if points is None else points
-    rows = []
-    for _ in range(count):
-        place, family = torch.rand(4, generator=draws), torch.randint(len(FAMILIES), (), generator=draws)
-        rows.append((place, family, torch.rand(5, generator=draws)))
-    places, families, colors = (torch.stack(column) for column in zip(*rows, strict=True))
-    turn, period, *shift = places.T[:, :, None, None]
-    cosine, sine = (2 * math.pi * turn).cos(), (2 * math.pi * turn).sin()
-    x, y = points / (0.25 + 0.75 * period)
-    rotated, shifts = torch.stack([cosine * x - sine * y, sine * x + cosine * y]), torch.stack(shift)
-    weight = torch.empty(count, 1, *points.shape[2:])
-    for index, mask in enumerate(FAMILIES):
-        here = torch.nonzero(families == index).squeeze(1)
-        weight[here, 0] = mask(rotated[:, here], shifts[:, here]).float()
-    first, second = random_colors(colors[:, :2]), random_colors(colors[:, 2:4])
-    second = second * colors[:, 4:, None, None]  # down to black
-    return second + weight * (first - second)
-
-
-FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points and a shift, both of x and y first
-    lambda points, shift: ((points + shift) % 1 < 0.5)[0],  # stripes
-    lambda points, shift: ((points + shift) % 1 < 0.5).sum(0) == 1,  # checkers
-    lambda points, shift: ((points + shift) % 1 - 0.5).square().sum(0) < 0.4**2,  # spots, over half the area
-    lambda points, shift: (points > shift - 0.5)[0],  # a half
-    lambda points, shift: torch.ones_like(points[0]),  # a solid color
-)
-
-
-def random_colors(draws: Tensor) -> Tensor:
-    """(N, 3, 1, 1) linear, of hues and saturations (N, 2): from white to pure; the largest channel is 1."""
-    hue, saturation = draws.split(1, dim=1)
-    ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6  # of the hexcone (Smith 1978)
-    pure = ((ramps - 3).abs() - 1).clamp(0, 1)
-    return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]

@@ -17,12 +17,11 @@ from augment.memory import has_memory, operator_bytes
 from augment.objects import SceneObject
 from augment.scene import Scene
 from renderer.gloss import Gloss, smoothest
-from renderer.light.basis import harmonics_of
+from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
 from renderer.light.presets import load_light
 from renderer.mesh import select_faces
 from renderer.microfacets import LEAST, degree_for, highlight_error
-from renderer.transfer import DEGREE
 
 if TYPE_CHECKING:
     from augment.variation import VarnishSettings

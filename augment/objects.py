@@ -13,7 +13,7 @@ import numpy as np
 
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.gloss import Gloss
-from renderer.mesh import Mesh, concatenate, load_mesh, normalize, select_faces, subdivide
+from renderer.mesh import Mesh, concatenate, normalize, select_faces, subdivide
 from renderer.shapes import solid
 from renderer.validation import require_field_types, require_kind
 
@@ -230,6 +230,8 @@ def _colored(item: MeshSettings) -> Mesh:
         except ValueError as error:  # of the name or the seed
             raise InputError(f"{item.mesh}: {error}") from error
     else:
+        from renderer.io.meshes import load_mesh  # trimesh takes half a second
+
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     if item.color is None:
         return mesh

@@ -14,7 +14,7 @@ from augment.objects import SceneObject
 from augment.progress import progress
 from renderer.camera import Camera
 from renderer.image import ImageSettings, background_term
-from renderer.transfer import TransferOperator
+from renderer.transport.operators import TransferOperator
 from renderer.views import STACKED, OperatorStack, Rows
 
 

@@ -1,14 +1,14 @@
 """Images of objects whose vertices, colors, gloss or lamps change, view by view; moved views are rasterized again.
 
 Shadows and bounces of environment light are frozen at a shape close by, with the mesh's gloss (`FrozenTransport`);
-shadows of local lights are those of the moved shape itself (`renderer.transport.local`).
+shadows of local lights are those of the moved shape itself (`renderer.transport.lamp_paths`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,14 +19,13 @@ from augment.objects import SceneObject
 from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss, sample_gloss
-from renderer.image import ImageSettings, decode
-from renderer.light.basis import Basis, parts_of
+from renderer.gloss import Gloss
+from renderer.image import ImageSettings
+from renderer.light.basis import Basis, split_light
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.rendering import Shading, view_radiance, view_with_outlines
-from renderer.shading import normals_in_sight
-from renderer.transport.local import LocalLightView
+from renderer.shaded_view import PixelRadiance, ShadedView
+from renderer.transport.lamp_paths import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
 
@@ -104,10 +103,6 @@ class Reshading:
         """(V, 3) of each unmoved object."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
-    @cached_property
-    def _faces(self) -> list[Tensor]:
-        return [torch.from_numpy(item.mesh.faces).to(self.like.device) for item in self.objects]
-
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
         """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
         key = number, camera
@@ -120,9 +115,10 @@ class Reshading:
         """An unmoved object in local light."""
         key = number, camera
         if key not in self._local_views:
-            mesh, (fragments, _) = self.objects[number].mesh, self.view(*key)
-            rays = self._rays.setdefault(number, Rays(mesh))
-            self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
+            fragments, _ = self.view(*key)
+            shape = self.objects[number].mesh
+            rays = self._rays_among(number)
+            self._local_views[key] = LocalLightView(rays, shape, fragments, self.settings)
         return self._local_views[key]
 
     def radiance(
@@ -133,58 +129,80 @@ class Reshading:
         light: Tensor,
         changed: Conditions,
         background: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels (P,) of an object, their coverage (P,), and its radiance (3, P) in a light (size, 3); differentiable
-        in all tensors, with `settings.silhouettes` also in tensors among the camera's fields.
+    ) -> PixelRadiance:
+        """Compute the radiance of an object, differentiable in all tensors.
 
-        example: whose shapes change little from call to call. changed: a row of conditions, of which light and cameras
-        are those given. background: image values behind the object, (3 or 1, size²).
+        With `settings.silhouettes`, it is also differentiable in tensors among
+        the fields of the camera.
+
+        Args:
+            example: Number of the example. The shapes of one example change
+                little from call to call.
+            number: Number of the object.
+            camera: The camera.
+            light: Coefficients of the basis, shape (size, 3).
+            changed: A row of conditions, without their light and cameras.
+            background: Image values behind the object, shape (3 or 1, size²).
+
+        Returns:
+            The radiance of the view's pixels.
         """
-        item, settings, moving_camera, camera = self.objects[number], self.settings, camera, camera.fixed()
-        vertices, gloss = changed.vertices, None
-        if vertices is None:
-            corners, shape = self.vertices[number], item.mesh.vertices
-            fragments, albedo = self.view(number, camera)
+        item = self.objects[number]
+        fixed_camera = camera.fixed()
+        is_moved = changed.vertices is not None
+        if changed.vertices is None:
+            vertices = self.vertices[number]
+            positions = item.mesh.vertices
+            fragments, albedo = self.view(number, fixed_camera)
         else:
-            corners, shape = vertices, vertices.detach().cpu().double().numpy()
-            fragments, albedo = self._rasterized(number, camera, shape)
+            vertices = changed.vertices
+            positions = vertices.detach().cpu().double().numpy()
+            fragments, albedo = self._rasterized(number, fixed_camera, positions)
         if changed.albedo is not None:
-            painted = item.mesh, fragments, settings.encoding, item.albedo_scale, changed.albedo
-            albedo = painted_albedo(*painted, changed.hue)
+            painted = item.mesh, fragments, self.settings.encoding, item.albedo_scale
+            albedo = painted_albedo(*painted, changed.albedo, changed.hue)
+        gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
-        if settings.normals == "flat":
-            normals = None
-        elif vertices is None:
-            normals = torch.from_numpy(item.mesh.vertex_normals).to(self.like.device)  # which all views share
-        else:
-            normals = normals_in_sight(fragments, corners, self._faces[number])
-        lights = [(part, light[where]) for where, part in parts_of(self.basis)]
+        split = split_light(self.basis, light)
+        rays = None
+        lamp_view = None
+        if split.local_lights:
+            rays = Rays(replace(item.mesh, vertices=positions)) if is_moved else self._rays_among(number)
+            if not is_moved and gloss is None:
+                lamp_view = self.local_view(number, fixed_camera)
+        indirect = None
+        if self.settings.global_illumination:
+            is_kept = camera is fixed_camera
+            frozen = _FrozenView(self, example, number, fixed_camera, fragments, positions, is_kept)
+            indirect = frozen.radiance
+        shares_normals = not is_moved and self.settings.normals == "smooth"
+        shown = ShadedView(
+            mesh=item.mesh,
+            fragments=fragments,
+            settings=self.settings,
+            vertices=vertices,
+            albedo=albedo,
+            light=split,
+            rays=rays,
+            is_moved=is_moved,
+            gloss=gloss,
+            vertex_normals=self._vertex_normals(number) if shares_normals else None,
+            lamp_view=lamp_view,
+            indirect=indirect,
+            lamp_positions=changed.positions,
+        )
+        return shown.pixel_radiance(camera, background)
 
-        @cache  # called only where the scene has local lights
-        def local_view() -> LocalLightView:
-            if vertices is None and gloss is None:
-                return self.local_view(number, camera)
-            moved = replace(item.mesh, vertices=shape)
-            rays = self._rays.setdefault(number, Rays(moved)) if vertices is None else Rays(moved)
-            return LocalLightView(rays, item.mesh, fragments, settings, vertices, gloss)
+    def _rays_among(self, number: int) -> Rays:
+        """Return rays among the faces of an unmoved object."""
+        return self._rays.setdefault(number, Rays(self.objects[number].mesh))
 
-        def indirect(albedo: Tensor, light: Tensor) -> Tensor:
-            frozen = self._transport_near(example, number, camera, shape)
-            added = frozen.radiance(camera, fragments, albedo, light)
-            if camera is not moving_camera:  # it will not come back
-                del frozen.views[camera]
-            return added
+    def _vertex_normals(self, number: int) -> Tensor:
+        """Return the normals (V, 3) of an unmoved object, which all its views share."""
+        return torch.from_numpy(self.objects[number].mesh.vertex_normals).to(self.like.device)
 
-        extra = indirect if settings.global_illumination else None
-        shine = sample_gloss(item.mesh, fragments, gloss)
-        shading = Shading(corners, albedo, lights, normals, local_view, extra, changed.positions, shine)
-        if vertices is None or not settings.silhouettes:
-            return fragments.pixels, fragments.coverage.to(self.like), view_radiance(fragments, shading)
-        behind = decode(background, settings.encoding).expand(3, -1)
-        return view_with_outlines(moving_camera, fragments, self._faces[number], behind, shading)
-
-    def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
+    def transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""
         mesh, fixed = self.objects[number].mesh, (self.settings, self.objects[number].albedo_scale, self.basis)
         if number not in self._unmoved_transport:
@@ -205,3 +223,34 @@ class Reshading:
         drawn = vertices, item.mesh.faces, [camera], settings, self.rasterizer
         fragments = build_fragments(*drawn, closed=item.mesh.closed)[0].to(self.like.device)
         return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self.like)
+
+
+@dataclass(frozen=True, eq=False)
+class _FrozenView:
+    """Shadows and bounces in one view of a shape, frozen at a shape close by.
+
+    Attributes:
+        reshading: What keeps the frozen shapes.
+        example: Number of the example.
+        number: Number of the object.
+        camera: The camera.
+        fragments: The samples of the view, in P pixels.
+        positions: Positions of the shape's vertices, shape (V, 3).
+        is_kept: Whether the camera will come back.
+    """
+
+    reshading: Reshading
+    example: int
+    number: int
+    camera: Camera
+    fragments: Fragments
+    positions: np.ndarray
+    is_kept: bool
+
+    def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
+        """Return the radiance (3, P) that they add, with albedo (S, 3) in light (size, 3)."""
+        frozen = self.reshading.transport_near(self.example, self.number, self.camera, self.positions)
+        added = frozen.radiance(self.camera, self.fragments, albedo, light)
+        if not self.is_kept:
+            del frozen.views[self.camera]
+        return added

@@ -19,7 +19,7 @@ from renderer.image import ImageSettings
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.harmonics import bands, degree_of, per_degree
 from renderer.mesh import Mesh
-from renderer.transport.local import unoccluded
+from renderer.transport.lamp_paths import unoccluded
 from renderer.transport.rays import Rays, sphere
 
 DIRECTIONS = 48  # of the sky, from a point

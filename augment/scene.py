@@ -19,11 +19,10 @@ from augment.reshading import Reshading
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.image import ImageSettings, background_term, clamp, encode
-from renderer.light.basis import HARMONICS, Basis, parts_of
-from renderer.light.local import Lamps, moved
+from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 from renderer.validation import as_integers, as_list, as_tensor, describe, require_kind
 from renderer.views import InPlace, OperatorStack
 
@@ -202,7 +201,7 @@ class Scene:
 
     def basis_under(self, conditions: Conditions, row: int) -> Basis:
         """The light's basis for a row of conditions, with lamps at its positions."""
-        return self.basis if conditions.positions is None else moved(self.basis, conditions.positions[row].detach())
+        return self.basis if conditions.positions is None else self.basis.moved(conditions.positions[row].detach())
 
     def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
         """The cameras of an example under a row of conditions."""
@@ -267,7 +266,7 @@ class Scene:
 
     def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
         """The same products for all other light, and the lamps image by image."""
-        where, lamps = next((where, part) for where, part in parts_of(self.basis) if isinstance(part, Lamps))
+        where, lamps = next(part for part in self.basis.local_lights if part.basis.is_movable)
         rest = light.clone()
         rest[:, where] = 0
         for rows, pixels, composite in self._relit(rest, examples):

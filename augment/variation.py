@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from augment import room
-from augment.camera_effects import CameraEffectSettings, draw_camera_effects, pixel_middles, random_colors
+from augment.camera_effects import CameraEffectSettings, draw_camera_effects
 from augment.objects import another_instance, rotated, varnished
+from augment.patterns import pixel_middles, random_colors
 from augment.progress import progress
 from augment.scene import Example, Scene
 from renderer.camera import Camera, PerspectiveCamera
@@ -21,7 +22,7 @@ from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.gloss import Gloss
 from renderer.image import clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
-from renderer.light.basis import Harmonics, LocalBasis, harmonics_of, parts_of
+from renderer.light.basis import harmonics_of, split_light
 from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
 from renderer.microfacets import LEAST
@@ -173,7 +174,7 @@ def _with_moved_rows(
         shown = [numbers[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     # Rays take longer than an operator.
-    has_rays = not isinstance(scene.basis, Harmonics) or scene.settings.global_illumination
+    has_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
     return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
@@ -300,13 +301,12 @@ def _in_rooms(
     patterns fall: there, on table, wall and object along the lamp or, without one, the view."""
     rows, lights, images = torch.nonzero(on_table).squeeze(1).tolist(), sky.cpu().double(), []
     points = pixel_middles(scene.settings.size).repeat(1, len(scene), 1, 1)
-    parts = [(where, part) for where, part in parts_of(scene.basis) if isinstance(part, LocalBasis)]
     for number, group in groupby(progress(rows, "tables"), lambda row: scene.examples[row].object):
         item, rays = scene.objects[number], Rays(scene.objects[number].mesh)
         for row in group:
             camera, exposure = scene.examples[row].cameras[0], scene.examples[row].exposure
             seen = item.lowest, walls[row], camera, scene.settings
-            local = [(part, scene.lights[row, where].cpu().double()) for where, part in parts]
+            local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
             images.append(exposure * room.irradiance(rays, item.radius, *seen, lights[row], lamps[row], local))
             towards = lamps[row] if lamps[row].any() else torch.from_numpy(camera.axes()[2])
             points[:, row] = room.across_light(rays, item.mesh, *seen, towards).float()

@@ -38,9 +38,10 @@ from renderer.camera import orbit_cameras
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss
 from renderer.image import ImageSettings, tonemap
+from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.mesh import Mesh
 from renderer.rasterizer import NAMES, Rasterizer, choose
-from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator, build_operators
+from renderer.transport.operators import TransferOperator, build_operators
 from renderer.views import TransferOperators
 
 BACKGROUND = 0.5

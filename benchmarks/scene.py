@@ -19,13 +19,14 @@ from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
-from renderer.io.mitsuba import DIFFERENTIABLE, environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
-from renderer.light.basis import Harmonics
+from renderer.io.mitsuba import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
+from renderer.io.mitsuba_entries import environment, integrator, sensor_of
+from renderer.light.basis import DEGREE, Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import probe
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.transfer import DEGREE, TransferOperator, build_operators
+from renderer.transport.operators import TransferOperator, build_operators
 
 SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel
 ALBEDO = (0.8, 0.5, 0.3)

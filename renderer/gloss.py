@@ -29,7 +29,7 @@ from torch import Tensor
 from renderer.albedo import Texture, sample_textures
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments
-from renderer.light.harmonics import bands, lambertian_factors, unit
+from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import (
     DIELECTRIC,
@@ -45,6 +45,7 @@ from renderer.microfacets import (
     reflectance,
 )
 from renderer.validation import as_tensor, require_flag
+from renderer.vectors import unit
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""Triangle meshes with colors: the data class, loading, normalizing, and subdividing for attacks that move vertices.
+"""Triangle meshes with colors: the data class, normalizing, and subdividing for attacks that move vertices.
 
 World axes are right-handed with z up. Colors stay as authored for display (sRGB-encoded); linear
 light needs them decoded.
@@ -10,16 +10,16 @@ import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from renderer.errors import LARGEST, InputError, require_choice, require_range
+from renderer.errors import InputError, require_range
+from renderer.normals import doubled_area_vectors, plain_face_normals, vertex_normals
 from renderer.skin import Skin
-from renderer.validation import as_array, as_path, describe, require_flag, require_whole
+from renderer.validation import as_array, describe, require_whole
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 MOST_VERTICES = 10**7  # some 5 GB
@@ -122,9 +122,7 @@ class Mesh:
 
     def face_normals(self) -> np.ndarray:
         """(F, 3) unit normals, outward for counter-clockwise faces; the zero vector for zero-area faces."""
-        doubled = doubled_area_vectors(self.vertices, self.faces)
-        length = np.linalg.norm(doubled, axis=1, keepdims=True)
-        return np.divide(doubled, length, out=np.zeros_like(doubled), where=length > 0)
+        return plain_face_normals(self.vertices, self.faces)
 
     def face_areas(self) -> np.ndarray:
         """(F,) areas in squared world units."""
@@ -133,8 +131,6 @@ class Mesh:
     @cached_property
     def vertex_normals(self) -> np.ndarray:
         """(V, 3) of `renderer.normals.vertex_normals`."""
-        from renderer.normals import vertex_normals  # which imports this module
-
         return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
 
     @cached_property
@@ -180,13 +176,6 @@ def _closed_parts(faces: bytes) -> np.ndarray | None:
     if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
         return None
     return connected_component_labels(np.stack([by_forth, by_back], axis=1) // 3, node_count=len(corners))
-
-
-def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 3): normal to each face, outward for counter-clockwise ones, twice as long as the face has area."""
-    corners = vertices.T.take(faces.T, axis=1)  # by components, since np.cross takes several times as long
-    (ax, ay, az), (bx, by, bz) = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
@@ -247,50 +236,6 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         gloss_textures=factors,
         skin=skin,
     )
-
-
-def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
-    """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or another format of trimesh.
-
-    All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
-    that moving it opens no seam, and unused vertices are dropped. A color is the product of the material's
-    color, the texture and the vertex or face colors that the file has, white where it has none; alpha, other
-    material properties and the texture's wrap mode are left out. glTF's colors other than textures are linear
-    by its standard and are encoded here. Of a glTF with a skin, the mesh has the pose of its nodes, and their joints.
-
-    gloss: read glTF's roughness, metallic (factors and texture) and specularFactor; surfaces are matte otherwise, since
-    most files have values that nobody chose. Formats other than glTF are matte.
-    up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
-    InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
-    are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area;
-    skins without weights, whose weights do not sum to one or that name missing joints.
-
-    >>> renderer.export_mesh(renderer.solid("cup"), "cup.glb")
-    >>> load_mesh("cup.glb").faces.shape == renderer.solid("cup").faces.shape
-    True
-    """
-    from renderer.io.meshes import read_parts
-
-    path = as_path("path", path)
-    require_choice(f"{path}: up", up, ("auto", "y", "z"))
-    require_flag("gloss", gloss)
-    is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    placed = [transformed(*part) for part in read_parts(path, is_gltf, gloss)]
-    if not placed:
-        raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
-    mesh = concatenate(placed)
-    points, skin = mesh.vertices, mesh.skin
-    if skin is not None:  # vertices that joints carry otherwise come apart
-        carried, rows = np.unique(skin.carried, axis=0, return_inverse=True)
-        points = np.column_stack([points, rows.ravel()])
-    vertices, corners = np.unique(points[mesh.faces].reshape(-1, points.shape[1]), axis=0, return_inverse=True)
-    skin = skin and replace(skin, carried=carried[vertices[:, -1].astype(np.int64)])
-    mesh = replace(mesh, vertices=vertices[:, :3], faces=corners.reshape(-1, 3), skin=skin)
-    if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
-        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
-    if not mesh.face_areas().sum() > 0:
-        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
-    return transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
 
 
 def normalize(mesh: Mesh) -> Mesh:

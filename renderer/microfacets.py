@@ -30,8 +30,9 @@ import torch
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
-from renderer.light.harmonics import MAX_DEGREE, bands, lambertian_factors, per_degree, rotate, select_rows, unit
+from renderer.light.harmonics import MAX_DEGREE, bands, lambertian_factors, per_degree, rotate, select_rows
 from renderer.light.window import best_window
+from renderer.vectors import unit
 
 LEAST = 0.2  # roughness: of smoother lobes, light of degree 40 shows less than a highlight
 AMPLITUDE = 0.1  # of a highlight, that the band of a light's degree may have

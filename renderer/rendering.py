@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial, reduce
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_bounded, require_choice, require_range
 from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.image import SAMPLES, ImageSettings, as_background, composite, decode, samples_per_side
-from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
+from renderer.gloss import Gloss
+from renderer.image import SAMPLES, ImageSettings, as_background, composite, samples_per_side
+from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh, require_mesh
 from renderer.rasterizer import NAMES, choose
-from renderer.shading import glossy_radiance, normals_in_sight, radiance
+from renderer.shaded_view import ShadedView
 from renderer.shapes import sphere
-from renderer.silhouettes import moving_outlines
-from renderer.transfer import build_operators
-from renderer.transport.local import LocalLightView
+from renderer.transport.operators import build_operators
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_list, as_tensor, describe, require_kind, require_number
@@ -63,26 +60,59 @@ def render(
     silhouettes: bool = False,
     rasterizer: str = "auto",
 ) -> Float[Tensor, "V 3 size size"]:
-    """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices, albedo and gloss.
+    """Render a mesh from V cameras, differentiable in light, vertices, albedo and gloss.
 
-    NumPy arrays and lists are taken in place of tensors.
+    NumPy arrays and lists are taken instead of tensors. The images have the
+    dtype and the device of the light.
 
-    light: (degree + 1)² coefficients (`load_light`), in whose dtype and on whose device the images are computed; None
-    for no environment light. lights: lamps and projectors, alone for full white power, or with coefficients (size, 3);
-    they cast shadows and do not bounce. background: see `renderer.image.as_background`; one for all views, or an image
-    for each. vertices: in place of the mesh's. albedo: linear in [0, 1], in place of the mesh's colors per face, or
-    of its only texture. albedo_scale multiplies the albedo, also beyond 1. gloss: in place of the mesh's. samples:
-    per pixel side; None is 2, or 8 with silhouettes. encoding: linear or srgb. normals: flat or smooth. shadows: that
-    the mesh casts on itself. bounces: of light between its surfaces, shadows included. rasterizer: auto, opengl,
-    numba or numpy. Gradients by vertices hold visibility constant; those by vertices, albedo and gloss also hold
-    shadows and bounces of environment light constant. silhouettes: gradients by vertices, and by fields of the
-    cameras that are tensors of one number, also see how outlines and surfaces move in the image.
-    InputError: NaN, shapes that do not fit, unknown choices, arguments of other types, albedo beyond [0, 1].
+    Gradients by the vertices hold visibility constant. Gradients by vertices,
+    albedo and gloss also hold shadows and bounces of environment light constant.
 
-    >>> light = renderer.load_light("grace").requires_grad_()
-    >>> image = renderer.render(renderer.solid("apple"), renderer.orbit_cameras(2, 2.2), light, size=16)
-    >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
-    (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
+    Args:
+        mesh: The mesh, of N vertices and F faces.
+        cameras: One camera, or V cameras.
+        light: Coefficients of environment light, shape ((degree + 1)², 3), such
+            as `renderer.load_light` returns. None for no environment light.
+        size: Pixels per side of the images.
+        background: Gray value, color (3,) or images in [0, 1], see
+            `renderer.image.as_background`. One for all views, or an image for each.
+
+        lights: Local lights, such as `renderer.light.lamps.Lamps`, alone for full
+            white power or in pairs with coefficients (size, 3). They cast shadows
+            and do not bounce.
+
+        vertices: Positions in world units instead of the mesh's, shape (N, 3).
+        albedo: Linear albedo in [0, 1] instead of the mesh's colors, shape (F, 3)
+            for a color per face or (height, width, 3) for the only texture.
+        albedo_scale: Factor of the albedo, also beyond 1.
+        gloss: Gloss instead of the mesh's.
+
+        samples: Samples per side of a pixel. None for 2, or 8 with silhouettes.
+        encoding: Encoding of the image values, "linear" or "srgb".
+        rasterizer: What finds the visible faces, "auto", "opengl", "numba" or
+            "numpy".
+
+        normals: "smooth" for interpolated normals, "flat" for a normal per face.
+        shadows: Whether the mesh casts shadows of environment light on itself.
+        bounces: Number of bounces of light between the surfaces of the mesh, which
+            include shadows.
+        silhouettes: Whether gradients by the vertices, and by fields of the
+            cameras that are tensors of one number, also see how outlines and
+            surfaces move in the image.
+
+    Returns:
+        Images in [0, 1], shape (V, 3, size, size).
+
+    Raises:
+        InputError: If an argument holds NaN or has another type, shapes do not
+            fit, a choice is unknown, or the albedo is not in [0, 1].
+
+    Example:
+        >>> light = renderer.load_light("grace").requires_grad_()
+        >>> cameras = renderer.orbit_cameras(2, 2.2)
+        >>> image = renderer.render(renderer.solid("apple"), cameras, light, size=16)
+        >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
+        (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
     require_mesh("mesh", mesh)
     per_side = samples_per_side(samples, silhouettes)
@@ -95,110 +125,61 @@ def render(
     albedo = None if albedo is None else _as_albedo(albedo)
     vertices = None if vertices is None else as_tensor("vertices", vertices)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
-        raise InputError(f"vertices of shape {tuple(vertices.shape)} does not fit the mesh: give {mesh.vertices.shape}")
-    local = [_with_coefficients(local) for local in as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)]
-    like = next((values for _, values in [(None, light), *local] if values is not None), torch.zeros(0))
+        shape = tuple(vertices.shape)
+        raise InputError(f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}")
+    given = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
+    local = [_with_coefficients(member) for member in given]
+    # The images have the dtype and the device of the first light.
+    like = torch.zeros(0) if light is None else light
+    if light is None and local:
+        like = local[0][1]
+    split = SplitLight(light, [(basis, values.to(like)) for basis, values in local])
+
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
-    positions = vertices.detach().cpu().double().numpy()
+    moved = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
     fixed = [camera.fixed() for camera in cameras]
-    views = build_fragments(positions, mesh.faces, fixed, settings, _choose(rasterizer), closed=mesh.closed)
+    chosen = _choose(rasterizer)
+    views = build_fragments(moved.vertices, mesh.faces, fixed, settings, chosen, closed=mesh.closed)
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
-    smooth, faces = normals == "smooth" and light is not None, torch.from_numpy(mesh.faces).to(like.device)
-    moved = replace(mesh, vertices=positions)
-    emitters: list[tuple[Harmonics | LocalBasis, Tensor]] = [(basis, values.to(like)) for basis, values in local]
-    if light is not None:
-        emitters.insert(0, (Harmonics(degree_of(light)), light))
-    basis = SumBasis(tuple(basis for basis, _ in emitters))
-    transport = build_transport(moved, settings, albedo_scale, basis) if emitters else None
+    transport = build_transport(moved, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved)
     images = []
     for camera, view, behind in zip(cameras, views, backgrounds, strict=True):
         fragments = view.to(like.device)
-        colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
-        surface = Surface(moved, view, settings, given_gloss=gloss)
-        indirect = partial(transport.radiance, surface) if transport else None
-        in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices, gloss))
-        of_vertices = normals_in_sight(fragments, vertices, faces) if smooth else None
-        shine = sample_gloss(mesh, fragments, gloss)
-        shading = Shading(vertices, colors, emitters, of_vertices, in_local_light, indirect, gloss=shine)
-        if silhouettes:
-            linear = decode(behind.flatten(1), encoding)
-            pixels, coverage, shade = view_with_outlines(camera, fragments, faces, linear, shading)
-        else:
-            pixels, coverage = fragments.pixels, fragments.coverage.to(like)
-            shade = view_radiance(fragments, shading)
-        images.append(composite(shade, coverage, pixels, behind, encoding))
+        indirect = None
+        if transport:
+            surface = Surface(moved, view, settings, given_gloss=gloss)
+            indirect = partial(transport.radiance, surface)
+        shown = ShadedView(
+            mesh=mesh,
+            fragments=fragments,
+            settings=settings,
+            vertices=vertices,
+            albedo=_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
+            light=split,
+            rays=rays,
+            gloss=gloss,
+            indirect=indirect,
+        )
+        seen = shown.pixel_radiance(camera, behind.flatten(1))
+        images.append(composite(seen.radiance, seen.coverage, seen.pixels, behind, encoding))
     return torch.stack(images)
 
 
-class Shading(NamedTuple):
-    """What the samples of one view are shaded with.
-
-    albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). normals: as for `radiance`. indirect: of
-    albedo and coefficients of environment light, the radiance that shadows and bounces add to it. positions: of lamps
-    that moved, (L, 3). gloss: in environment light.
-    """
-
-    vertices: Tensor
-    albedo: Tensor
-    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]]
-    normals: Tensor | None
-    in_local_light: Callable[[], LocalLightView]
-    indirect: Callable[[Tensor, Tensor], Tensor] | None = None
-    positions: Tensor | None = None
-    gloss: SampleGloss | None = None
-
-
-def view_radiance(fragments: Fragments, shading: Shading) -> Tensor:
-    """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, local lights."""
-    albedo, gloss = shading.albedo, shading.gloss
-    radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not shading.lights else []
-    for basis, light in shading.lights:
-        if isinstance(basis, LocalBasis):
-            radiances.append(shading.in_local_light().radiance(basis, albedo, light, shading.positions, fragments))
-            continue
-        shaded = fragments, shading.vertices, light, albedo, shading.normals
-        radiances.append(radiance(*shaded) if gloss is None else glossy_radiance(*shaded, gloss))
-        if shading.indirect is not None:
-            radiances.append(shading.indirect(albedo, light))
-    return reduce(torch.add, radiances)
-
-
-def view_with_outlines(
-    camera: Camera, fragments: Fragments, faces: Tensor, background: Tensor, shading: Shading
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(pixels (P + E,), coverage (P + E,), radiance (3, P + E)) of one view, of which E pixels are not covered; the
-    radiance, that of `view_radiance`, is differentiable in outlines, too (`renderer.silhouettes`).
-
-    background: linear, (3, size²). What shadows and bounces of environment light add to a pixel is divided among its
-    samples by albedo, where outlines move.
-    """
-    albedo, indirect, pixel = shading.albedo, shading.indirect, fragments.pixel
-    at_samples = view_radiance(fragments.by_sample(), shading._replace(indirect=None))
-    summed = at_samples.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, at_samples) / fragments.samples**2
-    values = at_samples.detach()
-    if indirect is not None:
-        added = [indirect(albedo, light) for basis, light in shading.lights if not isinstance(basis, LocalBasis)]
-        summed = reduce(torch.add, added, summed)
-        total = values.new_zeros(summed.shape).index_add(1, pixel, albedo.detach().T.to(values))
-        per_albedo = torch.stack(added).sum(0).detach() * fragments.samples**2 / total.masked_fill(total == 0, 1)
-        values = values + per_albedo[:, pixel] * albedo.detach().T
-    pixels, zeros = moving_outlines(fragments, camera, shading.vertices, faces, values, background)
-    coverage = F.pad(fragments.coverage.to(summed), (0, len(pixels)))
-    return torch.cat([fragments.pixels, pixels]), coverage, F.pad(summed, (0, len(pixels))) + zeros
-
-
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """A local light with its coefficients (size, 3); without them it shines white, at its full power."""
-    pair = (light, None) if isinstance(light, LocalBasis) else light
-    if len(pair) != 2 or not isinstance(pair[0], LocalBasis):
+    """Return a local light with coefficients (size, 3), which by default are white of full power."""
+    pair = light if isinstance(light, tuple) else (light, None)
+    if len(pair) != 2:
         raise InputError(f"lights holds {describe(pair)}: give {_LOCAL_LIGHTS}")
     basis, given = pair
+    require_kind("lights: a basis", basis, LocalBasis, _LOCAL_LIGHTS)
     if given is None:
         return basis, torch.full((basis.size, 3), basis.power)
     values = as_tensor("lights: coefficients", given)
     if values.shape != (basis.size, 3):
-        raise InputError(f"lights: {basis} has coefficients of shape {tuple(values.shape)}, give {(basis.size, 3)}")
+        shape = tuple(values.shape)
+        expected = (basis.size, 3)
+        raise InputError(f"lights: {basis} has coefficients of shape {shape}, give {expected}")
     require_bounded(lights=values)
     return basis, values
 
@@ -243,11 +224,11 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     the camera sees it from afar. Even light of radiance 1 is white. A mirror would show the series ringing and the
     coefficients that reach no surface. InputError: NaN.
     """
-    parts = [(part, light[rows].detach().cpu().float()) for rows, part in parts_of(basis)]
-    local = [(part, values) for part, values in parts if isinstance(part, LocalBasis)]
-    sky = next((values / math.pi for part, values in parts if isinstance(part, Harmonics)), None)
+    sky, local = split_light(basis, light.detach().cpu().float())
+    sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
-    return render(_white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
+    images = render(_white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")
+    return images[0]
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:

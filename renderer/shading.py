@@ -10,7 +10,7 @@ theorem, p(n) = n · ∇p(n) / d. So one product of monomials with the slope's c
 which the part tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by the normal (appendix D).
 
 Visibility and texture coordinates are fixed (Section 3 and appendix B.3): the derivative by the vertices contains
-how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
+how normals turn and not how outlines move. For the light alone, `renderer.transport.operators` is faster.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from renderer.gloss import SampleGloss, at_samples, toward_camera
 from renderer.light import harmonics
 from renderer.microfacets import along, coat_bands
 from renderer.normals import FEW, area_vectors, vertex_normals
+from renderer.vectors import unit, unit_vectors
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -77,9 +78,9 @@ def glossy_radiance(
     wide = torch.promote_types(vertices.dtype, torch.float32)
     if normals is None:
         planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shaded = harmonics.unit(planes).T[fragments.face].to(wide)
+        shaded = unit(planes).T[fragments.face].to(wide)
     else:
-        shaded = harmonics.unit(smooth_normals(fragments, normals.to(wide)).T).T
+        shaded = unit(smooth_normals(fragments, normals.to(wide)).T).T
     toward = toward_camera(fragments, vertices.to(wide))
     albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(shaded)
     below = albedo * gloss.diffuse(shaded, toward)[:, None]
@@ -164,7 +165,7 @@ class _Irradiance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
-        unit, length = harmonics.unit_vectors(normals)
+        unit, length = unit_vectors(normals)
         unit = unit.to(light.dtype)
         blocks = zip(*map(_polynomial(light), unit.split(BLOCK, dim=1)), strict=True)
         value, slope = (torch.cat(parts, dim=-1) for parts in blocks)

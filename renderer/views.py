@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError
 from renderer.image import as_background, background_term, clamp, encode
-from renderer.transfer import TransferOperator, apply_transfer, require_image_gradient
-from renderer.transport.local import SparseTransfer, joined
+from renderer.transport.lamp_paths import SparseTransfer, joined
+from renderer.transport.operators import TransferOperator, apply_transfer, require_image_gradient
 from renderer.validation import as_tensor
 
 if TYPE_CHECKING:

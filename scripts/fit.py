@@ -22,7 +22,7 @@ from renderer.errors import InputError, require_choice, require_range
 from renderer.fitting import fit_photograph
 from renderer.image import ENCODINGS, MOST_BOUNCES, decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
-from renderer.light.presets import save_light
+from renderer.light.files import save_light
 from train.attack import AttackExperimentSettings, build_attacked
 from train.errors import writable_folder
 from train.results import require_replaceable

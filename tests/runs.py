@@ -25,8 +25,6 @@ def finish(run: Run) -> dict[str, float]:
     return scores
 
 
-def completed_run(
-    settings: ExperimentSettings, folder: Path, data: DataSet | None = None
-) -> dict[str, float]:
+def completed_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> dict[str, float]:
     """Make, train and score a run; return its scores."""
     return finish(loaded_run(settings, folder, data))

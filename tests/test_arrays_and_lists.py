@@ -13,7 +13,7 @@ import renderer
 from augment.progress import Phases
 from renderer import harmonics, skylight
 from renderer.camera import Camera
-from renderer.light.local import Lamps
+from renderer.light.lamps import Lamps
 
 SIZE = 8
 MESH = renderer.Mesh.plain(

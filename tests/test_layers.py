@@ -1,6 +1,7 @@
 """Imports go one way: train → augment → renderer."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,17 @@ def test_only_one_module_imports_opengl():
         if "moderngl" in imported_packages(path)
     ]
     assert users == ["renderer/rasterizer/opengl.py"]
+
+
+def test_no_import_within_the_renderer_leads_back_also_inside_functions():
+    names = {
+        path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."): path
+        for path in (ROOT / "renderer").rglob("*.py")
+    }
+    imported = {}
+    for name, path in names.items():
+        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        members = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
+        imported[name] = (members | {node.module for node in nodes}) & names.keys()
+    order = list(TopologicalSorter(imported).static_order())  # CycleError names the circle
+    assert order.index("renderer.normals") < order.index("renderer.mesh") < order.index("renderer.io.meshes")

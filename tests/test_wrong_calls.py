@@ -20,7 +20,8 @@ from augment.progress import Phases
 from augment.scene import Conditions
 from augment.service import RandomLightSettings
 from renderer import InputError, harmonics, skylight
-from renderer.light.local import Lamps, Projector
+from renderer.light.lamps import Lamps
+from renderer.light.projector import Projector
 from renderer.validation import describe
 from train import load_run
 from train.photographs.scoring import evaluate_photographs

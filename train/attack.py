@@ -29,7 +29,7 @@ from augment.attacks.descent import Goal
 from augment.attacks.evaluate import check, require_transferable, success_by_radius, transfer, warnings
 from augment.attacks.files import LINES, require_renderers, save
 from augment.attacks.search import find_scene
-from augment.build import LampsSettings, ProjectorSettings, RendererSettings, SceneSettings, build_scene
+from augment.build import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings, build_scene
 from augment.classifiers import Classifier, load_classifier
 from augment.losses import NO_CLASS
 from augment.objects import ObjectSettings, load_object, on_ground
@@ -128,12 +128,11 @@ class AttackExperimentSettings:
         if isinstance(self.target, int | float):  # a class whose name is a number
             self.target = str(self.target)
         require_transferable(self.attack.parameters, self.transfer.azimuths, self.transfer.meshes)
-        if self.attack.projector is not None and self.scene.projector is None:
-            self.scene.projector = ProjectorSettings()
+        for name, kind in LOCAL_LIGHT_SETTINGS.items():
+            if getattr(self.attack, name) is not None and getattr(self.scene, name) is None:
+                setattr(self.scene, name, kind())
         if self.attack.pose is not None:
             self.renderer.silhouettes = True
-        if self.attack.lamps is not None and self.scene.lamps is None:
-            self.scene.lamps = LampsSettings()
         if self.attack.positions is not None and self.scene.lamps is None:
             self.scene.lamps = LampsSettings(start=LAMP_POWER)
 

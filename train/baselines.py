@@ -13,7 +13,7 @@ from augment.batches import as_found
 from augment.losses import label_loss
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
-from renderer.light.basis import nearest_in_box
+from renderer.light.ball import nearest_in_box
 
 # Norm-ball and steps of `pgd`. Madry et al. 2018 have a radius of 8/255 on CIFAR-10.
 PGD = StepSettings(norm="linf", radius=2 / 255, step="sign", step_size=1 / 255)

@@ -207,9 +207,7 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
                 flips[part][places],
             )
             labels[places] = renders.labels[number]
-        yield from zip(
-            shown.split(share), labels.split(share), is_render[part].split(share), strict=True
-        )
+        yield from zip(shown.split(share), labels.split(share), is_render[part].split(share), strict=True)
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:

@@ -50,9 +50,7 @@ class Split:
     def content_hash(self) -> str:
         """The SHA-256 of images and labels. Files count by their names and sizes."""
         images = self.images
-        return content_hash(
-            [images.facts() if isinstance(images, ImageFiles) else images, self.labels]
-        )
+        return content_hash([images.facts() if isinstance(images, ImageFiles) else images, self.labels])
 
     def to(self, device: torch.device) -> "Split":
         """Return a copy on a device. Files stay where they are."""
@@ -262,9 +260,7 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
 
 
-def load_folder(
-    path: str, size: int, test_fraction: float, skip_unreadable: bool = False, workers: int = 0
-) -> DataSet:
+def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: bool = False, workers: int = 0) -> DataSet:
     """Load class folders of images, or folders `train` and `test` of class folders.
 
     The central square of each image is reduced. Images of more than `RESIDENT` pixels per side
@@ -295,9 +291,7 @@ def load_folder(
     train_root = root / "train" if parts else root
     classes = tuple(_folders(train_root))
     if len(classes) < 2:
-        raise InputError(
-            f"data.path={path} holds {len(classes)} class folders: it needs two or more"
-        )
+        raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     unread = left_out(root)
     if unread:
         shown = ", ".join(map(str, unread[:3]))
@@ -315,9 +309,7 @@ def load_folder(
     return DataSet(classes, train[~is_test], train[is_test])
 
 
-def load_unlabeled(
-    path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int
-) -> DataSet:
+def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int) -> DataSet:
     """Load all images of a folder and its sub-folders. Their classes are not known.
 
     Args:
@@ -343,14 +335,10 @@ def load_unlabeled(
 
 def _folders(root: Path) -> list[str]:
     """Return the names of the folders in a folder, sorted, without hidden ones."""
-    return sorted(
-        entry.name for entry in root.iterdir() if entry.is_dir() and not is_hidden(entry.name)
-    )
+    return sorted(entry.name for entry in root.iterdir() if entry.is_dir() and not is_hidden(entry.name))
 
 
-def _folder_split(
-    root: Path, classes: tuple[str, ...], size: int, skip_unreadable: bool, workers: int
-) -> Split:
+def _folder_split(root: Path, classes: tuple[str, ...], size: int, skip_unreadable: bool, workers: int) -> Split:
     """Read the images of class folders, with their labels."""
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)

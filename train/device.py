@@ -134,9 +134,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     if precision != "auto":
         return precision
     is_depthwise = trained is not None and any(
-        layer.groups == layer.in_channels > 1
-        for layer in trained.modules()
-        if isinstance(layer, nn.Conv2d)
+        layer.groups == layer.in_channels > 1 for layer in trained.modules() if isinstance(layer, nn.Conv2d)
     )
     return "bfloat16" if is_native and not is_depthwise else "float32"
 

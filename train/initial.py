@@ -88,9 +88,7 @@ class Initial:
                 difference = f"{key} {stored[key]}, not {wanted.get(key)}"
                 if key == "classes":
                     difference = "other classes"
-                raise InputError(
-                    f"train.init_from={self.source} was trained with {difference}: give this run the same"
-                )
+                raise InputError(f"train.init_from={self.source} was trained with {difference}: give this run the same")
         with of_one_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -142,9 +140,7 @@ class ValidationPart:
     record: dict[str, Any] | None
 
 
-def choose_validation(
-    settings: ExperimentSettings, data: DataSet, initial: Initial | None
-) -> ValidationPart:
+def choose_validation(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> ValidationPart:
     """Choose the part of the training images that validates a network.
 
     The parts of one seed are nested. The smallest part among a network and those that it began

@@ -230,9 +230,7 @@ class Trainer:
                 if is_stopping:
                     interruption.stop()
 
-    def _train_epoch(
-        self, split: Split, rows: Tensor, interruption: Interruption, log: RunLog | None
-    ) -> bool:
+    def _train_epoch(self, split: Split, rows: Tensor, interruption: Interruption, log: RunLog | None) -> bool:
         """Take the epoch's remaining steps; return whether all were taken before a signal came."""
         plan = self._plan(split, rows)
         if self._under_way is None:
@@ -309,9 +307,7 @@ class Trainer:
                 log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
         return renders
 
-    def _step(
-        self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int
-    ) -> Tensor:
+    def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
         """Learn from a batch.
 
         Args:
@@ -570,11 +566,7 @@ def epoch_metrics(
     if len(diagnostics) > 1:
         for number, part in enumerate(diagnostics, 1):
             groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
-    return {
-        f"{group}/{name}": value
-        for group, values in groups.items()
-        for name, value in values.items()
-    }
+    return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:

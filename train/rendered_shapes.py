@@ -33,14 +33,10 @@ SETTINGS = ImageSettings(samples=4)
 VIEWS = 5
 BACKGROUNDS = 4
 # A hash of the code that renders, since other code may render other images.
-CODE = source_key(
-    *(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__))
-)
+CODE = source_key(*(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__)))
 
 
-def load_shapes(
-    train: int, test: int, size: int, seed: int, cache: TensorCache | None = None
-) -> DataSet:
+def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
     """Render images of every solid in even light, or read them from a cache.
 
     Args:

@@ -20,9 +20,7 @@ from train.processes import first_process_first
 from train.settings import OTHER, ExperimentSettings, chosen_rasterizer, keyed
 
 
-def build_service(
-    settings: ExperimentSettings, data: DataSet, device: torch.device
-) -> AugmentationService:
+def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
     """Build the service that regenerates a run's renders, and log the rasterizer.
 
     Args:
@@ -75,9 +73,7 @@ def build_service(
     )
 
 
-def _build_scene(
-    settings: ExperimentSettings, size: int, device: torch.device, phases: Phases
-) -> Scene:
+def _build_scene(settings: ExperimentSettings, size: int, device: torch.device, phases: Phases) -> Scene:
     """Build the scene of a run's meshes, in the first process before the others."""
     rasterizer = chosen_rasterizer(settings.renderer)
     console.info("rasterizer: %s", rasterizer.description)

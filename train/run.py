@@ -106,9 +106,7 @@ class Run:
         before = self._require_folder()
         part = choose_validation(settings, self.data, self.initial)
         self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
-        self.trainer = build_trainer(
-            settings, self.data, self.folder, self.initial, part, self._asked_threads(before)
-        )
+        self.trainer = build_trainer(settings, self.data, self.folder, self.initial, part, self._asked_threads(before))
         self._threads = torch.get_num_threads()
         if before is not None:
             self.trainer.resume()
@@ -170,9 +168,7 @@ class Run:
             return None
         if not resumes:
             remedy = "set train.resume=true to go on or overwrite=true to begin anew"
-            raise InputError(
-                f"run={self.folder} holds a run already: {remedy}, or choose another run"
-            )
+            raise InputError(f"run={self.folder} holds a run already: {remedy}, or choose another run")
         return require_same_run(self.folder, self.settings)
 
     def _asked_threads(self, before: DictConfig | None) -> int | None:

@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.build import load_background
 from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -28,14 +27,14 @@ from renderer.gloss import Gloss
 from renderer.image import ImageSettings, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.files import write_whole
-from renderer.io.images import read_numbers, write_image, write_numbers
+from renderer.io.images import gray_or_image, read_numbers, write_image, write_numbers
 from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
 from renderer.io.texture_bake import with_added_albedo
-from renderer.light.basis import Basis, LocalBasis, parts_of, with_local_lights
+from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
-from renderer.light.local import Lamps, Projector
-from renderer.light.presets import load_light, read_light, save_light
-from renderer.mesh import load_mesh
+from renderer.light.files import read_light, save_light
+from renderer.light.local_lights import LOCAL_LIGHTS
+from renderer.light.presets import load_light
 from renderer.rasterizer import Rasterizer, choose
 from renderer.validation import as_folder
 
@@ -242,11 +241,11 @@ def save_lights(
     Returns:
         Basis and coefficients of each light, the environment light first.
     """
-    lights = [(part, light[rows]) for rows, part in parts_of(basis)]
-    for part, coefficients in lights:
-        name = part.name if isinstance(part, LocalBasis) else Path(LIGHT).stem
+    sky, *local = [(part, light[rows]) for rows, part in parts_of(basis)]
+    names = [Path(LIGHT).stem, *(part.name for part, _ in local)]
+    for name, (part, coefficients) in zip(names, [sky, *local], strict=True):
         save_light(folder / f"{name}{when}.json", coefficients, part)
-    return lights
+    return [sky, *local]
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:
@@ -313,7 +312,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     local_lights = []
     for name in description["local_lights"]:
         path = folder / f"{Path(name).name}.json"
-        local_lights.append(read_light(path, Projector, Lamps))
+        local_lights.append(read_light(path, *LOCAL_LIGHTS))
     sky = load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
     background = description["background"]
@@ -325,7 +324,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         cameras=cameras,
         light=light,
         basis=basis,
-        background=load_background(background, settings.size, "background"),
+        background=gray_or_image("background", background, settings.size),
         settings=settings,
         images_before=_read_images(folder / f"{BEFORE}.npy", shape),
         images=_read_images(folder / f"{AFTER}.npy", shape),
@@ -341,6 +340,8 @@ def _camera(description: dict[str, Any]) -> Camera:
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
     """Return the attacked object of a folder with the given description."""
+    from renderer.io.meshes import load_mesh  # trimesh takes half a second
+
     mesh = load_mesh(folder / MESH, gloss=bool(description.get("gloss")))
     own_faces = description["own_faces"]
     own_faces = None if own_faces is None else int(own_faces)

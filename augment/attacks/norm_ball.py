@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
-from renderer.light.basis import Ball, nearest_in_box
+from renderer.light.ball import Ball, nearest_in_box
 from renderer.validation import require_field_types
 
 NORMS = ("linf", "l2")

@@ -14,9 +14,9 @@ from augment import AttackSettings, StepSettings, attack
 from augment.attacks.attack import AttackResult, logits_of
 from augment.random_streams import generator
 from benchmarks.paper import common
+from renderer.light.basis import DEGREE
 from renderer.light.environment import light_radiance
 from renderer.light.harmonics import project
-from renderer.transfer import DEGREE
 
 LIGHT_RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
 RADII: dict[str, tuple[float | None, ...]] = {  # L∞; the paper's are 0.1, 0.002, and on pixels 0.12, 0.53, 0.82

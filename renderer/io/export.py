@@ -46,7 +46,7 @@ def export_mesh(
     if first is not None:
         require_whole("first", first)
         require_range("first", first, 0, len(mesh.faces))
-    shaded = corner_normals(mesh, normals)
+    shaded = corner_normals(mesh.vertices, mesh.faces, normals)
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb")
     content = _glb(mesh, shaded, cameras, first)

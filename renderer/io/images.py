@@ -1,6 +1,8 @@
 """Image files, as a classifier sees them, and arrays of numbers as .npy files."""
 
 import io
+import math
+import reprlib
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,42 @@ def read_image(path: str | Path, size: int) -> Tensor:
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
+
+
+def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
+    """Make a gray image, or read the center square of an image file.
+
+    Args:
+        name: Name of the argument that holds the choice, for messages.
+        choice: Gray value in [0, 1], also as text, or the path of an image file.
+        size: Pixels per side.
+
+    Returns:
+        Values in [0, 1], shape (1, size, size) for gray and (3, size, size) for a
+        file.
+
+    Raises:
+        InputError: If the choice is neither, or the file cannot be read.
+
+    Example:
+        >>> gray_or_image("background", 0.5, 2).tolist()
+        [[[0.5, 0.5], [0.5, 0.5]]]
+    """
+    expected = "give gray values in [0, 1] or image files"
+    if isinstance(choice, bool):
+        raise InputError(f"{name}={choice}: {expected}")
+    try:
+        gray = float(choice)  # type: ignore[arg-type]  # Of a path it raises.
+    except (ValueError, TypeError, OverflowError):
+        gray = math.nan
+    if math.isnan(gray) and isinstance(choice, str | Path):
+        try:
+            return read_image(Path(choice), size)
+        except InputError as error:
+            raise InputError(f"{name}: {error} or a gray value") from error
+    if not 0 <= gray <= 1:
+        raise InputError(f"{name}={reprlib.repr(choice)}: {expected}")
+    return torch.full((1, size, size), gray)
 
 
 def read_square(path: str | Path, size: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The parts of a mesh file, as trimesh reads them, with their colors and textures.
+"""Meshes from files, as trimesh reads them, with their colors and textures.
 
 trimesh leaves out an image or material that it cannot read, with no more than a line in its log, and ignores parts of
 glTF 2.0. Where that would show a wrong surface, the file is refused.
@@ -22,11 +22,12 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
-from renderer.errors import LARGEST, InputError, in_one_line, require_file
+from renderer.errors import LARGEST, InputError, in_one_line, require_choice, require_file
 from renderer.image import encode
 from renderer.io.images import eight_bits
 from renderer.io.skins import skinned, with_skins_as_attributes
-from renderer.mesh import Mesh
+from renderer.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
+from renderer.validation import as_path, require_flag
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: the names in them cannot be checked first
 DEFINED, USED = (re.compile(rb"^[ \t]*%b[ \t]+(.*?)[ \t\r]*$" % key, re.MULTILINE) for key in (b"newmtl", b"usemtl"))
@@ -37,11 +38,53 @@ TRANSFORM = "KHR_texture_transform"
 HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions that move no vertex, as they begin
 
 
+def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
+    """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or another format of trimesh.
+
+    All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
+    that moving it opens no seam, and unused vertices are dropped. A color is the product of the material's
+    color, the texture and the vertex or face colors that the file has, white where it has none; alpha, other
+    material properties and the texture's wrap mode are left out. glTF's colors other than textures are linear
+    by its standard and are encoded here. Of a glTF with a skin, the mesh has the pose of its nodes, and their joints.
+
+    gloss: read glTF's roughness, metallic (factors and texture) and specularFactor; surfaces are matte otherwise, since
+    most files have values that nobody chose. Formats other than glTF are matte.
+    up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
+    InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
+    are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area;
+    skins without weights, whose weights do not sum to one or that name missing joints.
+
+    >>> renderer.export_mesh(renderer.solid("cup"), "cup.glb")
+    >>> load_mesh("cup.glb").faces.shape == renderer.solid("cup").faces.shape
+    True
+    """
+    path = as_path("path", path)
+    require_choice(f"{path}: up", up, ("auto", "y", "z"))
+    require_flag("gloss", gloss)
+    is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    placed = [transformed(*part) for part in read_parts(path, is_gltf, gloss)]
+    if not placed:
+        raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
+    mesh = concatenate(placed)
+    points, skin = mesh.vertices, mesh.skin
+    if skin is not None:  # vertices that joints carry otherwise come apart
+        carried, rows = np.unique(skin.carried, axis=0, return_inverse=True)
+        points = np.column_stack([points, rows.ravel()])
+    vertices, corners = np.unique(points[mesh.faces].reshape(-1, points.shape[1]), axis=0, return_inverse=True)
+    skin = skin and replace(skin, carried=carried[vertices[:, -1].astype(np.int64)])
+    mesh = replace(mesh, vertices=vertices[:, :3], faces=corners.reshape(-1, 3), skin=skin)
+    if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
+        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
+    if not mesh.face_areas().sum() > 0:
+        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
+    return transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
+
+
 def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
     """Every part of a file in its own coordinates, with the affine matrix (4, 4) that its node places it by;
     where a skin does, it is placed.
     linear: the file's colors, textures aside, are linear. gloss: read that of glTF, too. InputError: as
-    `renderer.mesh.load_mesh`."""
+    `load_mesh`."""
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     formats = set(trimesh.available_formats()) - ARCHIVES

@@ -1,8 +1,7 @@
 """Scenes for Mitsuba 3, as files of their own or in memory.
 
-A scene is a dictionary as `mitsuba.load_dict` takes it, in which a to_world transform is an array (4, 4) and an image
-is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` gives it to Mitsuba, and
-`write_mitsuba_scene` writes it as scene.xml with .ply parts and textures beside it, which needs no Mitsuba.
+A scene is a dictionary of `mitsuba_entries`. `load` gives it to Mitsuba, and `write_mitsuba_scene` writes it as
+scene.xml with .ply parts and textures beside it, which needs no Mitsuba.
 
 Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
 and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
@@ -23,32 +22,36 @@ import numpy as np
 import torch
 from PIL import Image
 
-from renderer.camera import Camera, PerspectiveCamera
+from renderer.camera import Camera
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode, to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
+from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_of
 from renderer.io.texture_bake import with_added_albedo
-from renderer.light.basis import Harmonics, LocalBasis
+from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
-from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
 from renderer.microfacets import LEAST, coat_mean
 from renderer.normals import corner_normals
 
-Scene = dict[str, Any]
-SCENE, PATTERN = "scene.xml", "pattern.exr"
+SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
 VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 DIFFERENTIABLE = "llvm_ad_rgb"
-TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # its maps: y up, +z in the middle
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
 PLUGINS = {  # by the tags that they have in files
-    "integrator": ("path", "direct"), "emitter": ("envmap", "projector", "point", "area"), "shape": ("ply", "disk"),
-    "sensor": ("perspective", "orthographic"), "bsdf": ("twosided", "diffuse", "principled"),
-    "texture": ("bitmap", "mesh_attribute"), "film": ("hdrfilm",), "rfilter": ("box",), "sampler": ("multijitter",),
-}  # fmt: skip
+    "integrator": ("path", "direct"),
+    "emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot"),
+    "shape": ("ply", "disk"),
+    "sensor": ("perspective", "orthographic"),
+    "bsdf": ("twosided", "diffuse", "principled"),
+    "texture": ("bitmap", "mesh_attribute"),
+    "film": ("hdrfilm",),
+    "rfilter": ("box",),
+    "sampler": ("multijitter",),
+}
 
 
 @contextmanager
@@ -101,54 +104,6 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
     around, _ = equirectangular(1, 2 * height)  # z is 0, the mean
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
     return light_radiance(coefficients, polar.sin() * around + polar.cos() * torch.tensor([0.0, 0.0, 1.0]))
-
-
-def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
-    """Direct light by rays that leave surfaces by the cosine, and to emitters, if any; or paths with bounces."""
-    if bounces:
-        return {"type": "path", "max_depth": bounces + 2, "rr_depth": bounces + 2, "hide_emitters": True}
-    return {"type": "direct", "emitter_samples": emitter_samples, "bsdf_samples": 1, "hide_emitters": True}
-
-
-def environment(radiance: Scene, scale: float = 1.0) -> Scene:
-    """An environment map, laid out as in `renderer.light.environment`. radiance: its entry "bitmap" or "filename"."""
-    return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
-
-
-def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
-    """A projector of a pattern (its entry "bitmap" or "filename"), `fov` in degrees. A white surface that faces it at
-    distance 1 has the radiance pattern · scale."""
-    irradiance = {"type": "bitmap", **pattern, "raw": True}
-    return {"type": "projector", "irradiance": irradiance, "fov": fov, "scale": scale, "to_world": pose}
-
-
-def sensor(pose: np.ndarray, size: int, fov: float | None = None, pixel_format: str = "rgba") -> Scene:
-    """A camera of size² pixels, `fov` in degrees, or without perspective, with [-1, 1] in x and y under its pose."""
-    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": pixel_format, "rfilter": {"type": "box"}}
-    perspective = {"type": "orthographic"} if fov is None else {"type": "perspective", "fov": fov}
-    return {**perspective, "to_world": pose, "film": film}
-
-
-def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
-    """A camera of the renderer."""
-    if isinstance(camera, PerspectiveCamera):
-        return sensor(pose_of(camera), size, math.degrees(camera.angle), pixel_format)
-    return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
-
-
-def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
-    """(4, 4) camera to world. Mitsuba's cameras and projectors look along +z and have x to the left."""
-    pose = camera.pose()
-    pose[:3] *= [-scale, scale, -1, 1]
-    return pose
-
-
-def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """(4, 4) camera to world of a camera or projector at a point that looks at another, with z up."""
-    ahead = (target - origin) / np.linalg.norm(target - origin)
-    left = np.cross([0, 0, 1], ahead)
-    left /= np.linalg.norm(left)
-    return np.block([[np.stack([left, np.cross(ahead, left), ahead, origin], axis=1)], [np.array([0, 0, 0, 1.0])]])
 
 
 @dataclass(frozen=True)
@@ -219,12 +174,12 @@ def write_mitsuba_scene(
     cameras: Sequence[Camera],
     settings: ImageSettings,
     light: str,
-    placed: Sequence[tuple[Harmonics | LocalBasis, torch.Tensor]] = (),
+    local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
 ) -> None:
     """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
-    there. placed: projectors and lamps, with their coefficients."""
+    there. local_lights: with their coefficients (size, 3)."""
     folder.mkdir(parents=True, exist_ok=True)
-    emitters = [emitter for lit in placed for emitter in _emitters(folder, *lit, albedo_scale)]
+    emitters = _local_emitters(folder, local_lights, albedo_scale)
     # Surfaces find the sky by themselves, with less noise.
     sky = environment({"filename": light}, math.pi * albedo_scale) | {"sampling_weight": 0.0 if emitters else 1.0}
     sampler = {"type": "multijitter", "sample_count": SAMPLES}
@@ -232,7 +187,8 @@ def write_mitsuba_scene(
     scene = xml.Element("scene", version="3.0.0")
     for entry in (integrator(settings.bounces, int(bool(emitters))), sky, *emitters, *sensors):
         _append(scene, "", entry)
-    for number, part in enumerate(split_parts(mesh, corner_normals(mesh, settings.normals), settings.encoding)):
+    normals = corner_normals(mesh.vertices, mesh.faces, settings.normals)
+    for number, part in enumerate(split_parts(mesh, normals, settings.encoding)):
         _append(scene, "", _write_part(folder, number, part, settings.encoding, albedo_scale))
     xml.indent(scene, "    ")
     write_whole(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
@@ -257,27 +213,20 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
                 _append(element, key, entry)
 
 
-def _emitters(
-    folder: Path, basis: Harmonics | LocalBasis, coefficients: torch.Tensor, albedo_scale: float
-) -> Iterator[Scene]:
-    """Lamps, or a projector, whose radiance is over π already.
-    Mitsuba's disks have radius 1 and shine along +z; their radiance is that of a far point's intensity on the area."""
-    if isinstance(basis, Lamps):
-        for (x, y, z), color in zip(basis.positions, math.pi * albedo_scale * coefficients, strict=True):
-            if not basis.radius:
-                yield {"type": "point", "position": [x, y, z], "intensity": {"type": "rgb", "value": color.tolist()}}
-                continue
-            polar, distance = math.atan2(math.hypot(x, y), z), math.hypot(x, y, z)
-            camera = PerspectiveCamera(polar, math.atan2(y, x), 1.0, distance=distance)
-            area = math.pi * basis.radius**2
-            radiance = {"type": "rgb", "value": [channel / area for channel in color.tolist()]}
-            pose = pose_of(camera, basis.radius)
-            yield {"type": "disk", "to_world": pose, "emitter": {"type": "area", "radiance": radiance}}
-    elif isinstance(basis, Projector):
-        write_map(folder / PATTERN, coefficients.view(basis.pixels, basis.pixels, 3))
-        pattern = {"filename": PATTERN, "filter_type": "nearest", "wrap_mode": "clamp"}
-        camera = PerspectiveCamera(basis.polar, basis.azimuth, 1.0, distance=basis.distance)
-        yield projector(pose_of(camera), math.degrees(basis.fov), pattern, albedo_scale * basis.distance**2)
+def _local_emitters(
+    folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
+) -> list[Scene]:
+    """Describe local lights for a scene file, and write their bitmaps beside it as .exr files."""
+    emitters = []
+    for basis, coefficients in lights:
+        emitters += basis.mitsuba_emitters(coefficients, albedo_scale)
+    projectors = [emitter for emitter in emitters if emitter["type"] == "projector"]
+    for number, emitter in enumerate(projectors):
+        file = f"pattern_{number}.exr" if number else "pattern.exr"
+        options = dict(emitter["irradiance"])
+        write_map(folder / file, torch.from_numpy(options.pop("bitmap")))
+        emitter["irradiance"] = {"type": options.pop("type"), "filename": file, **options}
+    return emitters
 
 
 def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:

@@ -1,21 +1,21 @@
 """Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators.
 
-Environment light has one basis, `Harmonics`. Lights within the scene are frozen dataclasses of `LocalBasis`: see
-`Lamps` and `Projector` in light/local.py. `renderer.render` takes a new one as it is; to configure and to attack it,
-add it to augment/build.py and give it a module in augment/attacks/parameters/.
+Environment light has one basis, `Harmonics`. Lights within the scene are frozen dataclasses of `LocalBasis`, a module
+each: see light/lamps.py and light/projector.py, and CONTRIBUTING.md for a new one.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from renderer.errors import require_finite, require_range
+from renderer.errors import InputError, require_finite, require_range
+from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.harmonics import (
     MAX_DEGREE,
     basis,
@@ -23,15 +23,68 @@ from renderer.light.harmonics import (
     lambertian_factors,
     nonzero_coefficients,
     select_rows,
-    unit,
 )
 from renderer.validation import require_whole
+from renderer.vectors import unit
 
-_STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
+
+class EnvironmentPart(NamedTuple):
+    """The environment light of a basis.
+
+    Attributes:
+        rows: Its coefficients among those of the whole basis.
+        basis: Its own basis.
+    """
+
+    rows: slice
+    basis: Harmonics
+
+
+class LocalPart(NamedTuple):
+    """One local light of a basis.
+
+    Attributes:
+        rows: Its coefficients among those of the whole basis.
+        basis: Its own basis.
+    """
+
+    rows: slice
+    basis: LocalBasis
+
+
+class Basis(ABC):
+    """Functions that any light of one kind is a sum of, with RGB coefficients of shape (size, 3)."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """How many functions there are."""
+
+    @property
+    def environment(self) -> EnvironmentPart | None:
+        """The environment light, None without one."""
+        return None
+
+    @property
+    def local_lights(self) -> list[LocalPart]:
+        """The lights within the scene, in the order of their coefficients."""
+        return []
+
+    @abstractmethod
+    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
+        """Project coefficients (..., size, 3) to those of light that can be emitted."""
+
+    def moved(self, positions: Tensor) -> Self:
+        """Return the basis with those of its lights that can be moved at positions (L, 3)."""
+        return self
+
+    def picture(self, coefficients: Tensor) -> Tensor | None:
+        """Return coefficients (size, 3) as an image (H, W, 3) of values in [0, 1], if they are one."""
+        return None
 
 
 @dataclass(frozen=True)
-class Harmonics:
+class Harmonics(Basis):
     """Environment light as real spherical harmonics: from infinitely far away, the same at each point of a scene.
 
     `size` functions, of which a light has a coefficient (size, 3) each, RGB. name: in files and messages.
@@ -54,6 +107,10 @@ class Harmonics:
     @property
     def size(self) -> int:
         return (self.degree + 1) ** 2
+
+    @property
+    def environment(self) -> EnvironmentPart:
+        return EnvironmentPart(slice(0, self.size), self)
 
     @property
     def nonzero(self) -> Tensor:
@@ -87,6 +144,8 @@ class Harmonics:
 
 
 HARMONICS = Harmonics()
+DEGREE = HARMONICS.degree  # of environment light, unless a degree is given
+COEFFICIENTS = HARMONICS.size  # of environment light of that degree
 
 
 class LightPaths(NamedTuple):
@@ -100,37 +159,101 @@ class LightPaths(NamedTuple):
     irradiance: Tensor
 
 
-class LocalBasis(ABC):
-    """Light from sources within the scene, which casts shadows. Coefficients (size, 3) are in [0, power]."""
+class LocalBasis(Basis):
+    """Light from sources within the scene, which casts shadows and does not bounce.
+
+    A subclass is a frozen dataclass. `renderer.render` takes it as it is. Its
+    name is that of its settings and of its file in the folder of an adversary.
+
+    Attributes:
+        name: Name of this kind of light, in files, settings and messages.
+        allow_negative: Whether coefficients may be negative.
+        is_movable: Whether `connect` and `moved` take other positions.
+        power: The largest coefficient. The smallest is 0.
+    """
 
     name: ClassVar[str]
     allow_negative: ClassVar[bool] = False
+    is_movable: ClassVar[bool] = False
     power: float
 
-    @property
+    @classmethod
     @abstractmethod
-    def size(self) -> int:
-        """How many functions there are."""
+    def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
+        """Create the light that settings describe.
 
-    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """The nearest coefficients that can be emitted: each light shows on its own where it is clamped."""
-        return self.nearest_nonnegative(coefficients)
+        Args:
+            settings: The settings of this kind of light in `augment.build`, with
+                angles in degrees.
 
-    def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """As `Harmonics.nearest_nonnegative`."""
-        return nearest_in_box(coefficients, 0, self.power, within)
+        Returns:
+            The basis, and the coefficients (size, 3) that attacks begin with.
+
+        Raises:
+            InputError: If a setting is out of range.
+        """
 
     @abstractmethod
     def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
-        """The paths to surface points (S, 3) of unit normals (S, 3), occlusion ignored. positions: (L, 3) of lamps,
-        instead of the basis'; the irradiance is differentiable in them, too."""
+        """Find the paths from the lights to surface points, without regard to occlusion.
+
+        Args:
+            points: Surface points, shape (S, 3).
+            normals: Unit normals there, shape (S, 3).
+            positions: Positions of the lights, shape (L, 3). The default is those
+                of the basis. Only a movable basis takes others.
+
+        Returns:
+            The paths, whose irradiance is differentiable in all arguments.
+        """
+
+    @abstractmethod
+    def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
+        """Describe the light for Mitsuba.
+
+        Args:
+            coefficients: Coefficients of the light, shape (size, 3).
+            albedo_scale: Factor of the light, which stands for that of the albedo.
+
+        Returns:
+            An entry of a Mitsuba scene for each emitter (see
+            `renderer.io.mitsuba_entries`). Mitsuba reflects albedo / π of the
+            irradiance, and this project all of it.
+        """
+
+    @property
+    def local_lights(self) -> list[LocalPart]:
+        return [LocalPart(slice(0, self.size), self)]
+
+    def project_nonnegative(self, coefficients: Tensor) -> Tensor:
+        """Project coefficients to the nearest that can be emitted.
+
+        Each light shows on its own where it is clamped.
+        """
+        return self.nearest_nonnegative(coefficients)
+
+    def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        """Same as `Harmonics.nearest_nonnegative`."""
+        return nearest_in_box(coefficients, 0, self.power, within)
 
 
 @dataclass(frozen=True)
-class SumBasis:
-    """Lights of several bases at once: the coefficients of one after the other."""
+class SumBasis(Basis):
+    """Lights of several bases at once.
+
+    Attributes:
+        parts: The bases, of which one at most is environment light. Their
+            coefficients follow each other.
+
+    Raises:
+        InputError: If two parts are environment light.
+    """
 
     parts: tuple[Harmonics | LocalBasis, ...]
+
+    def __post_init__(self) -> None:
+        if sum(part.environment is not None for part in self.parts) > 1:
+            raise InputError("parts holds two environment lights: add their coefficients instead")
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.parts))
@@ -139,87 +262,86 @@ class SumBasis:
     def size(self) -> int:
         return sum(part.size for part in self.parts)
 
+    @property
+    def environment(self) -> EnvironmentPart | None:
+        for rows, part in self._rows_of_parts():
+            if part.environment is not None:
+                return EnvironmentPart(rows, part.environment.basis)
+        return None
+
+    @property
+    def local_lights(self) -> list[LocalPart]:
+        return [LocalPart(rows, light.basis) for rows, part in self._rows_of_parts() for light in part.local_lights]
+
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """The projection of each part."""
-        projected = [part.project_nonnegative(coefficients[..., rows, :]) for rows, part in parts_of(self)]
+        """Project the coefficients of each part."""
+        projected = [part.project_nonnegative(coefficients[..., rows, :]) for rows, part in self._rows_of_parts()]
         return torch.cat(projected, dim=-2)
 
+    def moved(self, positions: Tensor) -> Self:
+        return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
-Basis = Harmonics | LocalBasis | SumBasis
+    def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
+        """Yield each part after its rows of coefficients."""
+        first = 0
+        for part in self.parts:
+            yield slice(first, first + part.size), part
+            first += part.size
 
 
-def parts_of(basis: Basis) -> list[tuple[slice, Harmonics | LocalBasis]]:
-    """(rows of coefficients, basis) of each part of a sum, or of the basis itself."""
-    parts, first = [], 0
-    for part in basis.parts if isinstance(basis, SumBasis) else (basis,):
-        parts.append((slice(first, first + part.size), part))
-        first += part.size
-    return parts
+def parts_of(basis: Basis) -> list[EnvironmentPart | LocalPart]:
+    """Return the parts of a basis in the order of their coefficients, each with its rows."""
+    environment = [] if basis.environment is None else [basis.environment]
+    return sorted([*environment, *basis.local_lights], key=lambda part: part.rows.start)
 
 
 def harmonics_of(basis: Basis) -> Harmonics:
-    """Those of the environment light, which come first."""
-    first = parts_of(basis)[0][1]
-    assert isinstance(first, Harmonics)
-    return first
+    """Return the harmonics of the environment light, which a scene always has."""
+    environment = basis.environment
+    assert environment is not None
+    return environment.basis
+
+
+class SplitLight(NamedTuple):
+    """A light, divided into environment light and local lights.
+
+    Attributes:
+        environment: Coefficients ((degree + 1)², 3), None without such light.
+        local_lights: Each basis with its coefficients (size, 3).
+    """
+
+    environment: Tensor | None
+    local_lights: list[tuple[LocalBasis, Tensor]]
+
+    @property
+    def basis(self) -> SumBasis:
+        """The basis of all lights, that of the environment light first."""
+        environment = [] if self.environment is None else [Harmonics(degree_of(self.environment))]
+        return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
+
+
+def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
+    """Divide coefficients (size, 3) of a basis into environment light and local lights."""
+    environment = basis.environment
+    return SplitLight(
+        environment=None if environment is None else coefficients[environment.rows],
+        local_lights=[(part.basis, coefficients[part.rows]) for part in basis.local_lights],
+    )
 
 
 def with_local_lights(sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:
-    """(basis, coefficients (size, 3)) of the sky in harmonics and of lights in the scene, each with its own."""
+    """Join environment light and local lights.
+
+    Args:
+        sky: Coefficients of environment light, shape ((degree + 1)², 3).
+        lights: Local lights, each with its coefficients (size, 3).
+
+    Returns:
+        The basis of all lights, the sky's first, and their coefficients.
+    """
     harmonics = Harmonics(degree_of(sky))
     if not lights:
         return harmonics, sky
+    bases = [basis for basis, _ in lights]
     coefficients = [values.to(sky) for _, values in lights]
-    return SumBasis((harmonics, *(basis for basis, _ in lights))), torch.cat([sky, *coefficients])
-
-
-@dataclass(frozen=True)
-class Ball:
-    """Values (A, ...), each within a radius of its center, in the norm "linf" or "l2"."""
-
-    center: Tensor
-    radius: float
-    norm: str
-
-    def unflatten(self, *shape: int) -> Ball:
-        """The ball of values (A, *shape), of a ball of values (A, D)."""
-        return Ball(self.center.unflatten(1, shape), self.radius, self.norm)
-
-    @property
-    def ends(self) -> tuple[Tensor, Tensor]:
-        """The lowest and the highest values, where the norm is "linf"."""
-        return self.center - self.radius, self.center + self.radius
-
-
-def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = None) -> Tensor:
-    """The values from `low` to `high`, numbers or tensors, that are nearest to values (A, ...) in the Euclidean sense.
-    within: a ball, whose centers lie there."""
-    if within is None:
-        return values.clamp(low, high)
-    if within.norm == "linf":
-        return values.clamp(low, high).clamp(*within.ends)
-    return _nearest_in_box_and_sphere(values, low, high, within)
-
-
-def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
-    """With a multiplier λ for the ball, the nearest point is the box's nearest to c + (v - c) / (1 + λ).
-
-    Its squared distance from the center c is a concave and piecewise linear function of s = 1 / (1 + λ)². From s = 0
-    on, Newton's steps therefore end where the distance is the radius, without going beyond.
-    """
-    offset, squared = values - ball.center, ball.radius**2
-    fraction, slope, distance = offset.new_zeros(()), _square(offset), offset.new_zeros(())
-    for _ in range(_STEPS):
-        step = (squared - distance) / slope.clamp(min=torch.finfo(values.dtype).tiny)
-        fraction = (fraction + step.clamp(min=0)).clamp(max=1)
-        target = torch.where(fraction < 1, ball.center + fraction.sqrt() * offset, values)
-        nearest = target.clamp(low, high)
-        slope, distance = _square(offset * (nearest == target)), _square(nearest - ball.center)
-        if not ((fraction < 1) & (squared - distance > 8 * torch.finfo(values.dtype).eps * squared)).any():
-            break
-    return nearest
-
-
-def _square(offsets: Tensor) -> Tensor:
-    """(A, 1, ...): the squared length of offsets (A, ...)."""
-    return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)
+    return SumBasis((harmonics, *bases)), torch.cat([sky, *coefficients])

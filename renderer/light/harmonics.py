@@ -13,16 +13,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_finite, require_range
 from renderer.validation import as_tensor, require_whole
+from renderer.vectors import unit
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
@@ -73,38 +73,9 @@ def require_degree(degree: int) -> None:
     require_range("degree", degree, 0, MAX_DEGREE)
 
 
-def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
-    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest."""
-    largest = vectors.abs().amax(0)
-    scaled = vectors / largest.masked_fill(largest == 0, 1)
-    norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
-    return scaled / norm.clamp(min=1), norm * largest
-
-
-def unit(vectors: Tensor) -> Tensor:
-    """Vectors (3, ...) at unit length; a zero vector stays zero, with a gradient of zero. Differentiable once."""
-    return _Unit.apply(vectors)
-
-
-class _Unit(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, vectors: Tensor) -> Tensor:
-        unit, length = unit_vectors(vectors)
-        ctx.save_for_backward(unit, length)
-        return unit
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> Tensor:
-        unit, length = ctx.saved_tensors
-        tangential = upstream - unit * (unit * upstream).sum(0)
-        return tangential / length.masked_fill(length == 0, torch.inf)
-
-
-def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
+def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
     """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
-    x, y, z = unit
+    x, y, z = directions
     indices, rows = dict.fromkeys(indices), {}
     degree = math.isqrt(max(indices, default=0))
     cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0

@@ -40,11 +40,11 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from torch import Tensor
 
-from renderer.light.basis import Ball
+from renderer.light.ball import Ball
 from renderer.light.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
 from renderer.light.program import shortest
 from renderer.light.window import irradiance_weights, nonnegative_window
-from renderer.normals import tangent_axes
+from renderer.vectors import tangent_axes
 
 Array = NDArray[Any]
 

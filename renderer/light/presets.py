@@ -4,22 +4,17 @@ Distant light has coefficients (49, 3), or of another degree, in world axes (z u
 `renderer.light.harmonics`.
 """
 
-import json
 import math
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
-from renderer.errors import FACTOR, InputError, require_bounded, require_file
-from renderer.image import to_bytes
-from renderer.io.files import write_whole
-from renderer.io.images import write_image
-from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
+from renderer.errors import InputError, require_bounded
+from renderer.light.basis import COEFFICIENTS, DEGREE, Harmonics
 from renderer.light.environment import SUFFIXES, read_panorama
+from renderer.light.files import read_light
 from renderer.light.harmonics import (
     basis,
     degree_of,
@@ -28,11 +23,9 @@ from renderer.light.harmonics import (
     require_degree,
     rotate,
 )
-from renderer.light.local import Projector
 from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.microfacets import window_without_ringing
-from renderer.transfer import COEFFICIENTS, DEGREE
-from renderer.validation import as_path, as_tensor, require_kind
+from renderer.validation import as_path
 
 # Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
 # L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 in the probes' own axes, whose y is up.
@@ -97,59 +90,6 @@ def load_light(light: str | Path, degree: int | None = DEGREE, roughness: float 
     if coefficients[size:].any():
         raise InputError(f"light {light} has harmonics beyond degree={degree}: give a higher degree")
     return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
-
-
-def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
-    """Write a basis and coefficients (size, 3), a row [r, g, b] each, as JSON; and a projector's pattern as a .png of
-    eight bits beside it, in which white is its power.
-
-    `read_light` reads float32 back to the bit. InputError: another shape, NaN, or a file that cannot be written.
-
-    >>> light = renderer.load_light("grace")
-    >>> save_light("light.json", light)
-    >>> torch.equal(renderer.load_light("light.json"), light)
-    True
-    """
-    path = as_path("path", path)
-    require_kind("basis", basis, Harmonics | LocalBasis, "Harmonics(degree), or lamps or a projector")
-    coefficients = as_tensor("coefficients", coefficients)
-    require_bounded(coefficients=coefficients)
-    if coefficients.shape != (basis.size, 3):
-        raise InputError(f"coefficients {tuple(coefficients.shape)} are not of {basis}: give {(basis.size, 3)}")
-    description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
-    try:
-        write_whole(path, json.dumps(description, allow_nan=False) + "\n")
-        if isinstance(basis, Projector):
-            pattern = to_bytes(coefficients.view(basis.pixels, basis.pixels, 3) / basis.power)
-            write_image(path.with_suffix(".png"), Image.fromarray(pattern.numpy()))
-    except OSError as error:
-        raise InputError(f"light {path} cannot be written: {error}") from error
-
-
-def read_light(path: str | Path, *kinds: type[Any]) -> tuple[Any, Tensor]:
-    """(the basis, of one of these kinds, and coefficients (size, 3) float32) of a .json file; rows alone are of
-    harmonics. InputError: a file that is missing or describes another light."""
-    path = Path(path)
-    require_file(path, "give the path of a .json file of coefficients")
-    try:
-        description = json.loads(path.read_text(encoding="utf-8-sig"))
-        if not isinstance(description, dict):
-            description = {"basis": HARMONICS.name, "coefficients": description}
-        coefficients = torch.tensor(description.pop("coefficients"), dtype=torch.float32)
-        name, named = description.pop("basis"), {kind.name: kind for kind in kinds}
-        if name not in named:
-            raise InputError(f"its basis is {name!r}, give one of {' or '.join(named)}")
-        if "positions" in description:
-            description["positions"] = tuple(map(tuple, description["positions"]))
-        basis = named[name](**description)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
-        raise InputError(f"{path} does not describe a light ({error}): write it again") from error
-    if coefficients.shape != (basis.size, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
-        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"
-        raise InputError(f"{path} has coefficients {tuple(coefficients.shape)}: {advice}")
-    return basis, coefficients
 
 
 def probe(name: str) -> Tensor:

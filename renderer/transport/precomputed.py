@@ -28,7 +28,7 @@ from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.gloss import SampleGloss, at_samples
 from renderer.image import ImageSettings
-from renderer.light.basis import Basis, Harmonics, LocalBasis, parts_of
+from renderer.light.basis import Basis, Harmonics
 from renderer.mesh import Mesh, refine
 from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
@@ -166,13 +166,12 @@ class Transport:
 def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis) -> Transport | None:
     """None without shadows and bounces of environment light; local lights cast their shadows by themselves. InputError:
     bounces of local lights."""
-    parts = [part for _, part in parts_of(basis)]
-    environment = [part for part in parts if not isinstance(part, LocalBasis)]
-    if len(environment) < len(parts) and settings.bounces:
+    if basis.local_lights and settings.bounces:
         raise InputError(f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows")
-    if not environment or not settings.global_illumination:
+    environment = basis.environment
+    if environment is None or not settings.global_illumination:
         return None
-    return Transport(mesh, settings, albedo_scale, environment[0])
+    return Transport(mesh, settings, albedo_scale, environment.basis)
 
 
 def _radiosity(patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics) -> Tensor:

@@ -20,10 +20,11 @@ from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
 from renderer.image import ImageSettings
-from renderer.light.harmonics import per_degree, unit
+from renderer.light.harmonics import per_degree
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.shading import normals_in_sight, smooth_normals
+from renderer.vectors import unit
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32

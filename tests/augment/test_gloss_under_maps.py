@@ -21,7 +21,7 @@ from renderer.light.presets import mean_luminance, probe
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface
 
 HDRI = Path(__file__).parents[3] / "shared" / "data" / "hdri"

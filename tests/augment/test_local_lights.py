@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -9,12 +9,14 @@ from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import AttackProblem
-from augment.build import LampsSettings, ProjectorSettings
+from augment.build import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
+from renderer.light.files import read_light, save_light
+from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
-from renderer.transport import local as sparse
+from renderer.transport import lamp_paths as sparse
+from renderer.transport.operators import build_operators
 
 SIZE, EVERY = 16, torch.arange(2)
 PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.1)
@@ -29,6 +31,18 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
     """Two views before gray."""
     lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"} | choices
     return augment.build_scene([(solid, "orange")], size, 2, rasterizer="numpy", **lights)
+
+
+@pytest.mark.parametrize("kind", LOCAL_LIGHTS)
+def test_each_kind_of_local_light_has_settings_an_attack_and_a_file(kind, tmp_path):
+    basis, coefficients = LOCAL_LIGHT_SETTINGS[kind.name]().build()
+    assert type(basis) is kind and coefficients.shape == (basis.size, 3)
+    assert kind.name in {item.name for item in fields(SceneSettings)}
+    assert kind.name in {item.name for item in fields(augment.AttackSettings)}
+    given = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0))
+    save_light(tmp_path / "light.json", given, basis)
+    found, values = read_light(tmp_path / "light.json", *LOCAL_LIGHTS)
+    assert found == basis and torch.equal(values, given)
 
 
 @pytest.mark.parametrize("parameter", ["lighting", "projector", "lamps", "positions"])

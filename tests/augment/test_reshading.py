@@ -11,7 +11,7 @@ from renderer.image import ENCODINGS, decode, encode
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 RASTERIZER = choose("numpy")

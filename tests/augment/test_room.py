@@ -9,7 +9,7 @@ from augment import room
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS
-from renderer.light.local import Lamps
+from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh, concatenate, normalize
 from renderer.transport.rays import Rays

@@ -15,19 +15,20 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.settings import SkylightSettings
 from augment.attacks.problem import AttackProblem
-from augment.build import build_scene, count_views, load_background, load_backgrounds
+from augment.build import build_scene, count_views, load_backgrounds
 from augment.objects import ObjectSettings, load_object
 from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings
+from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
 from renderer.light.presets import ambient, probe
 from renderer.microfacets import degree_for
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 
 EPS32 = torch.finfo(torch.float32).eps
 RASTERIZER = choose("numpy")
@@ -128,8 +129,8 @@ def test_a_background_is_gray_or_an_images_center_square(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
     Image.fromarray(pixels).save(wide)
     square = torch.from_numpy(pixels[:, 1:5]).permute(2, 0, 1) / 255
-    assert torch.equal(load_background(wide, 4), square) and torch.equal(load_background(str(wide), 4), square)
-    assert torch.equal(load_background("0.25", 4), torch.full((1, 4, 4), 0.25))
+    assert all(torch.equal(gray_or_image("backgrounds", path, 4), square) for path in (wide, str(wide)))
+    assert torch.equal(gray_or_image("backgrounds", "0.25", 4), torch.full((1, 4, 4), 0.25))
     assert load_backgrounds([0, 0.5], 4).shape == (2, 1, 4, 4)
     assert torch.equal(load_backgrounds([0.5, wide], 4), torch.stack([torch.full((3, 4, 4), 0.5), square]))
 

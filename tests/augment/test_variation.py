@@ -13,16 +13,19 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import augment
-from augment.build import LampsSettings, ProjectorSettings, load_background
-from augment.camera_effects import draw_camera_effects, draw_patterns
+from augment.build import LampsSettings, ProjectorSettings
+from augment.camera_effects import draw_camera_effects
 from augment.objects import ObjectSettings, PropSettings
+from augment.patterns import draw_patterns
 from augment.random_streams import generator
 from augment.scene import Conditions, Scene
 from augment.variation import VariationSettings, VarnishSettings, vary
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode
+from renderer.io.images import read_image
 from renderer.light.basis import HARMONICS
-from renderer.light.presets import ambient, load_light, probe, save_light
+from renderer.light.files import save_light
+from renderer.light.presets import ambient, load_light, probe
 from renderer.mesh import Mesh
 
 SIZE = 48
@@ -219,7 +222,7 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
     (tmp_path / "notes.txt").write_text("no image")
     varied = images(drawn(scene, backgrounds=str(tmp_path)))
     free = ~(images(scene).sum(1) > 0).any(0)
-    choices = [load_background(file, SIZE)[:, free] for file in files]
+    choices = [read_image(file, SIZE)[:, free] for file in files]
     shown = [[torch.equal(image[:, free], choice) for choice in choices] for image in varied]
     assert all(sum(row) == 1 for row in shown) and len({tuple(row) for row in shown}) == 2
     with pytest.raises(InputError, match=f"backgrounds={tmp_path / 'empty'} holds no image: give a folder"):

@@ -33,8 +33,8 @@ from renderer.light.presets import ambient
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import Rasterizer, choose
 from renderer.shading import radiance
-from renderer.transfer import build_operators
 from renderer.transport import rays
+from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface
 
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, width=2.2)

@@ -16,7 +16,7 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
 from renderer.rasterizer import choose
 from renderer.shading import irradiance, normals_in_sight, radiance
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
 CAMERA, SETTINGS, RASTERIZER = OrthographicCamera(0, 0, 2.0), ImageSettings(2, 2), choose("numpy")

@@ -12,21 +12,23 @@ import torch
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.gloss import Gloss, SampleGloss, sample_gloss
+from renderer.gloss import Gloss, SampleGloss
 from renderer.image import ImageSettings
-from renderer.io.mitsuba import environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
-from renderer.light.basis import Harmonics, LightPaths, LocalBasis
+from renderer.io.mitsuba import load, mitsuba, mitsuba_map, shape
+from renderer.io.mitsuba_entries import environment, integrator, sensor_of
+from renderer.light.basis import Harmonics, LightPaths, LocalBasis, SplitLight
 from renderer.light.harmonics import bands, basis, lambertian_factors
-from renderer.light.local import Lamps, Projector
+from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
+from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import AMPLITUDE, LEAST, degree_for, highlight_window, reflectance
 from renderer.rasterizer import choose
-from renderer.rendering import Shading, precompute_transfer, render, view_radiance
-from renderer.shading import normals_in_sight
+from renderer.rendering import precompute_transfer, render
+from renderer.shaded_view import ShadedView
 from renderer.shapes import solid, sphere
-from renderer.transfer import build_operators
-from renderer.transport.local import LocalLightView, _reflectance
+from renderer.transport.lamp_paths import _reflectance
+from renderer.transport.operators import build_operators
 from renderer.transport.rays import Rays
 
 ROUGHNESS = [0.2, 0.3, 0.5, 0.8]
@@ -338,19 +340,16 @@ def test_derivatives_by_all_parameters_are_those_of_finite_differences(normals, 
     def uniform(*shape: int) -> torch.Tensor:
         return 0.3 + 0.5 * torch.rand(shape, dtype=torch.float64, generator=random)
 
-    faces, count = torch.from_numpy(mesh.faces), len(mesh.faces)
+    count = len(mesh.faces)
     start = [positive_light(6), uniform(1, 3), torch.from_numpy(mesh.vertices), uniform(len(view.face), 3)]
     start += [uniform(count), uniform(count), uniform(count)]
     upstream = uniform(3, len(view.pixels))
 
     def total(values: list[torch.Tensor]) -> torch.Tensor:
         environment, lamp, vertices, albedo, *gloss = values
-        local = LocalLightView(rays, mesh, view, settings, vertices, Gloss(*gloss))
-        lights = [(Harmonics(6), environment), (LAMP, lamp)]
-        smooth = normals_in_sight(view, vertices, faces) if normals == "smooth" else None
-        gloss = sample_gloss(mesh, view, Gloss(*gloss))
-        shading = Shading(vertices, albedo, lights, smooth, lambda: local, gloss=gloss)
-        return (view_radiance(view, shading) * upstream).sum()
+        light = SplitLight(environment, [(LAMP, lamp)])
+        shown = ShadedView(mesh, view, settings, vertices, albedo, light, rays, gloss=Gloss(*gloss))
+        return (shown.radiance() * upstream).sum()
 
     variables = [value.clone().requires_grad_() for value in start]
     gradients = torch.autograd.grad(total(variables), variables)

@@ -22,8 +22,8 @@ from renderer.light.environment import write_map
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.transfer import ImageSettings, build_operators
 from renderer.transport import rays
+from renderer.transport.operators import ImageSettings, build_operators
 
 pytest.importorskip("mitsuba")
 

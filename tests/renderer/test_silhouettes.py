@@ -11,7 +11,7 @@ from torch import Tensor
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.light.local import Lamps
+from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.mesh import concatenate
 from renderer.shapes import SOLIDS

@@ -14,10 +14,10 @@ from renderer.errors import InputError
 from renderer.gloss import Gloss
 from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS, SumBasis
-from renderer.light.local import Projector
+from renderer.light.projector import Projector
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 from renderer.views import TransferOperators
 
 VIEWS, SIZE = 9, 12

@@ -18,7 +18,7 @@ from PIL import Image
 
 from renderer import export_mesh, save_light, solid
 from renderer.light.environment import to_map, write_map
-from renderer.light.local import Lamps
+from renderer.light.lamps import Lamps
 from renderer.light.presets import probe
 
 ROOT = Path(__file__).parents[2]

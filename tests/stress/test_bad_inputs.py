@@ -24,8 +24,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from augment.build import load_background
 from renderer import InputError, load_light, load_mesh
+from renderer.io.images import gray_or_image
 from train import checkpoint
 from train.data import load_folder, load_npz
 
@@ -41,7 +41,7 @@ READERS: dict[str, Callable[[Path], Any]] = {  # the library's, by the file that
     "mesh.mtl": lambda path: load_mesh(path.with_name("mesh.obj")),
     "peel.png": lambda path: load_mesh(path.with_name("mesh.obj")),
     **dict.fromkeys(("light.npy", "light.hdr", "light.exr", "light.json"), lambda path: load_light(str(path))),
-    "background.png": lambda path: load_background(str(path), 16),
+    "background.png": lambda path: gray_or_image("background", str(path), 16),
     "data.npz": lambda path: load_npz(str(path)),
     "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
 }

@@ -22,7 +22,8 @@ from renderer.errors import InputError
 from renderer.image import decode, encode
 from renderer.io.files import write_whole
 from renderer.io.images import read_image, write_image
-from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
+from renderer.io.mitsuba import Part, load, mitsuba, shape, split_parts
+from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
@@ -53,7 +54,7 @@ def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
         return np.clip(albedo_scale * linear, 0, 1).astype(np.float32)
 
     parts = []
-    for part in split_parts(mesh, corner_normals(mesh, "smooth", SHARP), "srgb"):
+    for part in split_parts(mesh, corner_normals(mesh.vertices, mesh.faces, "smooth", SHARP), "srgb"):
         texture = part.texture
         if texture is not None:
             texture = scaled(decode(torch.from_numpy(texture / 255), "srgb").numpy())

@@ -198,9 +198,7 @@ def left_out(folder: Path) -> list[PurePosixPath]:
         Their paths, sorted.
     """
     own = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
-    return sorted(
-        path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in own
-    )
+    return sorted(path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in own)
 
 
 @cache
@@ -253,9 +251,7 @@ def _has_class_folders(
     Raise InputError if no folder is a class, if a folder may be meant for a label, or if images
     lie beside folders.
     """
-    names = sorted(
-        entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name)
-    )
+    names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
     others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
     for name in others:
         if others == names or any(_is_like(name, label) for label in labels):
@@ -366,9 +362,7 @@ def load_photographs(
     return [photographs[row] for row in readable], images, [str(path) for path, _ in broken]
 
 
-def _read_into(
-    images: Tensor, folder: Path, photographs: Sequence[Photograph]
-) -> list[Exception | None]:
+def _read_into(images: Tensor, folder: Path, photographs: Sequence[Photograph]) -> list[Exception | None]:
     """Read photographs into the rows of a tensor; return the error of each row, if any."""
     size = images.shape[-1]
 

@@ -6,7 +6,7 @@ from augment.scene import Scene
 
 
 class Lamps(LightParameter):
-    """RGB intensity of each lamp, from 0 to `renderer.light.local.Lamps.power`.
+    """RGB intensity of each lamp, from 0 to `renderer.light.lamps.Lamps.power`.
 
     Args:
         scene: Scene to attack.

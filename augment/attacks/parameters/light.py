@@ -9,7 +9,8 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
-from renderer.light.basis import Ball, Harmonics, LocalBasis, parts_of
+from renderer.light.ball import Ball
+from renderer.light.basis import Harmonics, LocalBasis, parts_of
 
 
 class LightParameter(Parameter):

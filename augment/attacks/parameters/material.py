@@ -14,7 +14,7 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import MaterialSettings
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
-from renderer.light.basis import Ball, nearest_in_box
+from renderer.light.ball import Ball, nearest_in_box
 from renderer.microfacets import LEAST
 
 # Positions among the four attack values of an example (`MATERIAL`): roughness,

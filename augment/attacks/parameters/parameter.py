@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.attacks.norm_ball import StepSettings, anywhere
 from augment.scene import Conditions
-from renderer.light.basis import Ball
+from renderer.light.ball import Ball
 
 
 class Parameter(ABC):

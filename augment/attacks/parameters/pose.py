@@ -17,7 +17,7 @@ from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
-from renderer.light.basis import Ball, nearest_in_box
+from renderer.light.ball import Ball, nearest_in_box
 from renderer.skin import Skin
 from renderer.vectors import rotation_matrices
 

@@ -9,7 +9,7 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.light import find_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene import Conditions, Scene
-from renderer.light.local import Lamps
+from renderer.light.lamps import Lamps
 
 
 class Positions(Parameter):

@@ -6,7 +6,7 @@ from augment.scene import Scene
 
 
 class Projector(LightParameter):
-    """RGB value of each pixel of a projector, from 0 to `renderer.light.local.Projector.power`.
+    """RGB value of each pixel of a projector, from 0 to `renderer.light.projector.Projector.power`.
 
     Args:
         scene: Scene to attack.

@@ -10,7 +10,7 @@ from augment.attacks.parameters.light import environment_light, replace_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import SkylightSettings
 from augment.scene import Conditions, Scene
-from renderer.light.basis import Ball, nearest_in_box
+from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients

@@ -13,11 +13,11 @@ from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.attack import AttackResult
 from augment.attacks.evaluate import warnings
 from augment.attacks.files import LINES, SIDE, _captions, figure
+from renderer.io.meshes import load_mesh
 from renderer.io.mitsuba import mitsuba_map
 from renderer.io.tiles import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
 from renderer.light.presets import load_light
-from renderer.mesh import load_mesh
 
 CLASSES = ("orange", "lime", "sky", "night")
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment.attacks.norm_ball import NORMS, STEPS, StepSettings
 from renderer.errors import InputError
-from renderer.light.basis import nearest_in_box
+from renderer.light.ball import nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
 DTYPES = [torch.float32, torch.float64]

@@ -18,7 +18,7 @@ from renderer.errors import InputError
 from renderer.io.files import TEMPORARY, remove_unfinished, replacing, write_whole
 from renderer.io.images import write_image, write_numbers
 from renderer.light.environment import write_map
-from renderer.light.local import Projector
+from renderer.light.projector import Projector
 from train import checkpoint
 
 LIGHT = 0.1 * torch.rand(49, 3, generator=torch.Generator().manual_seed(0))

@@ -20,8 +20,8 @@ from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
-from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import precomputed, rays
+from renderer.transport.operators import TransferOperator, build_operators
 
 RASTERIZER = choose("numpy")
 ABOVE = OrthographicCamera(0, 0, 2.0)

@@ -10,8 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
+from renderer.io.meshes import load_mesh
 from renderer.light.presets import load_light
-from renderer.mesh import load_mesh
 
 USER_ERROR = 2
 ROOT = Path(__file__).parents[3]

@@ -17,8 +17,9 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.images import read_image
 from renderer.light.environment import read_panorama, to_map
+from renderer.light.files import save_light
 from renderer.light.harmonics import equirectangular
-from renderer.light.presets import load_light, save_light
+from renderer.light.presets import load_light
 from scripts.fit import grab_cut
 from train.attack import AttackExperimentSettings
 from train.checkpoint import BEST, save

@@ -22,12 +22,13 @@ from augment.attacks.problem import AttackProblem
 from augment.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
+from renderer.light.basis import DEGREE
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
-from renderer.transfer import DEGREE, build_operators
+from renderer.transport.operators import build_operators
 
 EPS = torch.finfo(torch.float64).eps
 SKY = (0.9, 0.4, 3.0)

@@ -12,10 +12,9 @@ from renderer.fragments import Fragments
 from renderer.gloss import Gloss, at_samples
 from renderer.image import ImageSettings
 from renderer.light.basis import LightPaths, LocalBasis
-from renderer.light.harmonics import unit, unit_vectors
-from renderer.light.local import Lamps
 from renderer.mesh import Mesh
 from renderer.transport.rays import Rays, Surface
+from renderer.vectors import unit, unit_vectors
 
 SPARSE = 1 / 16  # fraction of nonzero entries below which multiplying them one by one takes less time,
 SMALL = 2**16  # unless the dense matrix has no more entries than this
@@ -143,7 +142,7 @@ class LocalLightView:
         positions: (L, 3) of lamps, None where the basis has them. fragments: the same samples in other pixels.
         Differentiable in all and in the vertices."""
         pixels = None if fragments is None else fragments.to("cpu")
-        if isinstance(basis, Lamps) and positions is not None:
+        if basis.is_movable and positions is not None:
             paths = unoccluded(self._rays, basis, *self._points, positions.cpu().double())
         else:
             if basis not in self._fixed:

@@ -19,12 +19,13 @@ from renderer.io import mitsuba
 from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
 from renderer.light.environment import write_map
-from renderer.light.local import Lamps, Projector, moved
+from renderer.light.lamps import Lamps
+from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.rasterizer import choose
-from renderer.transfer import TransferOperator, build_operators
-from renderer.transport import local as sparse
-from renderer.transport.local import local_radiance, unoccluded
+from renderer.transport import lamp_paths as sparse
+from renderer.transport.lamp_paths import local_radiance, unoccluded
+from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.rays import Rays, Surface
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
@@ -132,7 +133,7 @@ def test_moved_lamps_shine_and_cast_shadows_as_lamps_that_stand_there(basis):
     powers = torch.rand(2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     shown = partial(moved_image, ball_on_a_table(), samples=4, basis=basis)
     _, image = shown(there, powers)
-    standing = operator(ball_on_a_table(), moved(basis, there), samples=4)
+    standing = operator(ball_on_a_table(), basis.moved(there), samples=4)
     torch.testing.assert_close(image, standing.radiance(powers), rtol=1e-12, atol=1e-14)
     _, alone = shown(there[:1], powers[:1])
     assert (alone == 0).any() and alone.max() > 0.02

@@ -13,7 +13,7 @@ from renderer.image import ENCODINGS, ImageSettings, decode, encode
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
+from renderer.transport.operators import build_operators
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")

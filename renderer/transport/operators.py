@@ -34,19 +34,17 @@ from renderer.image import (
     encode_gradient,
 )
 from renderer.light import harmonics
-from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
+from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.transport.local import SparseTransfer, joined, local_transfer
-from renderer.transport.precomputed import build_transport
+from renderer.transport.lamp_paths import SparseTransfer, joined, local_transfer
+from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-DEGREE = HARMONICS.degree
-COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
 BLOCK = 2**12  # So many pixels are filtered at a time, whose sums stay in the processor's cache.
 GLOSSY = 2**20  # coefficients of samples with gloss at a time, of which more numbers are computed
@@ -388,71 +386,209 @@ def build_operators(
     dtype: torch.dtype = torch.float32,
     gloss: Gloss | None = None,
 ) -> list[TransferOperator]:
-    """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
+    """Compute one operator per camera, for lights of one basis.
 
-    albedo_scale multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side
-    that the camera sees, with normals as the settings say. gloss: in place of the mesh's. InputError: bounces of local
-    lights.
+    Surfaces shade on the side that the camera sees.
+
+    Args:
+        mesh: The mesh.
+        cameras: The cameras.
+        settings: Settings of the images.
+        rasterizer: What finds the visible faces.
+        albedo_scale: Factor of the albedo, for meshes whose texture is darker than
+            the thing.
+        basis: Basis of the lights.
+        dtype: Of the operators, which are computed in float64.
+        gloss: Gloss instead of the mesh's.
+
+    Returns:
+        The operators, in the order of the cameras.
+
+    Raises:
+        InputError: If local lights are to bounce, or the scale is not finite.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
     transport = build_transport(mesh, settings, albedo_scale, basis)
-    local = any(isinstance(part, LocalBasis) for _, part in parts_of(basis))
-    rays = transport.rays if transport else Rays(mesh)
+    builder = _OperatorBuilder(
+        mesh=mesh,
+        settings=settings,
+        albedo_scale=albedo_scale,
+        basis=basis,
+        dtype=dtype,
+        gloss=gloss,
+        transport=transport,
+        rays=transport.rays if transport else Rays(mesh),
+    )
+    return [builder.build(fragments) for fragments in views]
 
-    def build(fragments: Fragments) -> TransferOperator:
-        surface, pixels = Surface(mesh, fragments, settings, given_gloss=gloss), len(fragments.pixels)
-        by_channel = (transport and transport.colors) or (surface.gloss is not None and (transport or local))
-        color = None if by_channel else shared_albedo(mesh, fragments, settings.encoding)
-        if color is None:
-            albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
-            factor = None if by_channel else _pixel_albedo(fragments, albedo, dtype)
-        else:
-            factor = (color * albedo_scale).expand(pixels, 3)
-        one_channel = factor is not None  # The albedo multiplies whole pixels, so that the samples have 1.
-        if factor is None:
-            factor = torch.ones(pixels, 3)
-        else:
-            albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
-        channels = 2 if one_channel and surface.gloss is not None else albedo.shape[1]
-        transfers, nonzero = [], [torch.arange(0)]
+
+class _Channels(NamedTuple):
+    """How the channels of a view's transfer are laid out, and where the albedo is.
+
+    Attributes:
+        number: 3 if each color has a channel. 1 if the colors share a channel, and
+            2 if white light of the gloss follows it.
+        is_shared: Whether the colors share a channel.
+        sample_albedo: Albedo that is folded into the transfer, shape (S, 3), or
+            ones (S, 1) if the colors share a channel.
+        pixel_albedo: Albedo that multiplies a shared channel, shape (P, 3), or
+            ones.
+    """
+
+    number: int
+    is_shared: bool
+    sample_albedo: Tensor
+    pixel_albedo: Tensor
+
+
+class _DenseRows(NamedTuple):
+    """Rows of a transfer matrix.
+
+    Attributes:
+        transfer: Radiance per unit of K coefficients, shape (C, K, P).
+        coefficients: Indices of these coefficients in the light, shape (K,).
+    """
+
+    transfer: Tensor
+    coefficients: Tensor
+
+
+@dataclass(frozen=True)
+class _OperatorBuilder:
+    """Computes the operators of one mesh, view by view.
+
+    Attributes:
+        mesh: The mesh.
+        settings: Settings of the images.
+        albedo_scale: Factor of the albedo.
+        basis: Basis of the lights.
+        dtype: Of the operators.
+        gloss: Gloss instead of the mesh's, or None.
+        transport: Shadows and bounces of environment light, None without them.
+        rays: Rays among the faces of the mesh.
+    """
+
+    mesh: Mesh
+    settings: ImageSettings
+    albedo_scale: float
+    basis: Basis
+    dtype: torch.dtype
+    gloss: Gloss | None
+    transport: Transport | None
+    rays: Rays
+
+    def build(self, fragments: Fragments) -> TransferOperator:
+        """Compute the operator of one view."""
+        surface = Surface(self.mesh, fragments, self.settings, given_gloss=self.gloss)
+        channels = self._channels(surface)
+        dense = []
         sparse = []
-        for rows, part in parts_of(basis):
-            if isinstance(part, LocalBasis):
-                entries = local_transfer(rays, surface, albedo, part)
-                if entries.few(pixels):
-                    weight = (entries.weight * factor[entries.pixel]).to(dtype)
-                    sparse.append(SparseTransfer(rows.start + entries.function, entries.pixel, weight))
-                    continue
-                transfer, indices = entries.dense(pixels)
+        for part in self.basis.local_lights:
+            entries = self._local_entries(part, surface, channels)
+            if entries.few(len(fragments.pixels)):
+                sparse.append(self._sparse_rows(part, entries, channels))
             else:
-                if surface.gloss is None:
-                    weights = None if one_channel else albedo
-                    transfer, indices = _box_filter(surface, weights, part, dtype), part.nonzero
-                else:
-                    transfer = _glossy_box_filter(surface, surface.gloss, albedo, part, dtype)
-                    indices = torch.arange(part.size)
-                change = transport.change(surface, albedo) if transport else None
-                if change is not None:
-                    transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
-            transfers.append(transfer.to(dtype))
-            nonzero.append(rows.start + indices)
-        if len(transfers) == 1:  # There is nothing to join, so that nothing is copied.
-            [joined_transfer] = transfers
-        else:
-            joined_transfer = torch.cat([torch.empty(channels, 0, pixels, dtype=dtype), *transfers], dim=1)
+                dense.append(self._local_rows(part, entries, surface))
+        if self.basis.environment is not None:
+            dense.append(self._environment_rows(self.basis.environment, surface, channels))
+        joined_rows = self._join(dense, channels.number, len(fragments.pixels))
         return TransferOperator(
-            transfer=joined_transfer,
-            albedo=factor.T.to(dtype).contiguous(),
-            coverage=fragments.coverage.to(dtype),
+            transfer=joined_rows.transfer,
+            albedo=channels.pixel_albedo.T.to(self.dtype).contiguous(),
+            coverage=fragments.coverage.to(self.dtype),
             pixels=fragments.pixels,
-            nonzero=torch.cat(nonzero),
-            settings=settings,
-            basis=basis,
+            nonzero=joined_rows.coefficients,
+            settings=self.settings,
+            basis=self.basis,
             sparse=joined(sparse),
         )
 
-    return list(map(build, views))
+    def _channels(self, surface: Surface) -> _Channels:
+        """Choose the layout with the fewest channels that is exact."""
+        fragments = surface.fragments
+        pixel_count = len(fragments.pixels)
+        is_glossy = surface.gloss is not None
+        pixel_albedo = None
+        sample_albedo = None
+        if self._needs_three_channels(is_glossy):
+            sample_albedo = self._surface_albedo(fragments)
+        else:
+            color = shared_albedo(self.mesh, fragments, self.settings.encoding)
+            if color is not None:
+                pixel_albedo = (color * self.albedo_scale).expand(pixel_count, 3)
+            else:
+                sample_albedo = self._surface_albedo(fragments)
+                pixel_albedo = _pixel_albedo(fragments, sample_albedo, self.dtype)
+        if pixel_albedo is None:
+            assert sample_albedo is not None
+            return _Channels(3, False, sample_albedo, torch.ones(pixel_count, 3))
+        # The albedo multiplies whole pixels, so that the samples have 1.
+        ones = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
+        return _Channels(2 if is_glossy else 1, True, ones, pixel_albedo)
+
+    def _needs_three_channels(self, is_glossy: bool) -> bool:
+        """Return whether light takes on color in a way that no factor per pixel expresses.
+
+        Bounced light may have another color than the sky's. Shadows and local
+        lights compute gloss in the channels of the albedo.
+        """
+        if self.transport is not None and self.transport.colors:
+            return True
+        return is_glossy and (self.transport is not None or bool(self.basis.local_lights))
+
+    def _surface_albedo(self, fragments: Fragments) -> Tensor:
+        """Return the scaled albedo (S, 3) at the samples."""
+        return surface_albedo(self.mesh, fragments, self.settings.encoding) * self.albedo_scale
+
+    def _environment_rows(self, part: EnvironmentPart, surface: Surface, channels: _Channels) -> _DenseRows:
+        """Compute the rows of environment light, with shadows and bounces."""
+        harmonics_basis = part.basis
+        everything = torch.arange(harmonics_basis.size)
+        if surface.gloss is None:
+            weights = None if channels.is_shared else channels.sample_albedo
+            transfer = _box_filter(surface, weights, harmonics_basis, self.dtype)
+            coefficients = harmonics_basis.nonzero
+        else:
+            albedo = channels.sample_albedo
+            transfer = _glossy_box_filter(surface, surface.gloss, albedo, harmonics_basis, self.dtype)
+            coefficients = everything
+        change = None
+        if self.transport is not None:
+            change = self.transport.change(surface, channels.sample_albedo)
+        if change is not None:
+            transfer = change.index_add_(1, coefficients, transfer.double())
+            coefficients = everything
+        return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
+
+    def _local_entries(self, part: LocalPart, surface: Surface, channels: _Channels) -> SparseTransfer:
+        """Compute the nonzero entries of a local light."""
+        return local_transfer(self.rays, surface, channels.sample_albedo, part.basis)
+
+    def _local_rows(self, part: LocalPart, entries: SparseTransfer, surface: Surface) -> _DenseRows:
+        """Write the entries of a local light as rows."""
+        transfer, coefficients = entries.dense(len(surface.fragments.pixels))
+        return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
+
+    def _sparse_rows(self, part: LocalPart, entries: SparseTransfer, channels: _Channels) -> SparseTransfer:
+        """Return the entries of a local light in three channels, with their albedo."""
+        weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
+        return SparseTransfer(part.rows.start + entries.function, entries.pixel, weight)
+
+    def _join(self, parts: list[_DenseRows], channel_count: int, pixel_count: int) -> _DenseRows:
+        """Join rows in the order of their coefficients."""
+        if len(parts) == 1:  # There is nothing to join, so that nothing is copied.
+            return parts[0]
+        empty = torch.empty(channel_count, 0, pixel_count, dtype=self.dtype)
+        ordered = sorted(parts, key=_first_coefficient)
+        transfer = torch.cat([empty, *(part.transfer for part in ordered)], dim=1)
+        coefficients = [torch.arange(0), *(part.coefficients for part in ordered)]
+        return _DenseRows(transfer, torch.cat(coefficients))
+
+
+def _first_coefficient(rows: _DenseRows) -> int:
+    """Return the index of the first coefficient, 0 for none."""
+    return int(rows.coefficients[0]) if len(rows.coefficients) else 0
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:

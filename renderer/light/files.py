@@ -1,0 +1,107 @@
+"""Files of lights: a basis and its coefficients as JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from renderer.errors import FACTOR, InputError, require_bounded, require_file
+from renderer.image import to_bytes
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
+from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
+from renderer.validation import as_path, as_tensor, require_kind
+
+LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
+
+
+def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
+    """Write a light to a .json file, from which `read_light` reads float32 back to the bit.
+
+    The pattern of a projector is also written as a .png file of eight bits
+    beside it, in which white is the projector's power.
+
+    Args:
+        path: The .json file.
+        coefficients: Coefficients of the light, RGB, shape (size, 3).
+        basis: The basis of the light. The default is harmonics of degree 6.
+
+    Raises:
+        InputError: If the coefficients have another shape or hold NaN, or the
+            file cannot be written.
+
+    Example:
+        >>> light = renderer.load_light("grace")
+        >>> save_light("light.json", light)
+        >>> torch.equal(renderer.load_light("light.json"), light)
+        True
+    """
+    path = as_path("path", path)
+    expected = "Harmonics(degree), or lamps or a projector"
+    require_kind("basis", basis, Harmonics | LocalBasis, expected)
+    coefficients = as_tensor("coefficients", coefficients)
+    require_bounded(coefficients=coefficients)
+    if coefficients.shape != (basis.size, 3):
+        shape = tuple(coefficients.shape)
+        raise InputError(f"coefficients {shape} are not of {basis}: give {(basis.size, 3)}")
+    description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
+    picture = basis.picture(coefficients)
+    try:
+        write_whole(path, json.dumps(description, allow_nan=False) + "\n")
+        if picture is not None:
+            image = Image.fromarray(to_bytes(picture).numpy())
+            write_image(path.with_suffix(".png"), image)
+    except OSError as error:
+        raise InputError(f"light {path} cannot be written: {error}") from error
+
+
+def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, Tensor]:
+    """Read a light from a .json file.
+
+    Args:
+        path: The file, as `save_light` writes it. A file of rows [r, g, b] alone
+            holds coefficients of harmonics.
+        kinds: The classes of bases that the file may describe.
+
+    Returns:
+        The basis, and its coefficients (size, 3), float32.
+
+    Raises:
+        InputError: If the file is missing or does not describe such a light.
+    """
+    path = Path(path)
+    require_file(path, "give the path of a .json file of coefficients")
+    kind_of_name = {kind.name: kind for kind in kinds}
+    try:
+        description = json.loads(path.read_text(encoding="utf-8-sig"))
+        if not isinstance(description, dict):
+            description = {"basis": HARMONICS.name, "coefficients": description}
+        coefficients = torch.tensor(description.pop("coefficients"), dtype=torch.float32)
+        name = description.pop("basis")
+        if name not in kind_of_name:
+            known = " or ".join(kind_of_name)
+            raise InputError(f"its basis is {name!r}, give one of {known}")
+        basis = kind_of_name[name](**description)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (
+        KeyError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        OverflowError,
+        RecursionError,
+        OSError,
+    ) as error:
+        raise InputError(f"{path} does not describe a light ({error}): write it again") from error
+    is_bounded = bool((coefficients.abs() <= FACTOR).all())  # NaN is not.
+    if coefficients.shape != (basis.size, 3) or not is_bounded:
+        shape = tuple(coefficients.shape)
+        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"
+        raise InputError(f"{path} has coefficients {shape}: {advice}")
+    return basis, coefficients

@@ -1,0 +1,116 @@
+"""A projector of pixel patterns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.errors import FACTOR, require_range
+from renderer.io.images import gray_or_image
+from renderer.io.mitsuba_entries import pose_of, projector
+from renderer.light.basis import LightPaths, LocalBasis
+from renderer.validation import require_field_types
+
+MAX_PIXELS = 256  # The largest number of pixels per side.
+
+
+@dataclass(frozen=True)
+class Projector(LocalBasis):
+    """A projector that aims at the origin, with a coefficient for each of its pixels² pixels.
+
+    The pixels follow row by row from the top left, as a screen shows them. A
+    coefficient of 1 gives a white surface at the origin that faces the projector
+    the radiance 1. The light falls with the squared distance and is even on a
+    flat screen.
+
+    Attributes:
+        pixels: Pixels per side, at most 256.
+        polar: Angle of the position off +z, in radians.
+        azimuth: Angle of the position off +x toward +y, in radians.
+        distance: Distance from the origin, at least 2.
+        fov: Angle between opposite sides of the pattern, in radians.
+        power: The largest coefficient. The smallest is 0.
+
+    Raises:
+        InputError: If an attribute is out of range.
+
+    Example:
+        >>> beamer = Projector(pixels=4)
+        >>> beamer.size, str(beamer)
+        (16, 'a projector of 4² pixels')
+    """
+
+    pixels: int = 16
+    polar: float = math.pi / 3
+    azimuth: float = 0.5
+    distance: float = 4.0
+    fov: float = math.radians(30)
+    power: float = 1.0
+
+    name = "projector"
+
+    def __post_init__(self) -> None:
+        require_field_types(self)
+        require_range("projector.pixels", self.pixels, 1, MAX_PIXELS)
+        require_range("projector.distance", self.distance, 2, FACTOR)
+        require_range("projector.fov", self.fov, 1e-3, 3)
+        require_range("projector.power", self.power, 1 / FACTOR, FACTOR)
+
+    @classmethod
+    def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
+        require_range("polar", settings.polar, 0, 180)
+        require_range("azimuth", settings.azimuth, -360, 360)
+        require_range("fov", settings.fov, 0.1, 170)
+        light = cls(
+            pixels=settings.pixels,
+            polar=math.radians(settings.polar),
+            azimuth=math.radians(settings.azimuth),
+            distance=settings.distance,
+            fov=math.radians(settings.fov),
+            power=settings.power,
+        )
+        pattern = gray_or_image("pattern", settings.pattern, light.pixels).expand(3, -1, -1)
+        return light, light.power * pattern.flatten(1).T
+
+    def __str__(self) -> str:
+        return f"a {self.name} of {self.pixels}² pixels"
+
+    @property
+    def size(self) -> int:
+        return self.pixels**2
+
+    def picture(self, coefficients: Tensor) -> Tensor:
+        """Return coefficients (size, 3) as an image (pixels, pixels, 3), in which 1 is the power."""
+        return coefficients.view(self.pixels, self.pixels, 3) / self.power
+
+    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+        """Find one path for each point within the pattern."""
+        axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
+        source = self.distance * axes[2]
+        right, up, back = ((points - source) @ axes.T).unbind(1)
+        depth = -back
+        edge = math.tan(self.fov / 2)
+        column = ((1 + right / (depth * edge)) / 2 * self.pixels).floor()
+        row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
+        # The cosine at the surface over that of the angle from the axis.
+        cosine = ((source - points) * normals).sum(1) / depth
+        in_rows = (row >= 0) & (row < self.pixels)
+        in_columns = (column >= 0) & (column < self.pixels)
+        is_lit = in_rows & in_columns & (depth > 0) & (cosine > 0)
+        point = torch.nonzero(is_lit).squeeze(1)
+        irradiance = cosine * (self.distance / depth) ** 2
+        function = (row * self.pixels + column)[point].long()
+        return LightPaths(point, function, source.expand(len(point), 3), irradiance[point])
+
+    def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
+        # The radiance of Mitsuba's projector is over π already.
+        texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
+        pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
+        camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
+        scale = albedo_scale * self.distance**2
+        return [projector(pose_of(camera), math.degrees(self.fov), pattern, scale)]
