@@ -22,7 +22,7 @@ from augment.scene import Conditions
 from renderer.image import to_bytes, to_unit
 from renderer.io.images import read_image
 from renderer.light.basis import parts_of
-from train.photographs.metrics import RANKED, find_metric, metric_title
+from train.photographs.metrics import RANKED, metric_title, read_metric
 
 BEFORE, PATTERN, AFTER = "before.png", "pattern.png", "after.png"
 PIXELS, INK, GRAY, BLUE, GREEN, RED = 16, "#1f2328", "#6e7781", "#0072B2", "#1a7f37", "#b42318"
@@ -73,8 +73,9 @@ def draw_bars(card: Figure, runs: Sequence[Path]) -> None:
     before, *after = (json.loads((folder / "laboratory" / "summary.json").read_text()) for folder in folders)
     axes, metrics = card.add_axes((0.785, 0.15, 0.2, 0.64)), (*RANKED[1:], RANKED[0])
     for row, metric in enumerate(metrics):
-        begun, seeds = find_metric(before, metric), [find_metric(summary, metric)["value"] for summary in after]
-        bars = [(begun["value"], begun["low"], begun["high"]), (fmean(seeds), min(seeds), max(seeds))]
+        begun = read_metric(before, metric)
+        seeds = [read_metric(summary, metric).value for summary in after]
+        bars = [(begun.value, begun.low, begun.high), (fmean(seeds), min(seeds), max(seeds))]
         for (value, low, high), offset, color in zip(bars, (-0.19, 0.19), ("#b1bac4", BLUE), strict=True):
             axes.barh(row + offset, value, 0.36, color=color)
             axes.plot([low, high], [row + offset] * 2, color=INK, linewidth=1.6)

@@ -40,12 +40,11 @@ from train.lab.shots import LabSettings
 from train.loop import evaluate
 from train.networks import is_classifier, load_run
 from train.photographs.folder import TABLE
-from train.photographs.metrics import METRICS, OVERALL, metric_title, pool_by
-from train.photographs.predictions import PREDICTIONS, Prediction, write_predictions
-from train.photographs.scoring import predict_folder
-from train.report.compare import Evaluation, difference, mean_metric
+from train.photographs.metrics import METRICS, Pooled, metric_title
+from train.photographs.predictions import PREDICTIONS, Prediction, Predictor, write_predictions
+from train.report.compare import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary, summarize
-from train.tables import Table, format_interval
+from train.tables import Estimate, Table, format_interval
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
 LABEL, VALIDATION = "orange", 0.02
@@ -187,9 +186,9 @@ def score(args: argparse.Namespace) -> None:
             pairs = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
             group, answers[arm, folder] = zip(*pairs, strict=True)
             scored[arm, folder] = group
-            for name in group[0].pools:
-                cells = (format_interval(mean_metric(group, name, metric)) for metric in METRICS)
-                lines.append([arm, folder.name, Path(name).stem or "all", *cells])
+            for part in group[0].pools:
+                cells = (format_interval(mean_metric(group, part, metric)) for metric in METRICS)
+                lines.append([arm, folder.name, Path(part.title()).stem, *cells])
         if args.data:
             values = [evaluate(model, split)["accuracy"] for model in models]
             lines.append([arm, "CIFAR-100", "accuracy", mean_and_range(values), *blank])
@@ -197,7 +196,7 @@ def score(args: argparse.Namespace) -> None:
     for folder in folders:
         for arm in others:
             pair = scored[arm, folder], scored[first, folder]
-            cells = (format_interval(difference(*pair, OVERALL, metric), "+") for metric in METRICS)
+            cells = (format_interval(difference(*pair, ALL, metric), "+") for metric in METRICS)
             lines.append([f"{arm} - {first}", folder.name, "all", *cells])
             for group, positive in (("same class", True), ("same class, other things", False)):
                 pairs = (zip(own, answers[first, folder][0], strict=True) for own in answers[arm, folder])
@@ -208,21 +207,23 @@ def score(args: argparse.Namespace) -> None:
 
 def mean_and_range(values: Sequence[float]) -> str:
     """Of a number for each seed."""
-    return format_interval({"value": fmean(values)} | ({"low": min(values), "high": max(values)} if values[1:] else {}))
+    if len(values) == 1:
+        return format_interval(Estimate(values[0]))
+    return format_interval(Estimate(fmean(values), min(values), max(values)))
 
 
 def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> tuple[Evaluation, list[Prediction]]:
     """A run's predictions on a folder, pooled by source, which is a pattern, a map or where photographs come from, and
     by object; and each."""
     network = model.network
-    predictions, *_ = predict_folder(model, network.classes, folder, LABEL, network.size)
+    predictions = Predictor(model, network.classes, network.size).predict(folder, LABEL).predictions
     out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
     out.mkdir(parents=True, exist_ok=True)
     write_predictions(out / PREDICTIONS, predictions)
     thresholds = {point.label: point.threshold for point in network.operating_points}
-    pools = [pool_by(predictions, by, thresholds=thresholds) for by in ("mesh", "source")]
+    pooled = Pooled(predictions, thresholds=thresholds)
     summary = RunSummary(Path(run), run, {}, {}, None) if is_classifier(run) else summarize(Path(run))
-    return Evaluation(summary, pools[1] | pools[0]), predictions
+    return Evaluation(summary, pools_of(pooled, "source", "mesh")), predictions
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -20,7 +20,9 @@ from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
 from train.networks import load_run, published
 from train.photographs import scoring
+from train.photographs.folder import require_outside
 from train.photographs.metrics import GROUPS
+from train.photographs.predictions import Predictor
 from train.results import require_replaceable
 from train.run_folder import sole_writer
 
@@ -65,16 +67,20 @@ def main(settings: Settings) -> None:
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     points = network.operating_points
-    options = network.size, settings.skip_unreadable, device
+    predictor = Predictor(model, network.classes, network.size, device)
     with sole_writer("out", out):
         if settings.calibrate and settings.false_positive_rate:
             folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
-            points = scoring.choose_operating_points(model, network.classes, folder, labels, rate, *options)
+            skip = settings.skip_unreadable
+            points = scoring.choose_operating_points(predictor, folder, labels, rate, skip)
         by_label = {point.label: point for point in points}
         points = [by_label[name] for name in labels] if by_label.keys() >= set(labels) else []
-        photos, by = published(Path(settings.photos)), settings.by
-        summary = scoring.evaluate_photographs(model, network.classes, photos, labels, out, *options, by, points)
-    print(f"{scoring.format_summary(summary)}\n\ntable, scores and image: {out}")
+        photos = published(Path(settings.photos))
+        require_outside(out, photos)
+        answers = predictor.predict(photos, labels, settings.skip_unreadable)
+        scores = scoring.score(answers, settings.by, points)
+        scoring.write(scores, out)
+    print(f"{scoring.format_scores(scores)}\n\ntable, scores and image: {out}")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from omegaconf import MISSING
 from train.errors import writable_folder
 from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish, published
 from train.photographs import scoring
+from train.photographs.predictions import Predictor
 from train.report.summary import summarize
 from train.results import require_replaceable
 from train.settings import mapped
@@ -47,14 +48,15 @@ def main(settings: Settings) -> None:
         # Names of files in place of their paths, which are of this machine alone.
         state["settings"] = mapped(dict(run.settings), lambda text: Path(text).name if text[:1] == "/" else text)
         state["versions"] = dict(run.config.versions)
-        state["scores"] = {**run.scores, **run.photographs}
+        photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
+        state["scores"] = {**run.scores, **photographs}
     if settings.calibrate or not str(state["architecture"].get("name")).startswith(PYTHON):  # its user runs that code
         network = load_run(path, model=settings.model)  # or InputError, since nobody could use it
     if settings.calibrate and settings.false_positive_rate:
         network.half().float()  # as it is published
         folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
-        options = network.classes, folder, settings.label, rate, network.size, False, "cpu"
-        points = scoring.choose_operating_points(network, *options)
+        predictor = Predictor(network, network.classes, network.size)
+        points = scoring.choose_operating_points(predictor, folder, settings.label, rate)
         state["operating_point"] = [asdict(point) for point in points]
         for point in points:
             print(f"{point.label}: threshold {point.threshold:.3f} for {scoring.describe_point(asdict(point))}")

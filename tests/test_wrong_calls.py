@@ -24,7 +24,8 @@ from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from renderer.validation import describe
 from train import load_run
-from train.photographs.scoring import evaluate_photographs
+from train.photographs.predictions import Predictor
+from train.photographs.scoring import evaluate_photographs, score
 
 NAN = math.nan
 SIZE = 8
@@ -1116,24 +1117,24 @@ SERVICES = [
 SCORES = [
     *calls_of(
         "folder",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, x, "orange", Path("out"), SIZE),
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), x, "orange", Path("out")),
         None,
         3,
     ),
     *calls_of(
         "file.txt",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, x, "orange", Path("out"), SIZE),
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), x, "orange", Path("out")),
         "file.txt",
     ),
-    *calls_of("out", lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", x, SIZE), None, 3),
+    *calls_of("out", lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", "orange", x), None, 3),
     *calls_of(
         "file.txt",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", x, SIZE),
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", "orange", x),
         "file.txt",
     ),
     *calls_of(
         "label",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", x, "out", SIZE),
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", x, "out"),
         "pear",
         None,
         3,
@@ -1141,7 +1142,7 @@ SCORES = [
     ),
     *calls_of(
         "classes",
-        lambda x: evaluate_photographs(LINEAR, x, "photos", "orange", "out", SIZE),
+        lambda x: evaluate_photographs(Predictor(LINEAR, x, SIZE), "photos", "orange", "out"),
         "orange",
         None,
         3,
@@ -1149,12 +1150,12 @@ SCORES = [
     ),
     *calls_of(
         "size",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", "out", x),
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, x), "photos", "orange", "out"),
         *COUNT_FAULTS,
     ),
     *calls_of(
         "model",
-        lambda x: evaluate_photographs(x, CLASSES, "photos", "orange", "out", SIZE),
+        lambda x: evaluate_photographs(Predictor(x, CLASSES, SIZE), "photos", "orange", "out"),
         None,
         "resnet",
         3,
@@ -1162,12 +1163,12 @@ SCORES = [
     ),
     *calls_of(
         "logits",
-        lambda x: evaluate_photographs(x, CLASSES, "photos", "orange", "out", SIZE),
+        lambda x: evaluate_photographs(Predictor(x, CLASSES, SIZE), "photos", "orange", "out"),
         probabilities,
     ),
     *calls_of(
         "by",
-        lambda x: evaluate_photographs(LINEAR, CLASSES, "photos", "orange", "out", SIZE, by=x),
+        lambda x: score(Predictor(LINEAR, CLASSES, SIZE).predict("photos", "orange"), by=x),
         "mesh",
         "color",
         None,

@@ -8,7 +8,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ from train.errors import writable_folder
 from train.results import require_replaceable
 from train.run_folder import sole_writer, write_config
 from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
-from train.tables import Table, format_fraction, fraction
+from train.tables import Proportion, Table, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
 NAMES = {"float": "computed", "reload": "rendered again from the saved files", "mitsuba": "rendered by Mitsuba"}
@@ -312,7 +312,7 @@ def _success(result: AttackResult) -> str:
     """On clean-correct examples, and on their views, with the 95 % Wilson interval."""
     clean = result.clean_correct
     rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
-    if not rate["n"]:
+    if rate.n == 0:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
     views, wrong = result.success_in_views[clean], int((~clean).sum())
     text, by_margin = f"success on {format_fraction(rate)} examples", int(result.success_with_margin[clean].sum())
@@ -350,9 +350,9 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
         clean = found["clean_correct"]
         rate = fraction(_count_correct(found["success"], clean), sum(clean))
         kind = next(iter(found))
-        lines.append(json.dumps({kind: found[kind], **rate, **found}) + "\n")
+        lines.append(json.dumps({kind: found[kind], **asdict(rate), **found}) + "\n")
         without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
-        numbers = [f"{rate['n']} of {len(clean)}", format_fraction(rate), without_noise]
+        numbers = [f"{rate.n} of {len(clean)}", format_fraction(rate), without_noise]
         rows.append([f"{kind} {found[kind]}", *map(str, numbers)])
     write_whole(path, "".join(lines))
     header = ["adversaries shown to", "correct before", "success", "without noise"]
@@ -377,7 +377,7 @@ def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
     return str(Table("", ["radius", *titles], rows))
 
 
-def _rate(success: Tensor) -> dict[str, Any]:
+def _rate(success: Tensor) -> Proportion:
     return fraction(int(success.sum()), len(success))
 
 
@@ -393,7 +393,7 @@ def write_sweeps(sweeps: Mapping[str, Sequence[Mapping[str, Any]]], norms: Mappi
         ]
         sweeps = {**sweeps, "all": pooled}
     records = [
-        {"mesh": mesh, "method": method, **row["radii"], **_rate(row[method])}
+        {"mesh": mesh, "method": method, **row["radii"], **asdict(_rate(row[method]))}
         for mesh, sweep in sweeps.items()
         for method in methods
         for row in sweep

@@ -42,9 +42,9 @@ from train.networks import (
     without_normalization,
 )
 from train.photographs.folder import find_photographs, require_outside
-from train.photographs.metrics import METRICS, find_metric
-from train.photographs.predictions import BATCH, Model, compute_logits
-from train.photographs.scoring import evaluate_photographs, format_summary
+from train.photographs.metrics import METRICS
+from train.photographs.predictions import BATCH, Model, Predictor, compute_logits
+from train.photographs.scoring import Scores, evaluate_photographs, format_scores
 from train.recipe import freeze
 from train.renders import build_service
 from train.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
@@ -145,11 +145,11 @@ class Run:
         self._scores |= self._test_scores()
         if self._answers is not None and CLASSIFIER in trainer.architecture:
             self._scores["test/agreement"] = self._agreement(self._answers)
-        summaries = self._score_photographs(trainer.selected, self.folder)
-        for name, summary in summaries.items():
-            console.info("%s: %s", name, format_summary(summary))
-            self._scores |= _photograph_scores(name, summary)
         if self.log:
+            for name in self.settings.evaluate.folders:
+                scores = self._score_photographs(trainer.selected, name, self.folder)
+                console.info("%s: %s", name, format_scores(scores))
+                self._scores |= _photograph_scores(name, scores)
             self.log.scalars(self._scores)
         return self._scores
 
@@ -237,7 +237,8 @@ class Run:
             images = describe_test_images(settings, self.data)
             begun = settings.train.init_from
             console.info("before: %s has accuracy %.4f on %s", begun, accuracy, images)
-        self._score_photographs(predict, self.folder / BEFORE)
+        for name in settings.evaluate.folders:
+            self._score_photographs(predict, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
 
     def _predicted_classes(self, model: Model, split: Split) -> Tensor:
@@ -290,23 +291,16 @@ class Run:
         )
         return agreement
 
-    def _score_photographs(self, model: Model, folder: Path) -> dict[str, dict[str, Any]]:
-        """Score a model on each folder of photographs; return the first process's summaries."""
-        if distributed.rank() > 0:
-            return {}
-        summaries = {}
-        for name, photographs in self.settings.evaluate.folders.items():
-            summaries[name] = evaluate_photographs(
-                model,
-                self.data.classes,
-                photographs,
-                self.settings.label,
-                folder / name,
-                self.data.size,
-                self.settings.evaluate.skip_unreadable,
-                self.trainer.device,
-            )
-        return summaries
+    def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
+        """Score a model on the folder of photographs with a name; write the scores below `folder`."""
+        asked = self.settings.evaluate
+        return evaluate_photographs(
+            Predictor(model, self.data.classes, self.data.size, self.trainer.device),
+            asked.folders[name],
+            self.settings.label,
+            folder / name,
+            asked.skip_unreadable,
+        )
 
 
 def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
@@ -409,15 +403,15 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
     return f"{kind}, not of the network's {others} other classes" if others else kind
 
 
-def _photograph_scores(name: str, summary: dict[str, Any]) -> dict[str, float]:
-    """Return the known metrics of a summary and of its classes, by name."""
-    parts = {name: summary}
-    for label, part in summary.get("by_label", {}).items():
-        parts[f"{name}/{label}"] = part
-    scores = {}
-    for key, part in parts.items():
+def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
+    """Return the known metrics of photographs and of each label, by name."""
+    parts = {name: scores.overall}
+    for label, metrics in scores.by_label.items():
+        parts[f"{name}/{label}"] = metrics
+    values = {}
+    for part, metrics in parts.items():
         for metric in ("top5", *METRICS):
-            value = find_metric(part, metric).get("value")
-            if value is not None:
-                scores[f"{key}/{metric}"] = value
-    return scores
+            estimate = metrics.find(metric)
+            if estimate is not None and estimate.value is not None:
+                values[f"{part}/{metric}"] = estimate.value
+    return values

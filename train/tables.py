@@ -1,10 +1,37 @@
-"""Fractions with their intervals, and tables, as text for people."""
+"""Estimates with their intervals, and tables, as text for people."""
 
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Value of a metric with its 95% interval.
+
+    Attributes:
+        value: Value of the metric. None if it is unknown.
+        low: Low end of the interval. None if the interval is unknown.
+        high: High end of the interval. None if the interval is unknown.
+    """
+
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Proportion(Estimate):
+    """Fraction of images for which something is true, with its Wilson interval.
+
+    Attributes:
+        hits: Number of images for which it is true.
+        n: Number of images. If it is 0, the fraction is unknown.
+    """
+
+    hits: int = 0
+    n: int = 0
 
 
 @dataclass(frozen=True)
@@ -21,7 +48,11 @@ class Table:
     @property
     def known(self) -> "Table":
         """Without the columns in which every cell is unknown, "-"."""
-        kept = [index for index in range(len(self.header)) if any(row[index] != "-" for row in self.rows)]
+        kept = [
+            index
+            for index in range(len(self.header))
+            if any(row[index] != "-" for row in self.rows)
+        ]
         rows = [[row[index] for index in kept] for row in self.rows]
         return Table(self.title, [self.header[index] for index in kept], rows)
 
@@ -34,7 +65,10 @@ class Table:
             if len(parts[-1]) > 1 and _width([*parts[-1], column]) > room:
                 parts.append([first])
             parts[-1].append(column)
-        tables = ("\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True)) for part in parts)
+        tables = (
+            "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True))
+            for part in parts
+        )
         return "\n\n".join(filter(None, [self.title and f"{self.title}:", *tables]))
 
 
@@ -57,30 +91,60 @@ def as_text(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def fraction(hits: int, n: int) -> dict[str, Any]:
-    """hits / n with its 95 % Wilson score interval (Wilson 1927).
+def fraction(hits: int, n: int) -> Proportion:
+    """Compute hits / n with its 95% Wilson score interval (Wilson 1927).
 
-    Returns {value, low, high, hits, n}, the first three in [0, 1], or None with n = 0.
+    Args:
+        hits: Number of images for which something is true.
+        n: Number of images. If it is 0, the fraction is unknown.
+
+    Returns:
+        Fraction with its interval, all in [0, 1].
     """
     if n == 0:
-        return {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
-    from scipy.stats import binomtest  # takes a second to import
+        return Proportion()
+    # This import takes a second.
+    from scipy.stats import binomtest
 
     ends = binomtest(hits, n).proportion_ci(method="wilson")
-    return {"value": hits / n, "low": float(ends.low), "high": float(ends.high), "hits": hits, "n": n}
+    return Proportion(
+        value=hits / n,
+        low=float(ends.low),
+        high=float(ends.high),
+        hits=hits,
+        n=n,
+    )
 
 
-def format_fraction(result: Mapping[str, Any]) -> str:
-    """A result of `fraction`: hits of n [low, high]; "-" where n is 0."""
-    return "{hits} of {n} [{low:.0%}, {high:.0%}]".format(**result) if result["n"] else "-"
+def format_fraction(proportion: Proportion) -> str:
+    """Write a proportion as text.
 
+    Args:
+        proportion: Fraction of images, as `fraction` returns it.
 
-def format_interval(metric: Mapping[str, Any], sign: str = "") -> str:
-    """A metric's value [low, high], or the value alone without an interval; "-" where it is unknown or absent.
-
-    sign: "+" to show that of positive numbers, too.
+    Returns:
+        Text such as "8 of 40 [10%, 35%]", or "-" without images.
     """
-    if metric.get("value") is None:
+    if proportion.n == 0:
         return "-"
-    value, *ends = (f"{metric[name]:{sign}.3f}" for name in ("value", "low", "high") if name in metric)
-    return f"{value} [{', '.join(ends)}]" if ends else value
+    counts = f"{proportion.hits} of {proportion.n}"
+    return f"{counts} [{proportion.low:.0%}, {proportion.high:.0%}]"
+
+
+def format_interval(estimate: Estimate | None, sign: str = "") -> str:
+    """Write the value of a metric with its interval as text.
+
+    Args:
+        estimate: Value and interval. None if the metric is not there.
+        sign: "+" to show the sign of positive numbers, too.
+
+    Returns:
+        Text such as "0.500 [0.250, 0.750]". The interval is left out if it is
+        unknown. If the value is unknown, the text is "-".
+    """
+    if estimate is None or estimate.value is None:
+        return "-"
+    value = f"{estimate.value:{sign}.3f}"
+    if estimate.low is None or estimate.high is None:
+        return value
+    return f"{value} [{estimate.low:{sign}.3f}, {estimate.high:{sign}.3f}]"

@@ -29,8 +29,10 @@ def fraction(outcomes: Iterable[bool]) -> str:
 
 
 def percentages(hits: int, n: int) -> str:
-    value, low, high = (100 * (tables.fraction(hits, n)[name] or 0) for name in ("value", "low", "high"))
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}] of {n}" if n else "none of 0"
+    if n == 0:
+        return "none of 0"
+    rate = tables.fraction(hits, n)
+    return f"{100 * rate.value:.0f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}] of {n}"
 
 
 def groups(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
@@ -139,7 +141,9 @@ def draw_norm_balls(rows: Rows, path: Path) -> None:
     for ax, ((space,), balls) in zip(axes, spaces.items(), strict=True):
         for method in ("adversarial", "random", "search"):
             results = [tables.fraction(ball[method], ball["n"]) for ball in balls]
-            value, low, high = (np.array([result[name] for result in results]) for name in ("value", "low", "high"))
+            value = np.array([result.value for result in results])
+            low = np.array([result.low for result in results])
+            high = np.array([result.high for result in results])
             error = np.maximum([value - low, high - value], 0)  # below 0 by rounding alone
             ax.errorbar([ball["radius"] for ball in balls], value, error, label=method, marker="o", capsize=3)
         ax.set(title=space, xscale="log", xlabel="L∞ radius", ylabel="success", ylim=(-0.03, 1.03))

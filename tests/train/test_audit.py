@@ -1,7 +1,7 @@
 """The audit: a brute-force scan of radii, closed forms, and audits that were stopped."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -205,7 +205,7 @@ def test_the_answer_is_yes_only_where_intervals_lie_above_what_is_called_safe(mo
     views = [True] * hits + [False] * (n - hits)
     parts = {page.RECOGNIZED: {"uniform": views, "random 1": views}}
     parts |= {f"{kind}.json": {"correct": 4, "adversarial": [0, 0, 1, 1]} for kind in KINDS}
-    parts["summary.json"] = {"recall": rate, "false_positive_rate": none}
+    parts["summary.json"] = {"recall": asdict(rate), "false_positive_rate": asdict(none)}
     monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
     assert page._answer("orange", "a", Path(), ["laboratory"]).startswith(f"Is a safe in strange light? {answer}")
 
@@ -214,7 +214,7 @@ def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(monk
     rate, views = page.fraction(400, 400), [True] * 400
     parts = {page.RECOGNIZED: {"uniform": views, "random 1": views}}
     parts |= {f"{kind}.json": {"correct": 4, "adversarial": [0, 1, 2, 4]} for kind in KINDS}
-    parts["summary.json"] = {"recall": rate, "false_positive_rate": page.fraction(0, 400)}
+    parts["summary.json"] = {"recall": asdict(rate), "false_positive_rate": asdict(page.fraction(0, 400))}
     monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
     answer = page._answer("orange", "a", Path(), ["laboratory"])
     for light in KINDS.values():

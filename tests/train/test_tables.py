@@ -5,18 +5,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from train.tables import Table, format_fraction, format_interval, fraction
+from train.tables import Proportion, Table, format_fraction, format_interval, fraction
 
 
 def test_a_fraction_has_the_wilson_interval():
     """p = 0.2 of 40 ± 1.96 standard errors about (8 + z² / 2) / (40 + z²), z = 1.96 (Wilson 1927)."""
-    assert fraction(8, 40) == pytest.approx(
-        {"value": 0.2, "low": 0.10500, "high": 0.34757, "hits": 8, "n": 40}, rel=1e-4
-    )
+    expected = {"value": 0.2, "low": 0.10500, "high": 0.34757, "hits": 8, "n": 40}
+    assert vars(fraction(8, 40)) == pytest.approx(expected, rel=1e-4)
 
 
 def test_a_fraction_of_nothing_is_unknown():
-    assert fraction(0, 0) == {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
+    assert fraction(0, 0) == Proportion(value=None, low=None, high=None, hits=0, n=0)
     assert (format_fraction(fraction(0, 0)), format_interval(fraction(0, 0))) == ("-", "-")
 
 

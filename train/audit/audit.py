@@ -28,6 +28,7 @@ from train.lab.laboratory import write_laboratory
 from train.lab.shots import LabSettings
 from train.networks import published
 from train.photographs.folder import FOREIGN, find_photographs
+from train.photographs.predictions import Predictor
 from train.photographs.scoring import evaluate_photographs
 from train.results import RESULTS, require_replaceable
 from train.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
@@ -143,9 +144,8 @@ def run_audit(settings: AuditSettings) -> Path:
             for kind in KINDS:
                 _part(own / f"{kind}.json", success_by_light, network, attacked, kind, own)
             for name, folder in folders.items():
-                options: dict[str, Any] = {"size": network.size, "skip_unreadable": True, "device": device}
-                shown = network, network.classes, folder, settings.label
-                _whole(own / name, partial(evaluate_photographs, *shown, **options))
+                predictor = Predictor(network, network.classes, network.size, device)
+                _whole(own / name, partial(_evaluate, predictor, folder, settings.label))
             if rest:
                 _part(own / page.TRANSFER, transfers, network, *rest, attacked, own)
         names = {key: network.name for key, network in networks.items()}
@@ -163,6 +163,11 @@ def _part(path: Path, measure: Callable[..., dict[str, Any]], *arguments: Any) -
     """Write what is measured as JSON, unless the file is there."""
     if not path.exists():
         write_whole(path, json.dumps(measure(*arguments)) + "\n", durable=True)
+
+
+def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
+    """Score a network on photographs, but for those that cannot be read."""
+    evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
 def _whole(folder: Path, make: Callable[[Path], object]) -> None:

@@ -1,6 +1,7 @@
 """A model's predictions for photographs, and the table predictions.csv."""
 
 import csv
+import hashlib
 import io
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -10,13 +11,21 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from augment.batches import eval_mode
-from augment.classifiers.adapter import Label, NetworkCall, label_names
+from augment.classifiers.adapter import Label, NetworkCall, as_class_names, label_names
 from augment.losses import log_odds
 from augment.progress import progress
-from renderer.errors import InputError, in_one_line
-from renderer.image import to_unit
+from renderer.errors import InputError, in_one_line, require_range
+from renderer.image import LARGEST_SIZE, to_unit
 from renderer.io.files import write_whole
-from train.photographs.folder import SEPARATOR, Photograph, split_sources
+from renderer.validation import as_folder, require_kind, require_whole
+from train.photographs.folder import (
+    SEPARATOR,
+    Photograph,
+    find_photographs,
+    left_out,
+    load_photographs,
+    split_sources,
+)
 
 PREDICTIONS = "predictions.csv"
 BATCH = 256
@@ -48,28 +57,154 @@ class Prediction:
         return self.photograph.label == self.label
 
 
-def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str | torch.device) -> torch.Tensor:
+@dataclass(frozen=True)
+class FolderPredictions:
+    """Predictions of a model for all photographs of a folder.
+
+    Attributes:
+        folder: Folder of the photographs.
+        predictions: Predictions about each label, one label after the other.
+            Those about one label are in the order of the images.
+        images: Photographs, uint8 sRGB, shape (N, 3, size, size).
+        labels: Classes under study.
+        unreadable: Paths of the photographs that could not be read.
+        left_out: Paths of the files of kinds that are not read.
+        images_hash: Hash of the labels and the photographs. It is equal where
+            the metrics of two networks can be compared.
+    """
+
+    folder: Path
+    predictions: list[Prediction]
+    images: torch.Tensor
+    labels: list[str]
+    unreadable: list[str]
+    left_out: list[str]
+    images_hash: str
+
+    @property
+    def size(self) -> int:
+        """Pixels per side of the images that the model was shown."""
+        return self.images.shape[-1]
+
+    @property
+    def photographs(self) -> list[Prediction]:
+        """One prediction for each photograph, which is about the first label."""
+        return self.predictions[: len(self.images)]
+
+
+@dataclass
+class Predictor:
+    """A model, and what it takes to ask it about photographs.
+
+    Attributes:
+        model: Module or function from images (N, 3, size, size), float32 sRGB
+            in [0, 1], to logits (N, len(classes)). A module is called in eval
+            mode and left in its own.
+        classes: Names of the classes of the model.
+        size: Pixels per side of the images.
+        device: Device of the model.
+
+    Raises:
+        InputError: If the model cannot be called, or the classes or the size
+            are wrong.
+    """
+
+    model: Model
+    classes: Sequence[str]
+    size: int = 32
+    device: str | torch.device = "cpu"
+
+    def __post_init__(self) -> None:
+        kinds = "a torch.nn.Module, or a function from images to logits"
+        require_kind("model", self.model, Callable, kinds)
+        self.classes = as_class_names("classes", self.classes)
+        require_whole("size", self.size)
+        require_range("size", self.size, 1, LARGEST_SIZE)
+
+    def predict(
+        self, folder: Path, label: Label, skip_unreadable: bool = False
+    ) -> FolderPredictions:
+        """Predict the classes of all photographs of a folder.
+
+        Args:
+            folder: Folder of photographs, as `find_photographs` takes it.
+            label: Class under study, or several.
+            skip_unreadable: Whether to leave out photographs that cannot be
+                read. Otherwise they are an error.
+
+        Returns:
+            Predictions about each label, with the photographs.
+
+        Raises:
+            InputError: As of `find_photographs`, `load_photographs` and
+                `compute_logits`.
+        """
+        folder = as_folder("folder", folder)
+        labels = label_names(label)
+        found = find_photographs(folder, self.classes, label)
+        photographs, images, unreadable = load_photographs(
+            folder, found, self.size, skip_unreadable
+        )
+        logits = compute_logits(self.model, images, len(self.classes), self.device)
+        return FolderPredictions(
+            folder=folder,
+            predictions=predict(photographs, logits, self.classes, labels),
+            images=images,
+            labels=labels,
+            unreadable=unreadable,
+            left_out=[str(path) for path in left_out(folder)],
+            images_hash=_hash(folder, photographs, labels),
+        )
+
+
+def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
+    """Hash the labels, and the files of photographs with what is known of them."""
+    digest = hashlib.sha256("\n".join(labels).encode())
+    for photograph in photographs:
+        content = (folder / photograph.path).read_bytes()
+        digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
+    return digest.hexdigest()
+
+
+def compute_logits(
+    model: Model, images: torch.Tensor, classes: int, device: str | torch.device
+) -> torch.Tensor:
     """The model's logits, (N, classes) float32 on the CPU, for images (N, 3, H, W) uint8 sRGB.
 
     A module is called in eval mode and left in its own. InputError: logits of another shape, NaN or infinite, or of one
     class.
     """
     if classes < 2:
-        raise InputError("the model has a single class, whose odds are infinite: evaluate one with other classes, too")
-    with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
+        raise InputError(
+            "the model has a single class, whose odds are infinite: evaluate one with other classes, too"
+        )
+    with (
+        eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(),
+        torch.inference_mode(),
+    ):
         call = NetworkCall("model")
-        batches = [call(model, to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
+        batches = [
+            call(model, to_unit(batch.to(device)))
+            for batch in progress(images.split(BATCH), "predictions")
+        ]
         logits = torch.cat(batches).float().cpu()
     if logits.shape != (shape := (len(images), classes)):
         advice = "evaluate a checkpoint that was trained on these classes"
-        raise InputError(f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}")
+        raise InputError(
+            f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}"
+        )
     if not logits.isfinite().all():
-        raise InputError("the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged")
+        raise InputError(
+            "the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged"
+        )
     return logits
 
 
 def predict(
-    photographs: Sequence[Photograph], logits: torch.Tensor, classes: Sequence[str], labels: Sequence[str]
+    photographs: Sequence[Photograph],
+    logits: torch.Tensor,
+    classes: Sequence[str],
+    labels: Sequence[str],
 ) -> list[Prediction]:
     """Predictions from logits (N, C) in the order of `classes`: about the first of `labels` for all photographs, then
     about the next."""
@@ -81,7 +216,9 @@ def predict(
     for label in labels:
         studied = classes.index(label)
         odds = log_odds(logits.double(), studied).tolist()
-        for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
+        for photograph, by_class, places, score in zip(
+            photographs, probabilities, ranks, odds, strict=True
+        ):
             best, true = places.index(1), (None, None)
             if photograph.label in classes:
                 index = classes.index(photograph.label)
@@ -133,5 +270,15 @@ def _read_row(row: dict[str, str], label: str) -> Prediction:
 
 def _columns(label: str) -> dict[str, Callable[[str], object]]:
     """The columns of a prediction about a class, in the order of its fields, with their types."""
-    predicted = {"predicted": str, "probability": float, "true_probability": float, "true_rank": int}
-    return {**predicted, f"{label}_probability": float, f"{label}_rank": int, f"{label}_log_odds": float}
+    predicted = {
+        "predicted": str,
+        "probability": float,
+        "true_probability": float,
+        "true_rank": int,
+    }
+    return {
+        **predicted,
+        f"{label}_probability": float,
+        f"{label}_rank": int,
+        f"{label}_log_odds": float,
+    }

@@ -12,26 +12,29 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from augment.classifiers.adapter import label_names
 from augment.progress import announced
 from augment.service import ARMS
 from renderer.errors import InputError
 from renderer.io.files import write_whole
 from train.errors import one_sentence
 from train.loop import attack_success
-from train.photographs.metrics import LABEL, OVERALL, metric_title
+from train.photographs.metrics import metric_title
+from train.photographs.scoring import CONTACT_SHEET
 from train.photographs.sheet import evenly
 from train.report import compare, plots, summary
 from train.report.plots import Picture
 from train.report.summary import Arms, RunSummary, Scored
 from train.run_folder import CONFIG, read_config
-from train.tables import as_text, format_fraction, format_interval, fraction
+from train.tables import Table, as_text, format_fraction, format_interval, fraction
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
 MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with images
 ATTACK_EXAMPLES = 4  # with images of an attack
-GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
+GRID, SHEET = (
+    720,
+    1100,
+)  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
 HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")  # of METRICS, in the first sentences
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
@@ -50,10 +53,19 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
     trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
     read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
-    times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
-    counts = {f"network{'s' * (len(runs) != 1)}": len(runs), "unfinished or unreadable": len(unfinished)}
-    about = ", ".join(f"{count} {name}" for name, count in {**counts, "attacks": len(attacks)}.items() if count)
-    place = ", ".join(map(str, folders)) + (f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "")
+    times = [
+        file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE
+    ]
+    counts = {
+        f"network{'s' * (len(runs) != 1)}": len(runs),
+        "unfinished or unreadable": len(unfinished),
+    }
+    about = ", ".join(
+        f"{count} {name}" for name, count in {**counts, "attacks": len(attacks)}.items() if count
+    )
+    place = ", ".join(map(str, folders)) + (
+        f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else ""
+    )
     return write_page(
         out,
         "runs.html.jinja",
@@ -66,9 +78,14 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
         curves=_curves(epochs),
         seconds=summary.seconds_table(drawn),
-        photographs=[scores_section(title, group) for title, group in summary.by_images(drawn).items()],
+        photographs=[
+            scores_section(title, group) for title, group in summary.by_images(drawn).items()
+        ],
         renders={arm: _pictures(run, "epoch", "Renders") for arm, run in trained.items()},
-        examples={arm: _pictures(run, "attacks", "Renders before and after") for arm, run in trained.items()},
+        examples={
+            arm: _pictures(run, "attacks", "Renders before and after")
+            for arm, run in trained.items()
+        },
         attacks=attacks,
         shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
@@ -80,9 +97,15 @@ def write_page(out: Path, body: str, **content: Any) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
+    environment = Environment(
+        loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options
+    )
     environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
-    environment.filters |= {"fraction": fraction, "hits": format_fraction, "interval": format_interval}
+    environment.filters |= {
+        "fraction": fraction,
+        "hits": format_fraction,
+        "interval": format_interval,
+    }
     page = environment.get_template("page.html.jinja").render(body=body, **content)
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / PAGE, page)
@@ -106,10 +129,17 @@ def _command(config: Mapping[str, Any]) -> str:
 def _curves(arms: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> list[Picture]:
     pictures = []
     for name, title in CURVES.items():
-        lines = {arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs] for arm, runs in arms.items()}
+        lines = {
+            arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs]
+            for arm, runs in arms.items()
+        }
         pictures.append(plots.curves(lines, title))
-    rates = {arm: [[*enumerate(_attacks_by_round(run), 1)] for run in runs] for arm, runs in arms.items()}
-    pictures.append(plots.curves(rates, "attack success on clean-correct renders", "round of renders"))
+    rates = {
+        arm: [[*enumerate(_attacks_by_round(run), 1)] for run in runs] for arm, runs in arms.items()
+    }
+    pictures.append(
+        plots.curves(rates, "attack success on clean-correct renders", "round of renders")
+    )
     return [picture for picture in pictures if picture]
 
 
@@ -117,22 +147,32 @@ def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | Non
     """The attack's success in each round of renders of a run, or in each epoch of one with a round per epoch."""
     rates = []
     for line in epochs:
-        rounds = sorted({int(name[6 : name.index("/")]) for name in line if name.startswith("round_")})
-        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [attack_success(line, "augment/")]
+        rounds = sorted(
+            {int(name[6 : name.index("/")]) for name in line if name.startswith("round_")}
+        )
+        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [
+            attack_success(line, "augment/")
+        ]
     return rates
 
 
 def _pictures(run: RunSummary, name: str, title: str) -> list[Picture]:
     """A run's images renders/NAME_EPOCH.png of its first, middle and last epoch with any."""
-    numbers = [(path.stem.rpartition("_")[2], path) for path in (run.folder / "renders").glob(f"{name}_*.png")]
+    numbers = [
+        (path.stem.rpartition("_")[2], path)
+        for path in (run.folder / "renders").glob(f"{name}_*.png")
+    ]
     files = evenly(sorted((int(number), path) for number, path in numbers if number.isdigit()), 3)
-    images = [plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}") for n, path in files]
+    images = [
+        plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}")
+        for n, path in files
+    ]
     return [image for pictures in images for image in pictures]
 
 
 def _title(arms: Arms) -> str:
     evaluations = [scores for group in arms.values() for scores in group[0].photographs.values()]
-    labels = {label for scores in evaluations for label in label_names(scores["label"])}
+    labels = {label for scores in evaluations for label in scores.labels}
     names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
     return f"{' and '.join(sorted(labels)) or 'Networks'}, trained with renders: {', '.join(names)}"
 
@@ -141,7 +181,9 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     """How the test accuracy of each arm compares with that of the network that it began with."""
     sentences = []
     for arm, group in arms.items():
-        if bases := [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]:
+        if bases := [
+            run.before.accuracy for run in group if run.before and run.before.accuracy is not None
+        ]:
             after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
             images = group[0].config.get("test_images", "the test images")
             sentences.append(f"{arm}: accuracy went from {before:.1%} to {after:.1%}, on {images}.")
@@ -149,41 +191,81 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
-    """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
-    paths = {arm: run.folder / name / "contact_sheet.png" for arm, ((run, name), *_) in group.items()}
-    sheets = {arm: plots.from_file(path, f"predictions of {arm} on {title}", SHEET) for arm, path in paths.items()}
+    """Collect what the page shows of scores on the same images.
+
+    Args:
+        title: Title of the images.
+        group: Scored runs of each arm, as `summary.by_images` groups them.
+
+    Returns:
+        Values of the template: plots, tables, sentences, and a contact sheet of
+        each arm.
+    """
+    sheets = {}
+    for arm, (first, *_) in group.items():
+        alt = f"predictions of {arm} on {title}"
+        sheets[arm] = plots.from_file(first.folder / CONTACT_SHEET, alt, SHEET)
     tables = [summary.score_table("", group)]
-    content: dict[str, Any] = {"name": title, "sheets": sheets, "rocs": [], "tables": tables, "sentences": []}
+    rocs: list[Picture | None] = []
+    sentences: list[str] = []
     try:
-        if evaluations := compare.read_evaluations(group):
-            first = next(iter(evaluations.values()))[0]
-            for name in [name for name in first.pools if name == OVERALL or name.startswith(LABEL)]:
-                scores = {arm: [run.pools[name].scores for run in runs] for arm, runs in evaluations.items()}
-                content["rocs"].append(plots.roc(scores, first.pools[name].label))
-            content["sentences"] = _difference_sentences(evaluations, title)
-            tables.append(compare.overall_differences(evaluations))
-            if len(first.pools) > 1:
-                tables.append(compare.group_table(evaluations))
+        evaluations = compare.read_evaluations(group)
+        if evaluations:
+            rocs = _rocs(evaluations)
+            sentences = _difference_sentences(evaluations, title)
+            tables += _evaluation_tables(evaluations)
     except InputError as error:
-        content["sentences"] = [str(error)]
-    content["tables"] = [table.known for table in tables]
-    return content
+        sentences = [str(error)]
+    return {
+        "name": title,
+        "sheets": sheets,
+        "rocs": rocs,
+        "tables": [table.known for table in tables],
+        "sentences": sentences,
+    }
+
+
+def _rocs(arms: compare.Evaluations) -> list[Picture | None]:
+    """Draw the ROC curves of all images and, with several labels, of each label."""
+    first = next(iter(arms.values()))[0]
+    pictures = []
+    for part, pool in first.pools.items():
+        if part.is_overall:
+            scores = {arm: [run.pools[part].scores for run in runs] for arm, runs in arms.items()}
+            pictures.append(plots.roc(scores, pool.label))
+    return pictures
+
+
+def _evaluation_tables(arms: compare.Evaluations) -> list[Table]:
+    """Make the tables of differences and, if there are any, of labels and sources."""
+    tables = [compare.overall_differences(arms)]
+    first = next(iter(arms.values()))[0]
+    if len(first.pools) > 1:
+        tables.append(compare.group_table(arms))
+    return tables
 
 
 def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
-    """How far each of HEADLINES is from that of the network that an arm is compared with."""
+    """Say how far each of HEADLINES is from that of the network that an arm is compared with."""
     sentences = []
     for arm, base in compare.pairs_of(arms):
         parts = []
         for name in HEADLINES:
-            if result := compare.difference(arms[arm], arms[base], OVERALL, name):
-                doubtful = result["low"] <= 0 <= result["high"]
-                difference = "no difference is shown" if doubtful else format_interval(result, "+")
-                before, after = result["means"]
-                parts.append(f"{metric_title(name)} {before:.2f} and {after:.2f} ({difference})")
+            result = compare.difference(arms[arm], arms[base], compare.ALL, name)
+            if result is not None:
+                parts.append(f"{metric_title(name)} {_compared(result)}")
         if parts:
             sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
     return sentences
+
+
+def _compared(result: compare.Difference) -> str:
+    """Write both means and, if the interval does not hold zero, their difference."""
+    assert result.low is not None and result.high is not None
+    text = format_interval(result, sign="+")
+    if result.low <= 0 <= result.high:
+        text = "no difference is shown"
+    return f"{result.before:.2f} and {result.after:.2f} ({text})"
 
 
 def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:
@@ -196,5 +278,9 @@ def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack["folder"].parent / CONFIG)
-    checks = [(key.replace("_", " "), value) for key, value in attack["checks"].items() if not isinstance(value, dict)]
+    checks = [
+        (key.replace("_", " "), value)
+        for key, value in attack["checks"].items()
+        if not isinstance(value, dict)
+    ]
     return {**attack, "checks": checks, "images": images, "config": config}

@@ -14,7 +14,7 @@ from train.photographs.metrics import (
     REPLICATES,
     auc_and_recalls,
     bootstrap,
-    interval,
+    estimate,
     replicate_difference,
     thresholds,
 )
@@ -61,7 +61,8 @@ def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_i
     statistic = partial(auc_and_recalls, *(group.repeat(images) for group in scores))
     objects = [np.arange(len(group)).repeat(images) for group in scores]
     first, again = (bootstrap(statistic, *objects)[RANKED.index(name)] for _ in range(2))
-    assert tuple(interval(first).values()) == pytest.approx(tuple(reference), rel=0, abs=0.02)
+    ends = estimate(0.5, first)
+    assert (ends.low, ends.high) == pytest.approx(tuple(reference), rel=0, abs=0.02)
     np.testing.assert_array_equal(first, again)
 
 

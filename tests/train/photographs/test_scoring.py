@@ -2,6 +2,7 @@ import csv
 import json
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,8 +14,15 @@ from scipy.special import logsumexp, softmax
 from renderer.errors import InputError
 from train.photographs.folder import Photograph
 from train.photographs.metrics import AT_THRESHOLD, METRICS
-from train.photographs.predictions import Prediction, read_predictions, write_predictions
-from train.photographs.scoring import choose_operating_points, evaluate_photographs, format_summary
+from train.photographs.predictions import Prediction, Predictor, read_predictions, write_predictions
+from train.photographs.scoring import (
+    Scores,
+    choose_operating_points,
+    evaluate_photographs,
+    format_scores,
+    score,
+    write,
+)
 from train.photographs.sheet import FRAME, IMAGE
 from train.tables import fraction
 
@@ -35,7 +43,7 @@ class TableModel(torch.nn.Module):
 def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
     """Makes a folder of the named images and a model that gives the i-th of them the i-th row of logits.
 
-    Returns the model, its classes and the folder, in the order in which `evaluate_photographs` takes them.
+    Returns the model, its classes and the folder, in the order in which `evaluate` takes them.
     """
 
     def make(names: Sequence[str], logits: Sequence, classes: list[str]) -> tuple[TableModel, list[str], Path]:
@@ -81,7 +89,27 @@ def no_figure(monkeypatch) -> None:
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_: None)
 
 
-def score(rows: list[tuple[str, str]]) -> dict[str, object]:
+def scored(model, classes, folder, label, out: Path, skip_unreadable: bool = False, **options) -> Scores:
+    """The scores that a command writes into `out`; with options of `score` as pnb-evaluate, without as pnb-train."""
+    predictor = Predictor(model, classes)
+    if not options:
+        return evaluate_photographs(predictor, folder, label, out, skip_unreadable)
+    scores = score(predictor.predict(folder, label, skip_unreadable), **options)
+    write(scores, out)
+    return scores
+
+
+def evaluate(*arguments, **options) -> dict:
+    """The summary of `scored`, as it is in summary.json."""
+    return json.loads(json.dumps(scored(*arguments, **options).to_summary()))
+
+
+def wilson(hits: int, n: int) -> dict[str, float | None]:
+    """A fraction as summary.json has it."""
+    return asdict(fraction(hits, n))
+
+
+def counted(rows: list[tuple[str, str]]) -> dict[str, object]:
     """The metrics of photographs from their names and their classes in order, by counting and by comparing all pairs.
 
     The log-odds of orange depend on its place alone.
@@ -92,30 +120,30 @@ def score(rows: list[tuple[str, str]]) -> dict[str, object]:
     )
     pairs = [(place < other) + (place == other) / 2 for place in oranges for other in others]
     return {
-        "recall": fraction(oranges.count(0), len(oranges)),
-        "top5": fraction(sum(place < 5 for place in oranges), len(oranges)),
-        "false_positive_rate": fraction(others.count(0), len(others)),
+        "recall": wilson(oranges.count(0), len(oranges)),
+        "top5": wilson(sum(place < 5 for place in oranges), len(oranges)),
+        "false_positive_rate": wilson(others.count(0), len(others)),
         "auc": sum(pairs) / len(pairs) if pairs else None,
     }
 
 
 def test_every_metric_of_a_known_model_is_right(fruit, tmp_path):
-    summary = evaluate_photographs(*fruit, "orange", tmp_path / "new" / "out")
+    summary = evaluate(*fruit, "orange", tmp_path / "new" / "out")
     assert json.loads((tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")) == summary
     assert summary["n"] == {"photographs": 10, "positives": 5, "negatives": 5, "unreadable": 0, "left_out": 0}
     assert {source: row["n"] for source, row in summary["by_source"].items()} == {"lab": 2, "shop": 2, "street": 4}
     for source, metrics in {None: summary, **summary["by_source"]}.items():
-        expected = score([(name, order) for name, other, order in FRUIT if source in (None, other)])
+        expected = counted([(name, order) for name, other, order in FRUIT if source in (None, other)])
         auc = metrics["auc"]
         assert auc["value"] == pytest.approx(expected.pop("auc"), abs=1e-12)
         assert auc["value"] is None or auc["low"] <= auc["value"] <= auc["high"]
         assert {name: metrics[name] for name in expected} == expected
     assert summary["by_class"]["orange"]["most_common_wrong"] == {"pear": 2, "apple": 1, "plum": 1}
     assert summary["by_class"]["other_lemon"] == {
-        "n": 2, "recall": fraction(0, 0), "top5": fraction(0, 0), "predicted_label": fraction(1, 2),
+        "n": 2, "recall": wilson(0, 0), "top5": wilson(0, 0), "predicted_label": wilson(1, 2),
         "most_common_wrong": {"lime": 1, "orange": 1},
     }  # fmt: skip
-    assert summary["by_class"]["pear"]["recall"] == fraction(1, 3)
+    assert summary["by_class"]["pear"]["recall"] == wilson(1, 3)
 
 
 def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_path):
@@ -124,7 +152,7 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
     header, *rows = (folder / "photos.csv").read_text().splitlines()
     paired = [f"{row},{'shop' if row.startswith('orange/a') else ''}" for row in rows]
     (folder / "photos.csv").write_text("\n".join([f"{header},hard_negatives", *paired]))
-    summary = evaluate_photographs(*fruit, "orange", tmp_path / "out")
+    summary = evaluate(*fruit, "orange", tmp_path / "out")
     lab = summary["by_source"]["lab"]
     assert (lab["auc"]["value"], lab["auc"]["positives"], lab["auc"]["negatives"]) == (0.5, 2, 2)
     assert lab["false_positive_rate"]["n"] == 0  # its own
@@ -138,42 +166,43 @@ def test_a_mesh_is_ranked_against_all_images_of_the_other_kind_and_objects_count
     header, *rows = (folder / "photos.csv").read_text().splitlines()
     rows = [f"{row},{meshes.get(row.split('/')[1][0], '')}" for row in rows]
     (folder / "photos.csv").write_text("\n".join([f"{header},mesh", *rows]))
-    summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", by="mesh")
+    scores = scored(*fruit, "orange", tmp_path / "out", by="mesh")
+    summary = scores.to_summary()
     assert (summary["auc"]["positive_objects"], summary["auc"]["negative_objects"]) == (4, 4)
     for mesh, metrics in summary["by_mesh"].items():
         of_mesh = [(name, order) for name, _, order in FRUIT if meshes.get(name.split("/")[1][0]) == mesh]
         other = [(name, order) for name, _, order in FRUIT if name.startswith("orange/") == (mesh == "k")]
-        assert metrics["auc"]["value"] == pytest.approx(score(of_mesh + other)["auc"], abs=1e-12)
-        assert metrics["recall"] == score(of_mesh)["recall"]
-    assert list(summary["by_mesh"]) == ["k", "m", "n"] and "objects and images" in format_summary(summary)
+        assert metrics["auc"]["value"] == pytest.approx(counted(of_mesh + other)["auc"], abs=1e-12)
+        assert metrics["recall"] == counted(of_mesh)["recall"]
+    assert list(summary["by_mesh"]) == ["k", "m", "n"] and "objects and images" in format_scores(scores)
 
 
 @pytest.mark.parametrize(("rate", "recall", "false_positives"), [(0.4, 1, 2), (0.39, 0, 0), (0.8, 3, 4), (0.6, 1, 2)])
 def test_an_operating_point_is_the_lowest_threshold_within_its_rate(fruit, tmp_path, rate, recall, false_positives):
     """Of the ranks of orange, 1, 2, 6, 5, 2 and of the others 1, 5, 2, 1, 2: those that tie with it lie below."""
-    _, _, folder = fruit
-    (point,) = choose_operating_points(*fruit, "orange", rate, 32, False, "cpu")
+    model, classes, folder = fruit
+    (point,) = choose_operating_points(Predictor(model, classes), folder, "orange", rate)
     for in_sample in (True, False):
-        summary = evaluate_photographs(*fruit, "orange", tmp_path / "out", points=[point])
-        assert summary["recall_at_threshold"] == fraction(recall, 5)
-        assert summary["false_positive_rate_at_threshold"] == fraction(false_positives, 5)
+        summary = evaluate(*fruit, "orange", tmp_path / "out", points=[point])
+        assert summary["recall_at_threshold"] == wilson(recall, 5)
+        assert summary["false_positive_rate_at_threshold"] == wilson(false_positives, 5)
         assert summary["operating_point"] == vars(point) | {"in_sample": in_sample}
         Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")  # another image of the same prediction
     with pytest.raises(InputError, match=r"^calibrate=.* has 5 images of other things .* at least 10 for .*=0\.1$"):
-        choose_operating_points(*fruit, "orange", 0.1, 32, False, "cpu")
+        choose_operating_points(Predictor(model, classes), folder, "orange", 0.1)
 
 
 def test_several_classes_are_scored_each_as_alone_and_pooled_over_all_pairs(fruit, tmp_path):
     """Pooled, an image counts once for each class, with the log-odds of that class. Oranges a and c are a mesh."""
-    _, _, folder = fruit
+    model, classes, folder = fruit
     header, *rows = (folder / "photos.csv").read_text().splitlines()
     rows = [f"{row},{'m' if row[7] in 'ac' else ''}" for row in rows]
     (folder / "photos.csv").write_text("\n".join([f"{header},mesh", *rows]))
-    points = choose_operating_points(*fruit, ["pear", "orange"], 0.4, 32, False, "cpu")
-    both = evaluate_photographs(*fruit, ["pear", "orange"], tmp_path / "both", by="mesh", points=points)
+    points = choose_operating_points(Predictor(model, classes), folder, ["pear", "orange"], 0.4)
+    both = evaluate(*fruit, ["pear", "orange"], tmp_path / "both", by="mesh", points=points)
     for point in points:
-        alone = evaluate_photographs(*fruit, point.label, tmp_path / point.label, points=[point])
-        (own,) = choose_operating_points(*fruit, point.label, 0.4, 32, False, "cpu")
+        alone = evaluate(*fruit, point.label, tmp_path / point.label, points=[point])
+        (own,) = choose_operating_points(Predictor(model, classes), folder, point.label, 0.4)
         assert (own.threshold, own.negatives) == (point.threshold, point.negatives)
         part = both["by_label"][point.label]
         assert part.pop("n") == 10 and part == {name: alone[name] for name in part} and {*METRICS[:2], "auc"} < {*part}
@@ -203,7 +232,7 @@ def test_several_classes_are_scored_each_as_alone_and_pooled_over_all_pairs(frui
     assert both["by_source"]["shop"]["auc"]["value"] == pytest.approx(shop, abs=1e-12)
     first = [(name, order.split()[0]) for name, _, order in FRUIT]
     wrong = [best for name, best in first for label in both["label"] if not name.startswith(label) and best == label]
-    assert both["recall"] == fraction(2, 8) and both["false_positive_rate"] == fraction(len(wrong), 12)
+    assert both["recall"] == wilson(2, 8) and both["false_positive_rate"] == wilson(len(wrong), 12)
     assert (both["n"]["photographs"], both["n"]["positives"], both["n"]["negatives"]) == (10, 8, 12)
     hits = [sum(part[name]["hits"] for part in both["by_label"].values()) for name in AT_THRESHOLD]
     assert [both[name]["hits"] for name in AT_THRESHOLD] == hits
@@ -216,7 +245,7 @@ def test_several_classes_are_scored_each_as_alone_and_pooled_over_all_pairs(frui
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
     logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3], [0, -4000, -5000]]
     names = [f"{index}.png" for index in range(4)]
-    evaluate_photographs(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
+    evaluate(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
     predictions = read_predictions(tmp_path / "predictions.csv", "b")
     expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3]), -4000]
     assert [prediction.log_odds for prediction in predictions] == pytest.approx(expected, rel=1e-15)
@@ -226,7 +255,7 @@ def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(k
 def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(known_model, tmp_path):
     names = [f"{label}/{index}.png" for label in ("orange", "other_x", "plum") for index in range(4)]
     logits = np.random.default_rng(0).normal(0, 3, (len(names), len(FRUIT_CLASSES))).astype(np.float32)
-    evaluate_photographs(*known_model(names, logits, FRUIT_CLASSES), "orange", tmp_path)
+    evaluate(*known_model(names, logits, FRUIT_CLASSES), "orange", tmp_path)
     predictions = read_predictions(tmp_path / "predictions.csv", "orange")
     for name, prediction, scores in zip(names, predictions, logits.astype(float), strict=True):
         probabilities = dict(zip(FRUIT_CLASSES, softmax(scores), strict=True))
@@ -244,7 +273,7 @@ def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(k
 def test_a_tie_of_all_classes_goes_to_the_first_class(known_model, tmp_path, place):
     classes = [f"class {index}" for index in range(300)]  # sorts that are not stable show it at this size
     undecided = known_model(["a.png"], np.zeros((1, 300)), classes)
-    summary = evaluate_photographs(*undecided, classes[place], tmp_path)
+    summary = evaluate(*undecided, classes[place], tmp_path)
     assert (summary["recall"]["value"], summary["top5"]["value"]) == (place == 0, place < 5)
 
 
@@ -253,11 +282,12 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(fruit, tmp_pat
     (folder / "orange" / "broken.jpg").touch()
     (folder / "orange" / "photo.HEIC").touch()
     with pytest.raises(InputError, match="1 of 11 "):
-        evaluate_photographs(*fruit, "orange", tmp_path)
-    summary = evaluate_photographs(*fruit, "orange", tmp_path, skip_unreadable=True)
+        evaluate(*fruit, "orange", tmp_path)
+    scores = scored(*fruit, "orange", tmp_path, skip_unreadable=True)
+    summary = scores.to_summary()
     assert summary["unreadable"] == ["orange/broken.jpg"]
     assert summary["n"] == {"photographs": 10, "positives": 5, "negatives": 5, "unreadable": 1, "left_out": 1}
-    assert all(name in format_summary(summary) for name in ("orange/broken.jpg", "orange/photo.HEIC"))
+    assert all(name in format_scores(scores) for name in ("orange/broken.jpg", "orange/photo.HEIC"))
 
 
 def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(fruit, tmp_path):
@@ -266,7 +296,7 @@ def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(fru
     model.register_forward_pre_hook(lambda module, _: pytest.fail() if any(part.training for part in model) else None)
     model.register_forward_hook(lambda _, images, result: result.requires_grad or fruit_model(*images))
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    evaluate_photographs(model, classes, folder, "orange", tmp_path)
+    evaluate(model, classes, folder, "orange", tmp_path)
     assert [part.training for part in (model, *model)] == [True, True, False]
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
@@ -278,7 +308,7 @@ def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(fru
 def test_a_model_that_does_not_fit_is_refused(fruit, tmp_path, logits, message):
     _, classes, folder = fruit
     with pytest.raises(InputError, match=message):
-        evaluate_photographs(lambda x: logits.expand(len(x), -1), classes, folder, "orange", tmp_path / "out")
+        evaluate(lambda x: logits.expand(len(x), -1), classes, folder, "orange", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -288,9 +318,9 @@ def test_scores_are_never_written_among_the_photographs(fruit, tmp_path, out):
     (tmp_path / "link").symlink_to(folder)
     before = sorted(folder.rglob("*"))
     with pytest.raises(InputError, match=r"^out=.* lies inside the photographs' folder: choose another$"):
-        evaluate_photographs(*fruit, "orange", tmp_path / out)
+        evaluate(*fruit, "orange", tmp_path / out)
     assert sorted(folder.rglob("*")) == before
-    evaluate_photographs(*fruit, "orange", tmp_path / "photos_scored")  # beside them is not among them
+    evaluate(*fruit, "orange", tmp_path / "photos_scored")  # beside them is not among them
 
 
 PREDICTIONS = [
@@ -325,7 +355,7 @@ def count_tiles(sheet: Image.Image) -> list[int]:
 
 
 def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_path):
-    evaluate_photographs(*fruit, "orange", tmp_path)
+    evaluate(*fruit, "orange", tmp_path)
     with Image.open(tmp_path / "contact_sheet.png") as sheet:
         assert count_tiles(sheet) == [1, 4, 2]
 
@@ -334,7 +364,7 @@ def test_the_contact_sheet_shows_at_most_40_images_evenly_by_probability(known_m
     """Of 101 true positives 40 are shown, image 100 being the surest and image 0 the least."""
     names = [f"{index:03}.png" for index in range(101)]
     table = np.stack([np.arange(1, 102), np.zeros(101)], axis=1) / 20
-    evaluate_photographs(*known_model(names, table, ["orange", "pear"]), "orange", tmp_path)
+    evaluate(*known_model(names, table, ["orange", "pear"]), "orange", tmp_path)
     with Image.open(tmp_path / "contact_sheet.png") as sheet:
         assert count_tiles(sheet) == [40, 0, 0]
         red, green, blue = np.moveaxis(np.asarray(sheet).astype(int), 2, 0)
@@ -345,7 +375,7 @@ def test_the_contact_sheet_shows_at_most_40_images_evenly_by_probability(known_m
 
 def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_classes(fruit, tmp_path):
     """Of the ranks of orange, 1, 2, 6, 5, 2 and of the others 1, 5, 2, 1, 2; of the street 6, 2 and 1, 5."""
-    evaluate_photographs(*fruit, "orange", tmp_path)
+    evaluate(*fruit, "orange", tmp_path)
     curves = defaultdict(list)
     with (tmp_path / "roc.csv").open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
@@ -360,7 +390,7 @@ def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both
 
 def test_a_folder_without_negatives_has_an_empty_table_and_figure(known_model, tmp_path, monkeypatch):
     monkeypatch.undo()
-    evaluate_photographs(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)
+    evaluate(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)
     assert (tmp_path / "roc.csv").read_text() == "source,false_positive_rate,recall,threshold\n"
     with Image.open(tmp_path / "roc.png") as image:
         image.load()

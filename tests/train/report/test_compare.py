@@ -40,7 +40,7 @@ def scored_run(tmp_path, made_up_run, monkeypatch):
         ]
         predictions = [prediction(index, *kind) for index, kind in enumerate(kinds)]
         images = {"images": str([item.photograph for item in predictions]), "label": "orange"}
-        summaries = {name: pool(predictions).metrics | images}
+        summaries = {name: pool(predictions).metrics.to_summary() | images}
         folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
         write_predictions(folder / name / "predictions.csv", predictions)
         return folder

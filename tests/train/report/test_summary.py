@@ -1,3 +1,5 @@
+from dataclasses import asdict
+
 import pytest
 
 from renderer.errors import InputError
@@ -19,7 +21,7 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     settings = {2: ["seed=0"], 4: ["seed=1"], 9: ["seed=2"], 5: ["seed=0", "train.epochs=9"]}
     runs = []
     for hits, overrides in settings.items():
-        scores = {"recall": fraction(hits, 10), "false_positive_rate": fraction(1, 10)}
+        scores = {"recall": asdict(fraction(hits, 10)), "false_positive_rate": asdict(fraction(1, 10))}
         summary = {"images": "same", "label": "orange", **scores}
         runs.append(summarize(made_up_run(tmp_path / str(hits), "random", {"lab": summary}, *overrides)))
     tables = read_markdown(format_table(runs))
