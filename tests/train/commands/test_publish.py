@@ -86,5 +86,5 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
 def test_each_pretrained_network_says_what_it_left_out_and_has_scores_on_one_set_of_photographs(name):
     architecture = load_selected(Path("pretrained", name))[1]["architecture"]
     assert architecture["validation"]["fraction"] == 0.02
-    images = {summarize(Path("pretrained", other)).photographs["photographs"]["images"] for other in ("none", name)}
+    images = {summarize(Path("pretrained", other)).photographs["photographs"].images for other in ("none", name)}
     assert len(images) == 1
