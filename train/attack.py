@@ -1,14 +1,11 @@
-"""The attack command: its settings, which are the schema of conf/attack.yaml, the run over meshes, and its output."""
+"""The attack command: its settings, which are the schema of conf/attack.yaml, and the run over meshes."""
 
-import csv
-import io
-import json
 import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +23,7 @@ from augment.attacks.attack import (
     predictions,
 )
 from augment.attacks.descent import Goal
-from augment.attacks.evaluate import check, require_transferable, success_by_radius, transfer, warnings
+from augment.attacks.evaluate import check, require_transferable, success_by_radius, transfer
 from augment.attacks.files import LINES, require_renderers, save
 from augment.attacks.search import find_scene
 from augment.build import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings, build_scene
@@ -37,18 +34,22 @@ from augment.random_streams import generator
 from augment.scene import Scene
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.io.files import write_whole
 from train.device import choose_device
 from train.errors import writable_folder
+from train.report.attack_tables import (
+    FIGURE,
+    TABLE,
+    TRANSFERS,
+    Sweep,
+    format_attack,
+    format_sweep,
+    write_sweeps,
+    write_transfers,
+)
 from train.results import require_replaceable
 from train.run_folder import sole_writer, write_config
 from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
-from train.tables import Proportion, Table, format_fraction, fraction
 
-TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
-NAMES = {"float": "computed", "reload": "rendered again from the saved files", "mitsuba": "rendered by Mitsuba"}
-METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
-WITHOUT_NOISE = "_without_noise"  # ends the keys of what counts without a sensor's noise
 LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
 
@@ -152,7 +153,7 @@ def run(settings: AttackExperimentSettings) -> None:
     others = load_others(settings, classifier, device)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
-    sweeps: dict[str, list[dict[str, Any]]] = {}
+    sweeps: dict[str, Sweep] = {}
     with sole_writer("out", out):
         _remove_adversaries(out)
         for index, (name, scene, result) in enumerate(attacks(settings, classifier, device, adversary)):
@@ -264,65 +265,6 @@ def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
     return " ".join(shlex.quote(f"scene.{name}={getattr(scene, name)}") for name in changed)
 
 
-def format_attack(
-    name: str, result: AttackResult, checks: Mapping[str, Any] | None, lines: Sequence[Mapping[str, Any]] = ()
-) -> str:
-    """A paragraph on one mesh's attack, without a newline at the end. lines: as `augment.save` returns them."""
-    parameters = "+".join(parameter.name for parameter in result.problem.parameters)
-    steps = result.steps[result.success & ~result.success_before].double()
-    median = f"; median of {steps.median():.0f} steps" if len(steps) else ""
-    heading = f"{name}: {parameters} against {result.classifier.name}"
-    text = [f"{heading}: {_success(result)}{median} ({result.seconds['attack']:.1f} s)"]
-    if checks is not None:
-        without = checks[f"success_by_steps{WITHOUT_NOISE}"]
-        by_steps = ", ".join(
-            f"{_rate_of_both(rate, without[steps], result.settings)} in {steps}"
-            for steps, rate in checks["success_by_steps"].items()
-        )
-        search = checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"]
-        text += [
-            "log-probability of the right class over all views (less a target's): {cost_before:.2f} before, {cost:.2f} "
-            "after; lower in {cost_fell:.0%}, without a gradient at the start in {zero_gradient:.0%}".format(**checks),
-            "random changes of the same size, one for each step, succeed on "
-            f"{_rate_of_both(*search, result.settings)}; attacks of more steps: {by_steps}",
-            *(f"warning: {warning}" for warning in warnings(checks)),
-        ]
-    adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
-    for version in adversaries[0]["versions"] if adversaries else ():
-        numbers = [line["versions"][version] for line in adversaries]
-        as_they_are = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
-        without_noise = f" ({as_they_are} without noise)" if result.settings.sensor_noise else ""
-        by_margin = [line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]]
-        largest = 255 * max(line["largest_difference"] for line in numbers)
-        mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
-        text.append(
-            f"images as {NAMES.get(version, version)}: {sum(line['success'] for line in numbers)} of {len(numbers)} "
-            f"still succeed{without_noise}, {sum(by_margin)} of the {len(by_margin)} with the margin; pixels differ by "
-            f"{mean:.3g}/255 on average, {largest:.3g}/255 at most"
-        )
-    return "\n".join(text)
-
-
-def _rate_of_both(rate: float, without_noise: float, settings: AttackSettings) -> str:
-    """A fraction of successes and, where a sensor's noise counts, that without it."""
-    return f"{rate:.0%}" + (f" ({without_noise:.0%} without noise)" if settings.sensor_noise else "")
-
-
-def _success(result: AttackResult) -> str:
-    """On clean-correct examples, and on their views, with the 95 % Wilson interval."""
-    clean = result.clean_correct
-    rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
-    if rate.n == 0:
-        return f"none of {len(clean)} examples was correct before: there is nothing to count"
-    views, wrong = result.success_in_views[clean], int((~clean).sum())
-    text, by_margin = f"success on {format_fraction(rate)} examples", int(result.success_with_margin[clean].sum())
-    if result.settings.sensor_noise:
-        text += f" with a sensor's noise, {int(result.success_without_noise[clean].sum())} without"
-    text += f", {by_margin} with the margin of {result.settings.margin:g}" if result.settings.margin else ""
-    text += f", {int(views.sum())} of {views.numel()} views" if views.shape[1] > 1 else ""
-    return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
-
-
 def format_reloaded(
     adversary: Adversary, images: Tensor, classifier: Classifier, settings: AttackSettings, seed: int
 ) -> str:
@@ -341,93 +283,3 @@ def format_reloaded(
         f"values differ from the saved image's by {difference:.3g}/255 at most"
         for view, (name, confidence, steady, difference) in enumerate(rows)
     )
-
-
-def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
-    """Write a line for each result of `augment.transfer`, with the success rate; returns the rates as a table."""
-    lines, rows = [], []
-    for found in transfers:
-        clean = found["clean_correct"]
-        rate = fraction(_count_correct(found["success"], clean), sum(clean))
-        kind = next(iter(found))
-        lines.append(json.dumps({kind: found[kind], **asdict(rate), **found}) + "\n")
-        without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
-        numbers = [f"{rate.n} of {len(clean)}", format_fraction(rate), without_noise]
-        rows.append([f"{kind} {found[kind]}", *map(str, numbers)])
-    write_whole(path, "".join(lines))
-    header = ["adversaries shown to", "correct before", "success", "without noise"]
-    return str(Table("", header, rows))
-
-
-def _count_correct(success: Sequence[bool], clean: Sequence[bool]) -> int:
-    """How many of the examples that were correct before are a success."""
-    return sum(hit for hit, correct in zip(success, clean, strict=True) if correct)
-
-
-def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
-    """A result of `augment.success_by_radius`, a line per radius."""
-    rows = []
-    for row in sweep:
-        radii = " + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())
-        counts = (format_fraction(_rate(row[method])) for method in METHODS)
-        without_noise = (str(int(row[method + WITHOUT_NOISE].sum())) for method in METHODS)
-        cells = [cell for pair in zip(counts, without_noise, strict=True) for cell in pair]
-        rows.append([radii, *cells])
-    titles = [title for method in METHODS.values() for title in (method, "without noise")]
-    return str(Table("", ["radius", *titles], rows))
-
-
-def _rate(success: Tensor) -> Proportion:
-    return fraction(int(success.sum()), len(success))
-
-
-def write_sweeps(sweeps: Mapping[str, Sequence[Mapping[str, Any]]], norms: Mapping[str, str], out: Path) -> None:
-    """sweep.csv, a line per mesh (and all of several), method (also without noise) and radius, with the success rate on
-    examples that were correct before and its 95 % Wilson interval; and sweep.png, of the last mesh or of all. norms: by
-    parameter."""
-    methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
-    if len(sweeps) > 1:
-        pooled = [
-            {"radii": rows[0]["radii"], **{method: torch.cat([row[method] for row in rows]) for method in methods}}
-            for rows in zip(*sweeps.values(), strict=True)
-        ]
-        sweeps = {**sweeps, "all": pooled}
-    records = [
-        {"mesh": mesh, "method": method, **row["radii"], **asdict(_rate(row[method]))}
-        for mesh, sweep in sweeps.items()
-        for method in methods
-        for row in sweep
-    ]
-    text = io.StringIO()
-    table = csv.DictWriter(text, list(records[0]))
-    table.writeheader()
-    table.writerows(records)
-    write_whole(out / TABLE, text.getvalue())
-    _draw([record for record in records if record["mesh"] == records[-1]["mesh"] and record["n"]], norms, out / FIGURE)
-
-
-def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    from train.report.plots import COLORS, LINES, MARKERS
-
-    figure = Figure(figsize=(5, 3.8), layout="constrained")
-    axes, (first, *others) = figure.subplots(), norms
-    for (method, name), color, line, marker in zip(METHODS.items(), COLORS, LINES[1::-1], MARKERS, strict=False):
-        rows = [record for record in records if record["method"] == method]
-        radii, value, low, high = ([row[key] for row in rows] for key in (first, "value", "low", "high"))
-        axes.plot(radii, value, color=color, linestyle=line, marker=marker, label=name)
-        axes.fill_between(radii, low, high, color=color, alpha=0.15)
-    proportional = f"; {' and '.join(others)} in proportion" if others else ""
-    axes.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate")
-    axes.set_xlabel(f"{norms[first]} radius of {first}{proportional}")
-    ticks = sorted({record[first] for record in records})
-    axes.set_xticks(ticks, [f"{radius:g}" for radius in ticks])
-    axes.set_xticks([], minor=True)
-    axes.spines[["top", "right"]].set_visible(False)
-    if records:
-        axes.set_title(f"{records[0]['n']} examples correct before, 95 % intervals", fontsize=10)
-        figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    image = io.BytesIO()
-    figure.savefig(image, dpi=150)
-    write_whole(path, image.getbuffer())

@@ -15,7 +15,8 @@ from renderer.errors import InputError
 from renderer.light.presets import probe
 from renderer.rasterizer import opengl
 from tests.runs import loaded_run
-from train.attack import AttackExperimentSettings, attacks, format_attack, overrides
+from train.attack import AttackExperimentSettings, attacks, overrides
+from train.report.attack_tables import format_attack
 from train.settings import compose, read_settings
 
 CLASSES = ("orange", "lime", "sky")

@@ -1,0 +1,275 @@
+"""Text, tables and the figure of an attack."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from augment.attacks.attack import AttackResult
+from augment.attacks.evaluate import warnings
+from renderer.io.files import write_whole
+from train.report.plots import COLORS, LINES, MARKERS
+from train.tables import Proportion, Table, format_fraction, fraction
+
+TRANSFERS = "transfer.jsonl"
+TABLE = "sweep.csv"
+FIGURE = "sweep.png"
+# How the images of each version of an adversary were made.
+VERSIONS = {
+    "float": "computed",
+    "reload": "rendered again from the saved files",
+    "mitsuba": "rendered by Mitsuba",
+}
+# Titles of the methods that are compared at each radius.
+METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
+# End of the names of what counts without a sensor's noise.
+WITHOUT_NOISE = "_without_noise"
+
+# Result of `augment.success_by_radius`: at each radius, whether each method
+# succeeds on each example.
+Sweep = Sequence[Mapping[str, Any]]
+
+
+def format_attack(
+    name: str,
+    result: AttackResult,
+    checks: Mapping[str, Any] | None,
+    lines: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """Write what came of the attack on one mesh.
+
+    Args:
+        name: Name of the mesh.
+        result: Result of `augment.attack`.
+        checks: Result of `augment.check`. None if nothing was checked.
+        lines: Lines of attack.jsonl, as `augment.save` returns them.
+
+    Returns:
+        Lines without a newline at the end.
+    """
+    has_noise = bool(result.settings.sensor_noise)
+    text = [_heading(name, result)]
+    if checks is not None:
+        text += _check_lines(checks, has_noise)
+    adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
+    if adversaries:
+        for version in adversaries[0]["versions"]:
+            text.append(_version_line(version, adversaries, has_noise))
+    return "\n".join(text)
+
+
+def _heading(name: str, result: AttackResult) -> str:
+    """Say what was attacked, and how often and how fast with success."""
+    parameters = "+".join(parameter.name for parameter in result.problem.parameters)
+    heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
+    steps = result.steps[result.success & ~result.success_before].double()
+    if len(steps):
+        heading += f"; median of {steps.median():.0f} steps"
+    return f"{heading} ({result.seconds['attack']:.1f} s)"
+
+
+def _success(result: AttackResult) -> str:
+    """Count the successes on clean-correct examples and on their views."""
+    clean = result.clean_correct
+    rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
+    if rate.n == 0:
+        return f"none of {len(clean)} examples was correct before: there is nothing to count"
+    text = f"success on {format_fraction(rate)} examples"
+    if result.settings.sensor_noise:
+        without_noise = int(result.success_without_noise[clean].sum())
+        text += f" with a sensor's noise, {without_noise} without"
+    margin = result.settings.margin
+    if margin:
+        text += f", {int(result.success_with_margin[clean].sum())} with the margin of {margin:g}"
+    views = result.success_in_views[clean]
+    if views.shape[1] > 1:
+        text += f", {int(views.sum())} of {views.numel()} views"
+    wrong = int((~clean).sum())
+    if wrong:
+        text += f"; {wrong} wrong before, which do not count"
+    return text
+
+
+def _check_lines(checks: Mapping[str, Any], has_noise: bool) -> list[str]:
+    """Say what the checks of an attack found."""
+    rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
+    rates = []
+    for steps, rate in checks["success_by_steps"].items():
+        rates.append(f"{_both_rates(rate, rates_without_noise[steps], has_noise)} in {steps}")
+    search = _both_rates(
+        checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise
+    )
+    return [
+        "log-probability of the right class over all views (less a target's): "
+        f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
+        f"lower in {checks['cost_fell']:.0%}, "
+        f"without a gradient at the start in {checks['zero_gradient']:.0%}",
+        f"random changes of the same size, one for each step, succeed on {search}; "
+        f"attacks of more steps: {', '.join(rates)}",
+        *(f"warning: {warning}" for warning in warnings(checks)),
+    ]
+
+
+def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
+    """Write a rate of success and, if noise counts, that without it."""
+    return f"{rate:.0%} ({without_noise:.0%} without noise)" if has_noise else f"{rate:.0%}"
+
+
+def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
+    """Say how often adversaries still succeed in another version of their images."""
+    numbers = [line["versions"][version] for line in adversaries]
+    success = sum(line["success"] for line in numbers)
+    without_noise = ""
+    if has_noise:
+        count = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
+        without_noise = f" ({count} without noise)"
+    by_margin = [
+        line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]
+    ]
+    largest = 255 * max(line["largest_difference"] for line in numbers)
+    mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
+    return (
+        f"images as {VERSIONS.get(version, version)}: "
+        f"{success} of {len(numbers)} still succeed{without_noise}, "
+        f"{sum(by_margin)} of the {len(by_margin)} with the margin; "
+        f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+    )
+
+
+def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
+    """Write how often adversaries succeed elsewhere.
+
+    Args:
+        transfers: Results of `augment.transfer`.
+        path: File, which gets a line of JSON for each result.
+
+    Returns:
+        Table of the rates of success.
+    """
+    lines = []
+    rows = []
+    for found in transfers:
+        clean = found["clean_correct"]
+        rate = fraction(_count_correct(found["success"], clean), sum(clean))
+        # The first entry says where the adversaries are shown.
+        kind = next(iter(found))
+        entry = {kind: found[kind], **asdict(rate), **found}
+        lines.append(json.dumps(entry) + "\n")
+        without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
+        correct = f"{rate.n} of {len(clean)}"
+        rows.append([f"{kind} {found[kind]}", correct, format_fraction(rate), str(without_noise)])
+    write_whole(path, "".join(lines))
+    header = ["adversaries shown to", "correct before", "success", "without noise"]
+    return str(Table("", header, rows))
+
+
+def _count_correct(success: Sequence[bool], clean: Sequence[bool]) -> int:
+    """Count the successes on examples that were correct before."""
+    return sum(hit for hit, correct in zip(success, clean, strict=True) if correct)
+
+
+def format_sweep(sweep: Sweep) -> str:
+    """Write the success at each radius as a table.
+
+    Args:
+        sweep: Result of `augment.success_by_radius`.
+
+    Returns:
+        Table with a row for each radius.
+    """
+    rows = []
+    for row in sweep:
+        cells = [" + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())]
+        for method in METHODS:
+            cells.append(format_fraction(_rate(row[method])))
+            cells.append(str(int(row[method + WITHOUT_NOISE].sum())))
+        rows.append(cells)
+    header = ["radius"]
+    for title in METHODS.values():
+        header += [title, "without noise"]
+    return str(Table("", header, rows))
+
+
+def _rate(success: Tensor) -> Proportion:
+    """Compute the fraction of examples (N,) on which an attack succeeds."""
+    return fraction(int(success.sum()), len(success))
+
+
+def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Path) -> None:
+    """Write the success at each radius as a table, sweep.csv, and as a figure, sweep.png.
+
+    The table has a row for each mesh (and all of several), method (also without
+    noise) and radius. It has the rate of success on examples that were correct
+    before, with its 95% Wilson interval. The figure shows the last mesh, or all
+    of several.
+
+    Args:
+        sweeps: Result of `augment.success_by_radius` for each mesh.
+        norms: Norm of the radius of each parameter.
+        out: Folder that the files are written to.
+    """
+    methods = [method + end for end in ("", WITHOUT_NOISE) for method in METHODS]
+    if len(sweeps) > 1:
+        sweeps = {**sweeps, "all": _pool(sweeps, methods)}
+    records = []
+    for mesh, sweep in sweeps.items():
+        for method in methods:
+            for row in sweep:
+                rate = asdict(_rate(row[method]))
+                records.append({"mesh": mesh, "method": method, **row["radii"], **rate})
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(records[0]))
+    table.writeheader()
+    table.writerows(records)
+    write_whole(out / TABLE, text.getvalue())
+    last_mesh = records[-1]["mesh"]
+    drawn = [record for record in records if record["mesh"] == last_mesh and record["n"]]
+    _draw(drawn, norms, out / FIGURE)
+
+
+def _pool(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
+    """Join the examples of all meshes at each radius."""
+    pooled = []
+    for rows in zip(*sweeps.values(), strict=True):
+        success = {method: torch.cat([row[method] for row in rows]) for method in methods}
+        pooled.append({"radii": rows[0]["radii"], **success})
+    return pooled
+
+
+def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
+    """Draw the rate of success of each method against the radius."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 3.8), layout="constrained")
+    axes = figure.subplots()
+    first, *others = norms
+    # The adversarial line is solid, the other one dashed.
+    styles = zip(COLORS, LINES[1::-1], MARKERS, strict=False)
+    for (method, title), (color, line, marker) in zip(METHODS.items(), styles, strict=False):
+        rows = [record for record in records if record["method"] == method]
+        radii = [row[first] for row in rows]
+        values = [row["value"] for row in rows]
+        axes.plot(radii, values, color=color, linestyle=line, marker=marker, label=title)
+        low = [row["low"] for row in rows]
+        high = [row["high"] for row in rows]
+        axes.fill_between(radii, low, high, color=color, alpha=0.15)
+    proportional = f"; {' and '.join(others)} in proportion" if others else ""
+    axes.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate")
+    axes.set_xlabel(f"{norms[first]} radius of {first}{proportional}")
+    ticks = sorted({record[first] for record in records})
+    axes.set_xticks(ticks, [f"{radius:g}" for radius in ticks])
+    axes.set_xticks([], minor=True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if records:
+        count = records[0]["n"]
+        axes.set_title(f"{count} examples correct before, 95 % intervals", fontsize=10)
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    image = io.BytesIO()
+    figure.savefig(image, dpi=150)
+    write_whole(path, image.getbuffer())
