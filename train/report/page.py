@@ -41,54 +41,78 @@ CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validat
 
 @announced("report")
 def write_report(folders: Sequence[Path], out: Path) -> Path:
-    """Write the page of the runs and attacks in folders and below them, and return its path.
+    """Write the page of the runs and attacks in folders and below them.
 
-    A run or attack that cannot be read is named on the page. InputError as of `find`.
+    Args:
+        folders: Folders of runs and attacks, or folders that hold them.
+        out: Folder that report.html is written to.
+
+    Returns:
+        Path of the page. A run or attack that cannot be read is named on it.
+
+    Raises:
+        InputError: As of `summary.find`.
     """
-    runs, attacks, unfinished = summary.find(folders)
-    arms = summary.arms_of(runs)
+    found = summary.find(folders)
+    arms = summary.arms_of(found.runs)
     drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
-    epochs = {arm: [run.epochs for run in group] for arm, group in drawn.items()}
-    for folder, _, lines in [run for run in unfinished if run[2]][:MOST_UNFINISHED]:
-        epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
     trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
-    read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
-    times = [
-        file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE
-    ]
-    counts = {
-        f"network{'s' * (len(runs) != 1)}": len(runs),
-        "unfinished or unreadable": len(unfinished),
-    }
-    about = ", ".join(
-        f"{count} {name}" for name, count in {**counts, "attacks": len(attacks)}.items() if count
-    )
-    place = ", ".join(map(str, folders)) + (
-        f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else ""
-    )
+    title = "Attacks" if found.attacks else "Unfinished runs"
+    groups = summary.by_images(drawn)
     return write_page(
         out,
         "runs.html.jinja",
-        about=f"{about}; in {place}",
+        about=_about(found, folders),
         arms=arms,
-        title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
+        title=_title(arms) if arms else title,
         lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
         captions=ARMS,
-        unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
-        curves=_curves(epochs),
+        unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
+        curves=_curves(_drawn_epochs(drawn, found.unfinished)),
         seconds=summary.seconds_table(drawn),
-        photographs=[
-            scores_section(title, group) for title, group in summary.by_images(drawn).items()
-        ],
+        photographs=[scores_section(title, group) for title, group in groups.items()],
         renders={arm: _pictures(run, "epoch", "Renders") for arm, run in trained.items()},
         examples={
             arm: _pictures(run, "attacks", "Renders before and after")
             for arm, run in trained.items()
         },
-        attacks=attacks,
-        shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
+        attacks=found.attacks,
+        shown=[_attack(attack) for attack in found.attacks[:MOST_ATTACKS]],
     )
+
+
+def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
+    """Say how much of what is on the page, and where and when it was written."""
+    parts = []
+    if found.runs:
+        plural = "s" if len(found.runs) != 1 else ""
+        parts.append(f"{len(found.runs)} network{plural}")
+    if found.unfinished:
+        parts.append(f"{len(found.unfinished)} unfinished or unreadable")
+    if found.attacks:
+        parts.append(f"{len(found.attacks)} attacks")
+    place = ", ".join(map(str, folders))
+    read = [run.folder for run in found.runs]
+    read += [attack.folder for attack in found.attacks]
+    files = [file for folder in read for file in folder.iterdir() if file.name != PAGE]
+    if files:
+        newest = max(file.stat().st_mtime for file in files)
+        place += f", {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
+    return f"{', '.join(parts)}; in {place}"
+
+
+# The lines of the epochs of each run of each arm.
+Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
+
+
+def _drawn_epochs(drawn: Arms, unfinished: Sequence[summary.Unfinished]) -> Epochs:
+    """Return the epochs that plots show, those of some unfinished runs, too."""
+    epochs = {arm: [run.epochs for run in group] for arm, group in drawn.items()}
+    begun = [run for run in unfinished if run.epochs]
+    for run in begun[:MOST_UNFINISHED]:
+        epochs[f"unfinished: {run.folder.name[-24:]}"] = [run.epochs]
+    return epochs
 
 
 def write_page(out: Path, body: str, **content: Any) -> Path:
@@ -126,20 +150,19 @@ def _command(config: Mapping[str, Any]) -> str:
     return f"cd {shlex.quote(folder)}\n{command}" if folder and command else command
 
 
-def _curves(arms: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> list[Picture]:
+def _curves(arms: Epochs) -> list[Picture]:
+    """Draw accuracies by epoch, and the success of attacks by round of renders."""
     pictures = []
     for name, title in CURVES.items():
-        lines = {
-            arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs]
-            for arm, runs in arms.items()
-        }
+        lines = {}
+        for arm, runs in arms.items():
+            lines[arm] = [[(line["epoch"], line.get(name)) for line in run] for run in runs]
         pictures.append(plots.curves(lines, title))
-    rates = {
-        arm: [[*enumerate(_attacks_by_round(run), 1)] for run in runs] for arm, runs in arms.items()
-    }
-    pictures.append(
-        plots.curves(rates, "attack success on clean-correct renders", "round of renders")
-    )
+    rates = {}
+    for arm, runs in arms.items():
+        rates[arm] = [[*enumerate(_attacks_by_round(run), 1)] for run in runs]
+    title = "attack success on clean-correct renders"
+    pictures.append(plots.curves(rates, title, "round of renders"))
     return [picture for picture in pictures if picture]
 
 
@@ -268,19 +291,26 @@ def _compared(result: compare.Difference) -> str:
     return f"{result.before:.2f} and {result.after:.2f} ({text})"
 
 
-def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:
-    """An attack with its checks as rows, its images by title, and its configuration, {} where that is damaged."""
+def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
+    """Collect what the page shows of an attack: examples, images, checks and configuration."""
     images = {}
-    for number, label, before, after, outcome in evenly(attack["rows"], ATTACK_EXAMPLES):
-        title = f"Example {number}, {label}: {outcome}"
-        alt = f"{title}; before, after, their difference and the lights; predicted {before}, then {after}"
-        images[title] = plots.from_file(attack["folder"] / f"example_{number:03d}.png", alt, SHEET)
+    for row in evenly(attack.rows, ATTACK_EXAMPLES):
+        title = f"Example {row.number}, {row.label}: {row.outcome}"
+        alt = f"{title}; before, after, their difference and the lights; "
+        alt += f"predicted {row.before}, then {row.after}"
+        path = attack.folder / f"example_{row.number:03d}.png"
+        images[title] = plots.from_file(path, alt, SHEET)
     config: Mapping[str, Any] = {}
     with suppress(InputError):
-        config = read_config(attack["folder"].parent / CONFIG)
-    checks = [
-        (key.replace("_", " "), value)
-        for key, value in attack["checks"].items()
-        if not isinstance(value, dict)
-    ]
-    return {**attack, "checks": checks, "images": images, "config": config}
+        config = read_config(attack.folder.parent / CONFIG)
+    checks = []
+    for name, value in attack.checks.items():
+        if not isinstance(value, dict):
+            checks.append((name.replace("_", " "), value))
+    return {
+        "folder": attack.folder,
+        "rows": attack.rows,
+        "checks": checks,
+        "images": images,
+        "config": config,
+    }

@@ -28,10 +28,12 @@ from train.photographs.scoring import COUNTED_EACH, SUMMARY, describe_point, ope
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.tables import Estimate, Table, format_interval
 
-MOST_NAMED, LONGEST_NAME = 30, 56  # arms named by their settings, and characters of such a name
-INITIAL = (
-    "the initial network"  # in place of an arm, of a network that runs of the tables began with
-)
+# Number of arms up to which they are named by their settings.
+MOST_NAMED = 30
+# Characters of the longest such name.
+LONGEST_NAME = 56
+# Name of a network that runs began with, in place of that of an arm.
+INITIAL = "the initial network"
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,14 @@ Scored = Mapping[str, Sequence[ScoredRun]]
 
 
 def is_finished(folder: Path) -> bool:
-    """Whether the folder holds a run with its final scores."""
+    """Return whether a folder holds a run with its final scores.
+
+    Args:
+        folder: Folder of a run.
+
+    Returns:
+        Whether the last line of metrics.jsonl has the scores.
+    """
     lines = read_metrics(folder)
     return bool(lines) and "epoch" not in lines[-1]
 
@@ -180,50 +189,76 @@ def is_finished(folder: Path) -> bool:
 def summarize(folder: Path) -> RunSummary:
     """Read a finished run, an evaluation of pnb-evaluate, or a published network.
 
-    InputError for a folder without one, or where a file lacks an entry of the tables.
+    Args:
+        folder: Folder that one of these commands wrote.
+
+    Returns:
+        Settings and scores.
+
+    Raises:
+        InputError: For a folder without these, or if a file lacks an entry of
+            the tables.
     """
     folder = published(folder)
-    whole = folder.absolute()
-    name, settings = str(Path(*whole.parts[-2:])), {"network": str(whole)}
     try:
-        if is_finished(folder):
-            return _read_run(folder)
-        if (folder / SUMMARY).is_file():
-            scores = {whole.name: PhotographScores.read(read_json(folder / SUMMARY))}
-            return RunSummary(whole.parent, name, settings, scores, None)
-        if (folder / PUBLISHED).is_file():
-            values = load_selected(folder)[1].get("scores", {})
-            entries = {key: value for key, value in values.items() if isinstance(value, dict)}
-            scores = {key: PhotographScores.read(entry) for key, entry in entries.items()}
-            return RunSummary(folder, name, settings, scores, values.get("test/accuracy"))
-        raise InputError(
-            f"{folder} holds no finished run: let it finish, or resume it with train.resume=true"
-        )
+        summary = _read(folder)
     except InputError:
         raise
-    except Exception as error:  # entries may be missing or of any type
+    except Exception as error:
+        # Entries may be missing or of any type.
         files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {in_one_line(error)}"
-        raise InputError(
-            f"{folder}: {files} is not as `pnb-train` wrote it ({reason}): use another run"
-        ) from error
+        problem = f"{folder}: {files} is not as `pnb-train` wrote it ({reason})"
+        raise InputError(f"{problem}: use another run") from error
+    if summary is None:
+        remedy = "let it finish, or resume it with train.resume=true"
+        raise InputError(f"{folder} holds no finished run: {remedy}")
+    return summary
+
+
+def _read(folder: Path) -> RunSummary | None:
+    """Read what a folder holds; None if it is neither run, evaluation nor network."""
+    whole = folder.absolute()
+    name = str(Path(*whole.parts[-2:]))
+    settings = {"network": str(whole)}
+    if is_finished(folder):
+        return _read_run(folder)
+    if (folder / SUMMARY).is_file():
+        scores = {whole.name: PhotographScores.read(read_json(folder / SUMMARY))}
+        return RunSummary(whole.parent, name, settings, scores, accuracy=None)
+    if (folder / PUBLISHED).is_file():
+        values = load_selected(folder)[1].get("scores", {})
+        entries = {key: value for key, value in values.items() if isinstance(value, dict)}
+        scores = {key: PhotographScores.read(entry) for key, entry in entries.items()}
+        return RunSummary(folder, name, settings, scores, values.get("test/accuracy"))
+    return None
 
 
 def _read_run(folder: Path) -> RunSummary:
+    """Read a finished run."""
     *epochs, scores = read_metrics(folder)
-    config, before = read_config(folder / CONFIG), None
+    config = read_config(folder / CONFIG)
+    before = None
     if "test/accuracy_before" in scores:
-        start = {"train.init_from": config.train.init_from}
-        path, accuracy = folder / BEFORE, scores["test/accuracy_before"]
-        before = RunSummary(path, INITIAL, start, read_summaries(path), accuracy)
-    arm, settings, seed = (
-        str(config.augment.arm),
-        run_folder.decisive_settings(config),
-        int(config.seed),
-    )
-    accuracy, photographs = scores["test/accuracy"], read_summaries(folder)
+        path = folder / BEFORE
+        before = RunSummary(
+            folder=path,
+            arm=INITIAL,
+            settings={"train.init_from": config.train.init_from},
+            photographs=read_summaries(path),
+            accuracy=scores["test/accuracy_before"],
+        )
     return RunSummary(
-        folder, arm, settings, photographs, accuracy, seed, config, epochs, scores, before
+        folder=folder,
+        arm=str(config.augment.arm),
+        settings=run_folder.decisive_settings(config),
+        photographs=read_summaries(folder),
+        accuracy=scores["test/accuracy"],
+        seed=int(config.seed),
+        config=config,
+        epochs=epochs,
+        scores=scores,
+        before=before,
     )
 
 
@@ -243,45 +278,62 @@ def read_summaries(folder: Path) -> dict[str, PhotographScores]:
 
 
 def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
-    """The settings in which runs differ, by key, in words; without the arm and the seed, which tables always show."""
-    keys = sorted({key for run in runs for key in run.settings} - {"augment.arm", "seed"})
-    varied = [
-        key
-        for key in keys
-        if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs)
-    ]
-    return {
-        key: re.sub(r"^(augment|train|scene|renderer|evaluate)\.|[._]", " ", key).strip()
-        for key in varied
-    }
+    """Find the settings in which runs differ.
+
+    Args:
+        runs: Runs that are compared.
+
+    Returns:
+        The setting in words by its key, without the arm and the seed, which
+        tables always show.
+    """
+    keys = {key for run in runs for key in run.settings} - {"augment.arm", "seed"}
+    varied = {}
+    for key in sorted(keys):
+        if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs):
+            words = re.sub(r"^(augment|train|scene|renderer|evaluate)\.|[._]", " ", key)
+            varied[key] = words.strip()
+    return varied
 
 
 def arms_of(runs: Sequence[RunSummary]) -> Arms:
-    """Groups of runs that differ only in the seed, under short names: the arm and the settings in which its groups
-    differ, or a number and the arm where those are many or long. The networks that they began with come first, once."""
-    bases = [run.before for run in runs if run.before]
-    before = {
-        repr((base.settings, [part.images for part in base.photographs.values()])): base
-        for base in bases
-    }
+    """Group runs that differ only in the seed.
+
+    Args:
+        runs: Runs, which may have begun with other networks.
+
+    Returns:
+        Runs by the name of their arm. The networks that they began with come
+        first, once. A name has the arm and the settings in which its groups
+        differ, or a number and the arm if those are many or long.
+    """
     groups: dict[str, list[RunSummary]] = {}
-    for run in (*before.values(), *runs):
+    for run in (*_initial_networks(runs), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     heads = [group[0] for group in groups.values()]
-    varied = {
-        arm: varied_settings([head for head in heads if head.arm == arm])
-        for arm in {head.arm for head in heads}
-    }
+    varied = {}
+    for arm in {head.arm for head in heads}:
+        varied[arm] = varied_settings([head for head in heads if head.arm == arm])
     named: dict[str, list[RunSummary]] = {}
-    for number, (head, group) in enumerate(zip(heads, groups.values(), strict=True), 1):
-        parts = [
-            head.arm,
-            *(f"{words}={head.settings.get(key)}" for key, words in varied[head.arm].items()),
-        ]
-        name = ", ".join(parts)
-        is_short = len(heads) <= MOST_NAMED and len(name) <= LONGEST_NAME and name not in named
-        named[name if is_short else f"{number}: {head.arm}"] = group
+    for number, group in enumerate(groups.values(), 1):
+        head = group[0]
+        parts = [f"{words}={head.settings.get(key)}" for key, words in varied[head.arm].items()]
+        name = ", ".join([head.arm, *parts])
+        is_short = len(heads) <= MOST_NAMED and len(name) <= LONGEST_NAME
+        if not is_short or name in named:
+            name = f"{number}: {head.arm}"
+        named[name] = group
     return named
+
+
+def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
+    """Return the networks that runs began with, each once."""
+    networks = {}
+    for run in runs:
+        if run.before:
+            images = [scores.images for scores in run.before.photographs.values()]
+            networks[repr((run.before.settings, images))] = run.before
+    return [*networks.values()]
 
 
 def by_images(arms: Arms) -> dict[str, Scored]:
@@ -327,33 +379,44 @@ def _title_of(group: Scored) -> str:
 
 
 def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
-    """Accuracy, scores of the groups of `by_images`, and the settings in which the arms differ.
+    """Make tables of the accuracy, the scores and the settings of runs.
 
-    A row per run; below several seeds of an arm one with their mean ± standard deviation.
+    Args:
+        arms: Runs of each arm.
+        groups: Scored runs by a title of the images, as `by_images` groups them.
+
+    Returns:
+        Table of the accuracy, a table for each group, and a table of the
+        settings in which the arms differ, if there are any. They have a row per
+        run and, below several seeds of an arm, one with their mean ± standard
+        deviation.
     """
-    accuracies = {
-        arm: [
-            (run.seed, [Estimate(run.accuracy), Estimate(run.scores.get("test/accuracy_last"))])
-            for run in runs
-        ]
-        for arm, runs in arms.items()
-        if runs[0].accuracy is not None
-    }
-    tested = dict.fromkeys(
-        run.config.get("test_images", "") for runs in arms.values() for run in runs
-    )
-    title = " or ".join(f"accuracy on {images}" for images in tested if images)
-    tables = [_run_table(title, ["test accuracy", "of the last epoch"], accuracies)]
+    tables = [_accuracy_table(arms)]
     tables += [score_table(title, group) for title, group in groups.items()]
     heads = {arm: runs[0] for arm, runs in arms.items() if runs[0].seed is not None}
-    if varied := varied_settings([*heads.values()]):
-        rows = [
-            [arm, *(str(head.settings.get(key)) for key in varied)] for arm, head in heads.items()
-        ]
-        tables.append(
-            Table("settings in which the arms differ", ["network", *varied.values()], rows)
-        )
+    varied = varied_settings([*heads.values()])
+    if varied:
+        header = ["network", *varied.values()]
+        rows = []
+        for arm, head in heads.items():
+            rows.append([arm, *(str(head.settings.get(key)) for key in varied)])
+        tables.append(Table("settings in which the arms differ", header, rows))
     return tables
+
+
+def _accuracy_table(arms: Arms) -> Table:
+    """Make the table of the accuracy on the test images."""
+    lines: dict[str, list[Line]] = {}
+    tested: dict[str, None] = {}
+    for arm, runs in arms.items():
+        for run in runs:
+            tested[run.config.get("test_images", "")] = None
+            if runs[0].accuracy is not None:
+                last = run.scores.get("test/accuracy_last")
+                line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
+                lines.setdefault(arm, []).append(line)
+    title = " or ".join(f"accuracy on {images}" for images in tested if images)
+    return _run_table(title, ["test accuracy", "of the last epoch"], lines)
 
 
 def score_table(title: str, group: Scored) -> Table:
@@ -395,20 +458,34 @@ def label_title(label: str) -> str:
 
 
 def seconds_table(arms: Arms) -> Table:
-    """Means per epoch of the first run of each arm; the classifier's part of the attack, and the operators, once."""
+    """Make a table of the seconds of an epoch.
+
+    Args:
+        arms: Runs of each arm.
+
+    Returns:
+        Means over the epochs of the first run of each arm: of all phases, of
+        each, of the classifier's part of the attack, and of the operators,
+        which are computed once.
+    """
     titles = {phase: phase.replace("_", " and ") for phase in PHASES}
-    titles |= {"attack_classifier": "attack: in the classifier", "operators": "operators, once"}
+    titles["attack_classifier"] = "attack: in the classifier"
+    titles["operators"] = "operators, once"
     rows = []
     for arm, (run, *_) in arms.items():
-        times = {
-            phase: [line[key] for line in run.epochs if (key := f"seconds/{phase}") in line]
-            for phase in titles
-        }
-        means = {phase: fmean(seconds or [0]) for phase, seconds in times.items()}
-        if any(times.values()):
-            total = sum(means[phase] for phase in PHASES)
-            rows.append([arm, *(f"{seconds:.2f}" for seconds in (total, *means.values()))])
+        means = {phase: _mean_seconds(run, phase) for phase in titles}
+        if all(mean is None for mean in means.values()):
+            continue
+        total = sum(means[phase] or 0 for phase in PHASES)
+        rows.append([arm, *(f"{mean or 0:.2f}" for mean in (total, *means.values()))])
     return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
+
+
+def _mean_seconds(run: RunSummary, phase: str) -> float | None:
+    """Average the seconds of a phase over the epochs that have it; None if none has."""
+    name = f"seconds/{phase}"
+    seconds = [line[name] for line in run.epochs if name in line]
+    return fmean(seconds) if seconds else None
 
 
 # The seed of a run, and its metrics, one per column.
@@ -436,110 +513,199 @@ def _spread(metrics: Sequence[Estimate | None]) -> str:
     return f"{fmean(values):.3f} ± {stdev(values):.3f}"
 
 
-def read_attack(folder: Path) -> dict[str, Any]:
-    """An attack's folder; rows: number, label, predictions before and after, and outcome of each example; the numbers
-    of successes, with a sensor's noise and without, and of examples that were correct before any step; and its checks
-    by name. Attacks of earlier versions counted without noise.
+class ExampleRow(NamedTuple):
+    """An example of an attack, as a row of a table.
 
-    InputError naming a file that no attack wrote.
+    Attributes:
+        number: Number of the example.
+        label: Its class, or its classes in several views.
+        before: Predictions before the attack, with their probabilities.
+        after: Predictions after the attack.
+        outcome: What came of the attack, in words.
+    """
+
+    number: int
+    label: str
+    before: str
+    after: str
+    outcome: str
+
+
+@dataclass(frozen=True)
+class AttackSummary:
+    """What came of an attack, as its folder says.
+
+    Attributes:
+        folder: Folder of the attack.
+        rows: Its examples.
+        successes: Number of successes with a sensor's noise. Attacks of earlier
+            versions counted without noise.
+        without_noise: Number of successes without noise.
+        correct: Number of examples that were correct before the attack, of
+            which successes are counted.
+        checks: Results of `augment.check` by name.
+    """
+
+    folder: Path
+    rows: Sequence[ExampleRow]
+    successes: int
+    without_noise: int
+    correct: int
+    checks: Mapping[str, Any]
+
+
+def read_attack(folder: Path) -> AttackSummary:
+    """Read the folder of an attack.
+
+    Args:
+        folder: Folder with attack.jsonl.
+
+    Returns:
+        Its examples and the number of successes.
+
+    Raises:
+        InputError: If no attack wrote the file.
     """
     path = folder / LINES
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         examples = [line for line in lines if "example" in line]
         correct = [line for line in examples if not line["success_before"]]
-        successes = sum(bool(line["success"]) for line in correct)
-        without_noise = sum(_without_noise(line) for line in correct)
-        checks = next((dict(line["checks"]) for line in lines if "checks" in line), {})
-        rows = [_example_row(line) for line in examples]
-    except Exception as error:  # JSON of any depth and type raises many kinds
-        raise InputError(
-            f"{path} is damaged or was written by no attack ({in_one_line(error)})"
-        ) from error
-    counts = {"successes": successes, "without_noise": without_noise, "correct": len(correct)}
-    return {"folder": folder, "rows": rows, **counts, "checks": checks}
+        return AttackSummary(
+            folder=folder,
+            rows=[_example_row(line) for line in examples],
+            successes=sum(bool(line["success"]) for line in correct),
+            without_noise=sum(_is_success_without_noise(line) for line in correct),
+            correct=len(correct),
+            checks=next((dict(line["checks"]) for line in lines if "checks" in line), {}),
+        )
+    except Exception as error:
+        # JSON of any depth and type raises errors of many kinds.
+        problem = f"{path} is damaged or was written by no attack"
+        raise InputError(f"{problem} ({in_one_line(error)})") from error
 
 
-def _without_noise(line: dict[str, Any]) -> bool:
-    """Whether an example's line is of a success without noise; lines of earlier versions have no other."""
+def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
+    """Return whether an example is a success without noise, as all are in earlier versions."""
     return bool(line.get("success_without_noise", line["success"]))
 
 
-def _example_row(line: dict[str, Any]) -> tuple[int, str, str, str, str]:
-    label = ", ".join(dict.fromkeys(map(str, line["label"])))
-    before, after = (
-        ", ".join(
-            f"{p:.1%} {name}"
-            for name, p in zip(line[f"predicted{w}"], line[f"confidence{w}"], strict=True)
-        )
-        for w in ("_before", "")
-    )
-    success = (
-        "success"
-        if line["success"]
-        else "success only without noise"
-        if _without_noise(line)
-        else "no success"
-    )
-    outcome = f"{success} in {int(line['steps'])} steps"
-    return (
-        int(line["example"]),
-        label,
-        before,
-        after,
-        "wrong before any step" if line["success_before"] else outcome,
+def _example_row(line: Mapping[str, Any]) -> ExampleRow:
+    """Make a row of a line of attack.jsonl."""
+    return ExampleRow(
+        number=int(line["example"]),
+        label=", ".join(dict.fromkeys(map(str, line["label"]))),
+        before=_predicted(line["predicted_before"], line["confidence_before"]),
+        after=_predicted(line["predicted"], line["confidence"]),
+        outcome=_outcome(line),
     )
 
 
-Findings = tuple[
-    list[RunSummary], list[dict[str, Any]], list[tuple[Path, str, list[dict[str, float]]]]
-]
+def _predicted(names: Sequence[str], probabilities: Sequence[float]) -> str:
+    """Write the prediction for each view."""
+    pairs = zip(names, probabilities, strict=True)
+    return ", ".join(f"{probability:.1%} {name}" for name, probability in pairs)
+
+
+def _outcome(line: Mapping[str, Any]) -> str:
+    """Say what came of the attack on an example."""
+    if line["success_before"]:
+        return "wrong before any step"
+    success = "no success"
+    if line["success"]:
+        success = "success"
+    elif _is_success_without_noise(line):
+        success = "success only without noise"
+    return f"{success} in {int(line['steps'])} steps"
+
+
+class Unfinished(NamedTuple):
+    """A run that is not finished, or a folder that cannot be read.
+
+    Attributes:
+        folder: Its folder.
+        state: Its state in words, or why it cannot be read.
+        epochs: Lines of its epochs in metrics.jsonl.
+    """
+
+    folder: Path
+    state: str
+    epochs: Sequence[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What folders hold.
+
+    Attributes:
+        runs: Finished runs and scored networks, ordered by arm, so that the
+            others are compared with `none`, or with a network that no run
+            trained.
+        attacks: Attacks.
+        unfinished: Other runs.
+    """
+
+    runs: list[RunSummary] = field(default_factory=list)
+    attacks: list[AttackSummary] = field(default_factory=list)
+    unfinished: list[Unfinished] = field(default_factory=list)
 
 
 def find(folders: Sequence[Path]) -> Findings:
-    """The runs, the attacks as of `read_attack`, and what is not finished or cannot be read in folders and below them.
+    """Find runs and attacks.
 
-    Runs are ordered by arm, so that the others are compared with `none`, or with a network that no run trained. The
-    third part holds folders, their states in words or why they cannot be read, and the lines of their epochs.
-    InputError for a folder that is missing, and where nothing is found.
+    Args:
+        folders: Folders of runs and attacks, or folders that hold them.
+
+    Returns:
+        What is in the folders and below them.
+
+    Raises:
+        InputError: For a folder that is missing, and if nothing is found.
     """
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(
-                f"runs: {folder} is not a folder: give those of runs, of a sweep or of attacks"
-            )
+            remedy = "give those of runs, of a sweep or of attacks"
+            raise InputError(f"runs: {folder} is not a folder: {remedy}")
     paths = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
     if not paths:
-        raise InputError(
-            f"runs: {', '.join(map(str, folders))} holds no run and no attack: give other folders"
-        )
-    runs, attacks, unfinished = [], [], []
+        names = ", ".join(map(str, folders))
+        raise InputError(f"runs: {names} holds no run and no attack: give other folders")
+    found = Findings()
     for path in paths:
         try:
-            if (path / LINES).is_file():
-                attacks.append(read_attack(path))
-            elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
-                runs.append(summarize(path))
-            else:
-                epochs = [line for line in read_metrics(path) if "epoch" in line]
-                unfinished.append((path, run_folder.state(path), epochs))
-        except (InputError, OSError) as error:  # the latter of the lock in another user's folder
-            unfinished.append((path, f"cannot be read: {error}", []))
-    runs.sort(key=lambda run: [*ARMS].index(run.arm) if run.arm in ARMS else -1)
-    return runs, attacks, unfinished
+            _add(found, path)
+        except (InputError, OSError) as error:
+            # The lock in another user's folder raises OSError.
+            found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
+    arms = [*ARMS]
+    found.runs.sort(key=lambda run: arms.index(run.arm) if run.arm in arms else -1)
+    return found
+
+
+def _add(found: Findings, path: Path) -> None:
+    """Read a folder and add it to what was found."""
+    if (path / LINES).is_file():
+        found.attacks.append(read_attack(path))
+    elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
+        found.runs.append(summarize(path))
+    else:
+        epochs = [line for line in read_metrics(path) if "epoch" in line]
+        found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """The folders of runs and attacks; a run's own evaluations are shown with it."""
+    """Yield the folders of runs and attacks. A run's own evaluations are shown with it."""
+    of_run = {run_folder.METRICS, run_folder.FAILURE, checkpoint.LAST, checkpoint.BEST}
+    of_others = {LINES, SUMMARY, PUBLISHED}
     for root, below, files in os.walk(folder):
-        path, names = Path(root), set(files)
+        path = Path(root)
+        names = set(files)
         below.sort()
-        is_run = not names.isdisjoint(
-            {run_folder.METRICS, run_folder.FAILURE, checkpoint.LAST, checkpoint.BEST}
-        )
+        is_run = bool(names & of_run)
         if is_run:
+            # os.walk goes on in the folders that this list keeps.
             below[:] = [
                 name for name in below if name != BEFORE and not (path / name / SUMMARY).is_file()
             ]
-        if is_run or names & {LINES, SUMMARY, PUBLISHED} or names >= {CONFIG, "train.log"}:
+        if is_run or names & of_others or names >= {CONFIG, "train.log"}:
             yield path
