@@ -1,7 +1,8 @@
-"""Losses: the cost that an attack decreases, and those of training.
+"""Losses: the cost that an attack decreases, and the losses of training.
 
-A label is a class, or any class but one (a complementary label), written −1 − class. Where several classes are under
-study, `absent` holds the others that images of a complementary label do not show, either.
+A label is a class, or any class but one. The latter is a complementary label, and it is written
+−1 − class. If several classes are under study, `absent` holds further classes that images of a
+complementary label do not show.
 """
 
 from collections.abc import Sequence
@@ -12,16 +13,30 @@ from torch import Tensor
 
 from renderer.errors import require_range
 
-NO_CLASS = -(10**9)  # in place of a source or target class, where there is none; no complementary label
+# Stands for "no class" as a source or target. No complementary label has this value.
+NO_CLASS = -(10**9)
 
 
 def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases; (N,).
+    """Compute the cost that an attack decreases.
 
-    logits: (N, classes). source, target: (N,) int64; None leaves the second term out, and NO_CLASS in either its own.
-    InputError: a class without a logit.
+    It is −CE(logits, source) + CE(logits, target), equation 1 of the paper, where CE is the cross
+    entropy.
+
+    Args:
+        logits: The logits of N images, shape (N, classes).
+        source: The class that each image is led away from, int64, shape (N,). NO_CLASS leaves the
+            first term out.
+        target: The class that each image is led to, int64, shape (N,). NO_CLASS leaves the second
+            term out, and so does None for all images.
+
+    Returns:
+        The cost of each image, shape (N,).
+
+    Raises:
+        InputError: A source class has no logit.
     """
-    require_known(source.clamp(min=0), logits)  # NO_CLASS passes
+    require_known(source.clamp(min=0), logits)  # NO_CLASS passes as class 0.
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
     if target is not None:
         cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
@@ -29,69 +44,157 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """The lead (...) of the target's logit over all others or, without a target, of the best other class over the
-    source; negative where the goal is not reached. logits: (..., C)."""
+    """Compute by how much an attack's goal is reached.
+
+    Args:
+        logits: The logits, shape (..., classes).
+        source: The class to lead away from, shape (...).
+        target: The class to lead to, shape (...). NO_CLASS or None is no target.
+
+    Returns:
+        The lead of the target's logit over all others. Without a target, the lead of the best
+        other class over the source. It is negative if the goal is not reached. Shape (...).
+    """
     wanted = torch.full_like(source, NO_CLASS) if target is None else target
-    chosen = torch.where(wanted == NO_CLASS, source, wanted)[..., None]
-    gap = logits.gather(-1, chosen)[..., 0] - logits.scatter(-1, chosen, -torch.inf).amax(-1)
-    return torch.where(wanted == NO_CLASS, -gap, gap)
+    has_no_target = wanted == NO_CLASS
+    chosen = torch.where(has_no_target, source, wanted)[..., None]
+    best_of_others = logits.scatter(-1, chosen, -torch.inf).amax(-1)
+    gap = logits.gather(-1, chosen)[..., 0] - best_of_others
+    return torch.where(has_no_target, -gap, gap)
 
 
 def complementary_label(label: int) -> int:
-    """The label of an image that shows no class of the classifier, and in particular not this one."""
+    """Return the label of an image that shows no class, and in particular not this one.
+
+    Args:
+        label: The class that it does not show.
+
+    Returns:
+        The complementary label, −1 − label.
+    """
     return -1 - label
 
 
 def require_known(labels: Tensor, logits: Tensor) -> None:
-    """InputError for a label of a class beyond those of logits (N, classes)."""
+    """Check that every label has a logit.
+
+    Args:
+        labels: The labels, int64, shape (N,).
+        logits: The logits, shape (N, classes).
+
+    Raises:
+        InputError: A label is of a class beyond those of the logits.
+    """
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 
 
-def label_loss(logits: Tensor, labels: Tensor, label_smoothing: float = 0.0, absent: Sequence[int] = ()) -> Tensor:
-    """(N,) cross entropy where a label is a class c, and −log(1 − p_c) where it is complementary to c; with p_c and the
-    probabilities of `absent` added.
+def label_loss(
+    logits: Tensor,
+    labels: Tensor,
+    label_smoothing: float = 0.0,
+    absent: Sequence[int] = (),
+) -> Tensor:
+    """Compute the loss of each image by its label.
 
-    logits: (N, classes). labels: (N,) int64. label_smoothing: of the cross entropy alone.
+    The loss is the cross entropy for a class c. For a label that is complementary to c, it is
+    −log(1 − p), where p is the sum of the probabilities of c and of the classes `absent`.
+
+    Args:
+        logits: The logits, shape (N, classes).
+        labels: The labels, int64, shape (N,).
+        label_smoothing: The label smoothing of the cross entropy, at least 0 and below 1.
+        absent: Further classes that images of a complementary label do not show.
+
+    Returns:
+        The losses, shape (N,).
     """
     classes = _class_of(labels)[:, None]
-    others = logits.scatter(1, classes, -torch.inf)
+    logits_of_others = logits.scatter(1, classes, -torch.inf)
     for index in absent:
-        others[:, index] = -torch.inf
-    complementary = logits.logsumexp(1) - others.logsumexp(1)
-    entropy = F.cross_entropy(logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing)
-    return torch.where(labels < 0, complementary, entropy)
+        logits_of_others[:, index] = -torch.inf
+    complementary = logits.logsumexp(1) - logits_of_others.logsumexp(1)
+    cross_entropy = F.cross_entropy(
+        logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing
+    )
+    return torch.where(labels < 0, complementary, cross_entropy)
 
 
 def log_odds(logits: Tensor, label: int) -> Tensor:
-    """log p / (1 − p) of a class, (N,), from logits (N, classes): finite even where p rounds to 0 or 1."""
+    """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
+
+    They are finite even where p rounds to 0 or 1.
+
+    Args:
+        logits: The logits, shape (N, classes).
+        label: The class.
+
+    Returns:
+        The log-odds, shape (N,).
+    """
     others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
     return logits[:, label] - others.logsumexp(dim=1)
 
 
 def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
-    """Mean of log(1 + e^(o − p)) over all pairs of an image of the class, with log-odds p, and another image, with
-    log-odds o; 0 without a pair.
+    """Compute the loss of ranking the images of a class before all others.
 
-    A smooth bound of 1 − AUC (RankNet, Burges et al. 2005). logits: (N, classes). labels: (N,) int64.
+    It is the mean of log(1 + exp(o − p)) over all pairs of an image of the class, with log-odds
+    p, and another image, with log-odds o. It is a smooth upper bound of 1 − AUC, up to a factor
+    (RankNet, Burges et al. 2005).
+
+    Args:
+        logits: The logits, shape (N, classes).
+        labels: The labels, int64, shape (N,).
+        label: The class.
+
+    Returns:
+        The loss, a scalar. It is 0 if there is no pair.
     """
     odds = log_odds(logits, label)
-    pairs = (labels == label)[:, None] & (labels != label)
-    return (F.softplus(odds - odds[:, None]) * pairs).sum() / pairs.sum().clamp(min=1)
+    is_of_class = labels == label
+    is_pair = is_of_class[:, None] & ~is_of_class
+    losses = F.softplus(odds - odds[:, None]) * is_pair
+    return losses.sum() / is_pair.sum().clamp(min=1)
 
 
 def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
-    """(N,) Kullback–Leibler divergence Σ q log(q / p) of a network's probabilities p from another's q, by the logits
-    (N, classes) of both: the loss of distillation (Hinton et al. 2015, at temperature 1)."""
-    return F.kl_div(logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True).sum(1)
+    """Compute how far the predictions of a network are from another's.
+
+    This is the Kullback–Leibler divergence Σ q log(q / p) of the probabilities p of the network
+    from the probabilities q of the other one: the loss of distillation (Hinton et al. 2015) at
+    temperature 1.
+
+    Args:
+        logits: The logits of the network, shape (N, classes).
+        predictions: The logits of the other network, shape (N, classes).
+
+    Returns:
+        The divergence of each image, shape (N,).
+    """
+    terms = F.kl_div(
+        logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True
+    )
+    return terms.sum(1)
 
 
 def is_right(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
-    """Whether classes agree with labels, both (N,) int64; boolean."""
-    right = (predicted == _class_of(labels)) != (labels < 0)
+    """Say which predictions agree with the labels.
+
+    Args:
+        predicted: The predicted classes, int64, shape (N,).
+        labels: The labels, int64, shape (N,).
+        absent: Further classes that images of a complementary label do not show.
+
+    Returns:
+        Whether each agrees, bool, shape (N,).
+    """
+    is_complementary = labels < 0
+    right = (predicted == _class_of(labels)) != is_complementary
     for index in absent:
-        right = right & ((labels >= 0) | (predicted != index))
+        right = right & (~is_complementary | (predicted != index))
     return right
 
 
 def _class_of(labels: Tensor) -> Tensor:
+    """Return the class of each label, also of the complementary ones."""
     return torch.where(labels < 0, -1 - labels, labels)
