@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment import room
 from augment.camera_effects import CameraEffectSettings, draw_camera_effects
 from augment.objects import another_instance, rotated, varnished
 from augment.patterns import pixel_middles, random_colors
 from augment.progress import progress
+from augment.room import Room, above_table, across_light, irradiance
 from augment.scene import Example, Scene
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
@@ -200,12 +200,12 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
             albedo = albedo * random_colors(drawn * torch.tensor([1, settings.background_saturation])).to(albedo)
         if settings.tables:
             sky = sky.clone()
-            sky[on_table] = room.above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
+            sky[on_table] = above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
         lit = replace(scene, examples=rows, lights=torch.cat([_with_directional(sky, lamps), local], dim=1))
         values = albedo * _facing(lit) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
         if settings.tables:
-            irradiance, points = _in_rooms(lit, sky, lamps, _log_uniform(WALL, len(rows), draws), on_table)
-            values[on_table] = albedo[on_table] * irradiance.to(albedo)
+            arriving, points = _in_rooms(lit, sky, lamps, _log_uniform(WALL, len(rows), draws), on_table)
+            values[on_table] = albedo[on_table] * arriving.to(albedo)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
         changed["backgrounds"] = encode(clamp(values), encoding)
     if settings.camera != CameraEffectSettings():
@@ -290,25 +290,37 @@ def _facing(scene: Scene) -> Tensor:
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
     harmonics = harmonics_of(scene.basis)
     coefficients = scene.lights.cpu().double()[:, harmonics.nonzero]
-    irradiance = torch.einsum("ek,ekc->ec", harmonics.irradiance(towards), coefficients) * exposures
-    return irradiance.to(scene.backgrounds)[:, :, None, None]
+    facing = torch.einsum("ek,ekc->ec", harmonics.irradiance(towards), coefficients) * exposures
+    return facing.to(scene.backgrounds)[:, :, None, None]
 
 
 def _in_rooms(
     scene: Scene, sky: Tensor, lamps: Tensor, walls: Sequence[float], on_table: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(N, 3, size, size) irradiance of table and wall in the N examples on tables; and (2, E, size, size) where
-    patterns fall: there, on table, wall and object along the lamp or, without one, the view."""
-    rows, lights, images = torch.nonzero(on_table).squeeze(1).tolist(), sky.cpu().double(), []
-    points = pixel_middles(scene.settings.size).repeat(1, len(scene), 1, 1)
+    """Return the irradiance of the rooms, and where projected patterns fall in every example.
+
+    The first, (N, 3, size, size), is that of table and wall in the N examples on tables. The
+    second, (2, E, size, size), has coordinates across the light. In a room, the pattern falls on
+    table, wall and object along the lamp or, without a lamp, along the view.
+    """
+    rows = torch.nonzero(on_table).squeeze(1).tolist()
+    skies = sky.cpu().double()
+    settings = scene.settings
+    images = []
+    points = pixel_middles(settings.size).repeat(1, len(scene), 1, 1)
     for number, group in groupby(progress(rows, "tables"), lambda row: scene.examples[row].object):
-        item, rays = scene.objects[number], Rays(scene.objects[number].mesh)
+        item = scene.objects[number]
+        rays = Rays(item.mesh)
         for row in group:
-            camera, exposure = scene.examples[row].cameras[0], scene.examples[row].exposure
-            seen = item.lowest, walls[row], camera, scene.settings
-            local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
-            images.append(exposure * room.irradiance(rays, item.radius, *seen, lights[row], lamps[row], local))
+            example = scene.examples[row]
+            camera = example.cameras[0]
+            around = Room(rays, item.radius, item.lowest, walls[row])
+            light = scene.lights[row].cpu().double()
+            local = split_light(scene.basis, light).local_lights
+            arriving = irradiance(around, camera, settings, skies[row], lamps[row], local)
+            images.append(example.exposure * arriving)
             towards = lamps[row] if lamps[row].any() else torch.from_numpy(camera.axes()[2])
-            points[:, row] = room.across_light(rays, item.mesh, *seen, towards).float()
-    size = scene.settings.size
+            across = across_light(around, item.mesh, camera, settings, towards)
+            points[:, row] = across.float()
+    size = settings.size
     return torch.stack(images) if images else torch.zeros(0, 3, size, size), points

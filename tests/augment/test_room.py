@@ -44,9 +44,10 @@ def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
     compared = (ball == 0) & (flat > 0.999 * flat.max())
     lamp = [(Lamps((tuple((FAR * LAMP).tolist()),), 1e5), torch.full((1, 3), 0.1 * FAR**2).double())]
     both, image = concatenate([BALL, mesh]), ImageSettings(SIZE, samples=3)
+    around = room.Room(Rays(BALL), 1.8, height, wall)
     for light, lights, ours in [(SKY, [], (SKY, NONE)), (None, lamp, (0 * SKY, LAMP))]:
         there = renderer.render(both, camera, light, lights=lights, **options)[0].double()
-        seen = room.irradiance(Rays(BALL), 1.8, height, wall, camera, image, *ours) * (0.1 if lights else 1)
+        seen = room.irradiance(around, camera, image, *ours) * (0.1 if lights else 1)
         seen, expected = seen[:, compared], there[:, compared]
         most, errors = expected.max(), (seen - expected).abs()
         assert most < 1 and expected.min() < 0.6 * most  # a shadow is in sight
@@ -58,7 +59,8 @@ def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
 def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera):
     """In closed form: with the height of the unit sphere or of the table there, the camera sees the pixel's middle."""
     ball, image = Mesh.plain(*renderer.shapes.sphere(5)), ImageSettings(SIZE)
-    placed = room.across_light(Rays(ball), ball, -1.0, 50.0, camera, image, torch.tensor([0.0, 0.0, 1.0]).double())
+    around = room.Room(Rays(ball), 1.0, -1.0, 50.0)
+    placed = room.across_light(around, ball, camera, image, torch.tensor([0.0, 0.0, 1.0]).double())
     y, x = np.array([1, -1])[:, None, None] * placed.numpy() * camera.width / 2
     bulge = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
     on_ball = renderer.render(ball, camera, ambient(torch.ones(3)), SIZE, 0.0, samples=1)[0, 0].numpy() > 0
