@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,85 +19,137 @@ from train.photographs.predictions import Prediction, by_label
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ROC_TABLE, ROC_FIGURE = "roc.csv", "roc.png"
-PER_SECTION, COLUMNS = 40, 10
-IMAGE, FRAME = 96, 4  # px: the side of an enlarged image, and the width of its frame
-LONGEST_CAPTION = 18  # characters
-LEGEND = "Under each image: the predicted class and its probability; in gray, where that is wrong, the true class"
+ROC_TABLE = "roc.csv"
+ROC_FIGURE = "roc.png"
+# The images that a section shows, at most, and the images in a row.
+PER_SECTION = 40
+COLUMNS = 10
+# Pixels: the side of an enlarged image, and the width of its frame.
+IMAGE = 96
+FRAME = 4
+# Characters of a caption, at most.
+LONGEST_CAPTION = 18
+LEGEND = (
+    "Under each image: the predicted class and its probability; "
+    "in gray, where that is wrong, the true class"
+)
+# Colors of the frames.
+GREEN = "#2e9e5b"
+RED = "#d03b3b"
+YELLOW = "#e8a317"
+
 Item = TypeVar("Item")
+# The scores of the positives and of the negatives.
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
-    """Of each class under study, true positives, false negatives and false positives, up to PER_SECTION each, evenly
-    by falling probability.
+@dataclass(frozen=True)
+class _Section:
+    """Images of one kind, by falling probability.
 
-    images: (N, 3, H, W) uint8 sRGB, enlarged without smoothing, so that one sees the pixels that the classifier saw.
+    Attributes:
+        name: The kind, such as "true positives".
+        color: The color of the frames.
+        shown: The predictions and their images.
+        total: The number of images that the kind is a part of.
+    """
+
+    name: str
+    color: str
+    shown: list[tuple[Prediction, torch.Tensor]]
+    total: int
+
+
+def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
+    """Draw what is right and wrong about each class under study.
+
+    True positives, false negatives and false positives have a section each, with up to
+    PER_SECTION images that are evenly spread by probability.
+
+    Args:
+        predictions: The predictions, about the first class for all images, then about the next.
+        images: The images, uint8 sRGB, shape (N, 3, H, W). They are enlarged without smoothing,
+            so that one sees the pixels that the classifier saw.
+
+    Returns:
+        The sheet.
     """
     grids = [draw_grid([], heading=LEGEND)]
     for label, items in by_label(predictions).items():
-        pairs = sorted(zip(items, images, strict=True), key=lambda pair: -pair[0].probability)
-        positives = [pair for pair in pairs if pair[0].positive]
-        negatives = [pair for pair in pairs if not pair[0].positive]
-        sections = [
-            (
-                "true positives",
-                "#2e9e5b",
-                [pair for pair in positives if pair[0].predicted == label],
-                len(positives),
-            ),
-            (
-                "false negatives",
-                "#d03b3b",
-                [pair for pair in positives if pair[0].predicted != label],
-                len(positives),
-            ),
-            (
-                "false positives",
-                "#e8a317",
-                [pair for pair in negatives if pair[0].predicted == label],
-                len(negatives),
-            ),
-        ]
-        for name, color, group, total in sections:
-            part = (
-                f" ({PER_SECTION} shown, evenly by probability)" if len(group) > PER_SECTION else ""
-            )
-            tiles = [
-                _tile(prediction, image, color) for prediction, image in evenly(group, PER_SECTION)
-            ]
-            rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
-            grids.append(draw_grid(rows, heading=f"{label}: {len(group)} {name} of {total}{part}"))
-    sheet = Image.new(
-        "RGB", (max(grid.width for grid in grids), sum(grid.height for grid in grids)), PAPER
-    )
-    for grid, bottom in zip(grids, accumulate(grid.height for grid in grids), strict=True):
-        sheet.paste(grid, (0, bottom - grid.height))
+        for section in _sections(label, items, images):
+            grids.append(_section_grid(label, section))
+    width = max(grid.width for grid in grids)
+    sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
+    top = 0
+    for grid in grids:
+        sheet.paste(grid, (0, top))
+        top += grid.height
     return sheet
 
 
-def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
-    """`count` items at equal distances, the first and the last among them; all if there are no more."""
+def _sections(
+    label: str, predictions: Sequence[Prediction], images: torch.Tensor
+) -> list[_Section]:
+    """Divide the predictions about a class into the sections of the contact sheet."""
+    pairs = sorted(zip(predictions, images, strict=True), key=lambda pair: -pair[0].probability)
+    positives = [pair for pair in pairs if pair[0].positive]
+    negatives = [pair for pair in pairs if not pair[0].positive]
+    found = [pair for pair in positives if pair[0].predicted == label]
+    missed = [pair for pair in positives if pair[0].predicted != label]
+    mistaken = [pair for pair in negatives if pair[0].predicted == label]
     return [
-        ordered[index]
-        for index in np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int)
+        _Section("true positives", GREEN, found, len(positives)),
+        _Section("false negatives", RED, missed, len(positives)),
+        _Section("false positives", YELLOW, mistaken, len(negatives)),
     ]
 
 
+def _section_grid(label: str, section: _Section) -> Image.Image:
+    """Draw a section under its heading."""
+    count = len(section.shown)
+    heading = f"{label}: {count} {section.name} of {section.total}"
+    if count > PER_SECTION:
+        heading += f" ({PER_SECTION} shown, evenly by probability)"
+    tiles = [
+        _tile(prediction, image, section.color)
+        for prediction, image in evenly(section.shown, PER_SECTION)
+    ]
+    rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
+    return draw_grid(rows, heading=heading)
+
+
+def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
+    """Choose items at equal distances, the first and the last among them.
+
+    Args:
+        ordered: The items.
+        count: The number of items to choose.
+
+    Returns:
+        The chosen items; all items if there are no more.
+    """
+    places = np.linspace(0, len(ordered) - 1, min(count, len(ordered)))
+    return [ordered[index] for index in places.round().astype(int)]
+
+
 def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
-    """A framed image over the predicted class and, where it is wrong, the true class."""
-    enlarged = Image.fromarray(image.permute(1, 2, 0).numpy()).resize(
-        (IMAGE, IMAGE), Image.Resampling.NEAREST
-    )
+    """Frame an image over the predicted class and, if that is wrong, the true class."""
+    pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
+    enlarged = pixels.resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
     lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
     if prediction.true_rank != 1:
-        probability, label = prediction.true_probability, prediction.photograph.label
+        label = prediction.photograph.label
+        probability = prediction.true_probability
         lines.append(label if probability is None else f"{probability:.0%} {label}")
-    captions = (
-        line if len(line) <= LONGEST_CAPTION else f"{line[: LONGEST_CAPTION - 1]}…"
-        for line in lines
-    )
-    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME, color)), tuple(captions))
+    captions = tuple(_shortened(line) for line in lines)
+    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME, color)), captions)
+
+
+def _shortened(caption: str) -> str:
+    """Cut a caption that is too long."""
+    if len(caption) <= LONGEST_CAPTION:
+        return caption
+    return f"{caption[: LONGEST_CAPTION - 1]}…"
 
 
 def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
@@ -152,11 +204,17 @@ def draw_roc(
     label: str,
     styles: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """ROC curves by name, several of a name as with seeds, with the mean AUC as label, and lines at RATES.
+    """Draw ROC curves with their mean AUC, and a line at each of RATES.
 
-    scores: pairs of positives' and negatives'. styles: matplotlib's keywords of a name's lines.
+    Args:
+        axes: The axes to draw on.
+        scores: The scores of positives and negatives by name. A name has several pairs if it has
+            several seeds.
+        label: The classes under study, as the axes name them.
+        styles: matplotlib's keywords for the lines of a name.
     """
-    axes.axline((0, 0), slope=1, color="0.6", linewidth=1)  # chance
+    # A classifier that guesses has this line.
+    axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
     for rate in map(float, RATES):
         axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
     for name, pairs in scores.items():

@@ -16,13 +16,20 @@ from train.photographs.sheet import Pair, draw_roc
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito 2008, for color-blind readers, without yellow, which is faint on white. Line styles repeat the color.
+# The colors of Okabe and Ito (2008) for color-blind readers, without yellow, which is faint on
+# white. The styles and markers of lines repeat the distinction.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-LINES, MARKERS = ("--", "-", ":", "-."), "osD^vP"
-SIZE = (4.4, 3.3)  # inches
-WIDTH = 440  # CSS pixels
-SMALL = 192  # pixels per side of images that stay PNG
-INK = "#123456"  # replaced by the ink of the reader's color scheme
+LINES = ("--", "-", ":", "-.")
+MARKERS = "osD^vP"
+# The size of a plot in inches, and its width on the page in CSS pixels.
+SIZE = (4.4, 3.3)
+WIDTH = 440
+# Images of at most this many pixels per side stay PNG.
+SMALL = 192
+# Lines with fewer points than this have markers.
+MARKED = 30
+# The color of text and axes in matplotlib's file. The color of the reader's scheme replaces it.
+INK = "#123456"
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
 PLOT = {
     "axes.spines.top": False,
@@ -32,16 +39,29 @@ PLOT = {
     "svg.hashsalt": "report",
     "font.size": 10,
     "font.family": "sans-serif",
-    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK),
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
-Points = Sequence[tuple[float, float | None]]  # x and y, which may be unknown
+# Pairs of x and y. None stands for an unknown y.
+Points = Sequence[tuple[float, float | None]]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A file's bytes. kind: svg+xml, png or jpeg. alt: a description. width: CSS pixels to show it at."""
+    """An image of a page.
+
+    Attributes:
+        data: The bytes of its file.
+        kind: The kind of the file: svg+xml, png or jpeg.
+        alt: A description for readers who do not see it.
+        width: The width on the page, in CSS pixels.
+        caption: The text below it.
+    """
 
     data: bytes
     kind: str
@@ -56,74 +76,142 @@ class Picture:
 
 
 def style(index: int) -> dict[str, Any]:
-    """The color and line style of an arm, by its place among the arms."""
+    """Return matplotlib's keywords for the lines of an arm.
+
+    Args:
+        index: The place of the arm among the arms.
+
+    Returns:
+        The color and the line style.
+    """
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch") -> Picture | None:
-    """A line per seed in the color of its arm, over epochs or rounds; None where no line has two points that differ."""
-    known = {arm: [[(x, y) for x, y in seed if y is not None] for seed in seeds] for arm, seeds in arms.items()}
-    if not any(len({y for _, y in line}) > 1 for lines in known.values() for line in lines):
+def curves(
+    arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch"
+) -> Picture | None:
+    """Plot a quantity over epochs or rounds, with a line for each seed of an arm.
+
+    Args:
+        arms: The points of each seed, by arm.
+        title: The quantity.
+        x_title: What x counts.
+
+    Returns:
+        The plot. None if no line has two points that differ.
+    """
+    lines_of_arm: dict[str, list[list[tuple[float, float]]]] = {}
+    for arm, seeds in arms.items():
+        lines_of_arm[arm] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
+    all_lines = [line for lines in lines_of_arm.values() for line in lines]
+    if not any(len({y for _, y in line}) > 1 for line in all_lines):
         return None
 
-    def draw(axes: "Axes") -> None:
-        for index, (arm, lines) in enumerate(known.items()):
-            for number, line in enumerate(line for line in lines if len(line) > 1):
-                marker = MARKERS[index % len(MARKERS)] if len(line) < 30 else None
-                axes.plot(*zip(*line, strict=True), marker=marker, ms=4, label=None if number else arm, **style(index))
-        axes.set(xlabel=x_title)
-        axes.locator_params(axis="x", integer=True, min_n_ticks=1)
+    means = []
+    for arm, lines in lines_of_arm.items():
+        ends = [line[-1][1] for line in lines if line]
+        if ends:
+            means.append(f"{arm} {np.mean(ends):.2f}")
+    alt = f"{title} by {x_title}, at the end: {', '.join(means)}"
+    return _plot(lambda axes: _draw_curves(axes, lines_of_arm, x_title), title, alt)
 
-    ends = {arm: [line[-1][1] for line in lines if line] for arm, lines in known.items()}
-    means = ", ".join(f"{arm} {np.mean(values):.2f}" for arm, values in ends.items() if values)
-    return _plot(draw, title, f"{title} by {x_title}, at the end: {means}")
+
+def _draw_curves(
+    axes: "Axes", lines_of_arm: Mapping[str, list[list[tuple[float, float]]]], x_title: str
+) -> None:
+    """Draw the lines of each arm in its color; the first one is named in the legend."""
+    for index, (arm, lines) in enumerate(lines_of_arm.items()):
+        name: str | None = arm
+        for line in lines:
+            if len(line) < 2:
+                continue
+            marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
+            x, y = zip(*line, strict=True)
+            axes.plot(x, y, marker=marker, ms=4, label=name, **style(index))
+            name = None
+    axes.set(xlabel=x_title)
+    axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
 
 def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
-    """ROC curves by arm, one per pair of positives' and negatives' scores; None without any of both kinds."""
+    """Plot ROC curves, one for each seed of an arm.
+
+    Args:
+        arms: The scores of the positives and the negatives of each seed, by arm.
+        label: The classes under study, as the axes name them.
+
+    Returns:
+        The plot. None if no seed has scores of both kinds.
+    """
     known = {arm: [pair for pair in pairs if all(map(len, pair))] for arm, pairs in arms.items()}
     if not any(known.values()):
         return None
     styles = {arm: style(index) for index, arm in enumerate(arms)}
-    areas = {arm: [auc_and_recalls(*pair)[0] for pair in pairs] for arm, pairs in known.items() if pairs}
-    means = ", ".join(f"{arm} {np.mean(values):.3f}" for arm, values in areas.items())
-    return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", f"ROC; AUC: {means}")
+    means = []
+    for arm, pairs in known.items():
+        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
+        if areas:
+            means.append(f"{arm} {np.mean(areas):.3f}")
+    alt = f"ROC; AUC: {', '.join(means)}"
+    return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", alt)
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
-    """A transparent SVG, whose text and axes have the color of the reader's scheme."""
+    """Draw a transparent SVG whose text and axes have the color of the reader's scheme."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     file = io.StringIO()
-    with mpl.rc_context(PLOT):  # type: ignore[arg-type]  # which wants its keys as literals
+    with mpl.rc_context(PLOT):  # type: ignore[arg-type]  # Its type wants the keys as literals.
         figure = Figure(figsize=SIZE, layout="constrained")
         axes = figure.subplots()
         draw(axes)
         handles, labels = axes.get_legend_handles_labels()
         if labels:
-            legend = dict(zip(labels, handles, strict=True))  # each label once
+            legend = dict(zip(labels, handles, strict=True))  # This keeps each label once.
             columns = 1 if len(max(labels, key=len)) > 16 else 3
             figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=columns)
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     start, tag, rest = file.getvalue().partition("<defs>")
-    return Picture((start + STYLE + tag + rest.replace(INK, "currentColor")).encode(), "svg+xml", alt, WIDTH, title)
+    page = start + STYLE + tag + rest.replace(INK, "currentColor")
+    return Picture(page.encode(), "svg+xml", alt, WIDTH, title)
 
 
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
-    """As PNG if it is small, else as JPEG."""
-    file, small = io.BytesIO(), max(image.size) <= SMALL
-    shown = image if small else image.convert("RGB")
-    shown.save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
-    return Picture(file.getvalue(), "png" if small else "jpeg", alt, image.width, caption)
+    """Encode an image, as PNG if it is small, and otherwise as JPEG.
+
+    Args:
+        image: The image.
+        alt: A description for readers who do not see it.
+        caption: The text below it.
+
+    Returns:
+        The picture, shown at its own size.
+    """
+    file = io.BytesIO()
+    if max(image.size) <= SMALL:
+        image.save(file, "PNG", optimize=True)
+        return Picture(file.getvalue(), "png", alt, image.width, caption)
+    image.convert("RGB").save(file, "JPEG", optimize=True, quality=82)
+    return Picture(file.getvalue(), "jpeg", alt, image.width, caption)
 
 
 def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Picture]:
-    """The image of a file, reduced to a width; [] if it is missing or broken."""
+    """Read the image of a file, and reduce it.
+
+    Args:
+        path: The file.
+        alt: A description for readers who do not see it.
+        widest: The width in pixels, at most.
+        caption: The text below it.
+
+    Returns:
+        The picture. Nothing if the file is missing or broken.
+    """
     try:
         with Image.open(path) as image:
             pixels = image.convert("RGB")
-    except Exception:  # Pillow's decoders raise almost anything at a broken file
+    except Exception:  # Pillow's decoders raise almost anything at a broken file.
         return []
     pixels.thumbnail((widest, 4 * widest))
     return [encoded(pixels, alt, caption)]
