@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,146 +13,30 @@ import torch
 from torch import Tensor
 
 from augment.degree import degree_of_scene, reached_gloss, warn_of_cut_light
-from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
+from augment.objects import SceneObject, load_object, on_ground
 from augment.progress import progress
 from augment.scene import Scene
-from renderer.camera import MOST_VIEWS, orbit_cameras
+from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from renderer.camera import orbit_cameras
 from renderer.errors import (
-    FACTOR,
     InputError,
     as_device,
+    describe,
     require_bounded,
-    require_choice,
-    require_range,
 )
-from renderer.image import ImageSettings, samples_per_side
 from renderer.io.images import gray_or_image
-from renderer.light.basis import Basis, with_local_lights
-from renderer.light.harmonics import MAX_DEGREE, degree_of
-from renderer.light.lamps import Lamps
+from renderer.light.basis import Basis, LocalBasis, with_local_lights
+from renderer.light.harmonics import degree_of
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
-from renderer.light.projector import Projector
-from renderer.mesh import MOST_VERTICES, Mesh, normalize, require_mesh, subdivide
-from renderer.rasterizer import NAMES, Rasterizer, choose
-from renderer.validation import (
-    as_list,
-    as_tensor,
-    describe,
-    require_field_types,
-    require_flag,
-    require_kind,
-    require_whole,
-)
+from renderer.mesh import Mesh, normalize, require_mesh, subdivide
+from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
+from renderer.validation import as_list, as_tensor, require_flag, require_kind, require_whole
 
 if TYPE_CHECKING:
-    from augment.attacks.attack import AttackSettings
-    from augment.variation import VariationSettings
-
-
-@dataclass
-class ProjectorSettings:
-    """A `Projector`; angles in degrees. pattern: where attacks begin, a gray or an image file, of its power."""
-
-    pixels: int = 16
-    polar: float = 45.0
-    azimuth: float = 45.0
-    distance: float = 4.0
-    fov: float = 30.0
-    power: float = 1.0
-    pattern: Any = 0.0
-
-    def build(self) -> tuple[Projector, Tensor]:
-        """Return the projector and the pattern (pixels², 3) that attacks begin with."""
-        require_field_types(self)
-        return Projector.from_settings(self)
-
-
-@dataclass
-class LampsSettings:
-    """`Lamps` at positions [x, y, z], by default above four corners; points, or discs with a radius. start: the powers
-    that attacks begin with, a number, [r, g, b] of each lamp, or the lamps.json of an adversary, whose positions, power
-    and radius replace the others."""
-
-    positions: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
-    power: float = 10.0
-    radius: float = 0.0
-    start: Any = 0.0
-
-    def build(self) -> tuple[Lamps, Tensor]:
-        """Return the lamps and the powers (L, 3) that attacks begin with."""
-        require_field_types(self)
-        return Lamps.from_settings(self)
-
-
-LOCAL_LIGHT_SETTINGS = {"projector": ProjectorSettings, "lamps": LampsSettings}
-
-
-@dataclass
-class SceneSettings:
-    """What `build_scene` shows, and how; the schema of a command's `scene`, too.
-
-    meshes: a file, `solid:NAME`, or a mapping with the keys of `ObjectSettings`, each. backgrounds: gray values or
-    image files. views: cameras on a circle around each mesh; None where something else tells. polar: degrees off +z.
-    azimuth: of the first view, degrees off +x towards +y. width: of the image in world units; a mesh spans [-1, 1].
-    fov: degrees between the image's sides, as of a camera at that distance; None for parallel rays. vertices: subdivide
-    meshes until they have more. light: what `renderer.load_light` takes or, in Python, coefficients. degree: of such a
-    light; None for 6 or, where gloss is or becomes smoother than that shows, for what it needs. exposure: multiplies
-    it. projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
-    """
-
-    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
-    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
-    views: int | None = 1
-    polar: float = 60.0
-    azimuth: float = 0.0
-    width: float = 2.0
-    fov: float | None = None
-    vertices: int = 0
-    light: str = "grace"
-    degree: int | None = None
-    exposure: float = 1.0
-    projector: ProjectorSettings | None = None
-    lamps: LampsSettings | None = None
-    ground: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        require_field_types(self, "light", "vertices")
-        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
-        require_range("degree", self.degree, 0, MAX_DEGREE)
-        require_range("views", self.views, 1, MOST_VIEWS)
-        require_range("vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("polar", self.polar, 0, 180)
-        require_range("azimuth", self.azimuth, -360, 360)
-        require_range("fov", self.fov, 0.1, 150)
-
-
-@dataclass
-class RendererSettings:
-    """How `build_scene` renders; the schema of a command's `renderer`, too.
-
-    rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples, encoding, normals, shadows,
-    bounces, silhouettes: as for `renderer.render`.
-    """
-
-    rasterizer: str = "auto"
-    samples: int | None = None
-    encoding: str = "linear"
-    normals: str = "smooth"
-    shadows: bool = False
-    bounces: int = 0
-    silhouettes: bool = False
-
-    def __post_init__(self) -> None:
-        self.image(size=1)  # which checks most
-        if not isinstance(self.rasterizer, Rasterizer):
-            require_choice("rasterizer", self.rasterizer, NAMES)
-
-    def image(self, size: int) -> ImageSettings:
-        """The settings of an image of `size` pixels per side."""
-        choices = {name: value for name, value in vars(self).items() if name != "rasterizer"}
-        choices["samples"] = samples_per_side(self.samples, self.silhouettes)
-        return ImageSettings(size, **choices)
+    from augment.attacks.settings import AttackSettings
+    from augment.settings import VariationSettings
 
 
 Shown = str | Path | Mesh
@@ -261,8 +145,24 @@ def _lights(
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
     settings = [getattr(shown, kind.name) for kind in LOCAL_LIGHTS]
-    local = [light.build() for light in settings if light is not None]
+    local = [build_local_light(light) for light in settings if light is not None]
     return with_local_lights(environment * shown.exposure, local)
+
+
+def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
+    """Build a local light.
+
+    Args:
+        settings: Settings of its kind, such as `ProjectorSettings`.
+
+    Returns:
+        The light, and the coefficients (size, 3) with which attacks start.
+
+    Raises:
+        InputError: If a file cannot be read, or a value does not fit the others.
+    """
+    [kind] = [kind for kind in LOCAL_LIGHTS if type(settings) is LOCAL_LIGHT_SETTINGS[kind.name]]
+    return kind.from_settings(settings)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
@@ -273,20 +173,3 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
-
-
-def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
-    """Views per mesh, so that meshes × views × backgrounds are the examples; either is derived where it is None.
-
-    The paper's 100 examples are 2 meshes × 10 views × 5 backgrounds. InputError where no such product exists.
-    """
-    if not objects or not backgrounds:
-        raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
-    if examples is None and views is not None:
-        return views
-    derived, rest = divmod(examples or 0, objects * backgrounds)
-    if rest or derived < 1 or views not in (None, derived):
-        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        remedy = "derive the one from the other by scene.views=null or augment.examples=null"
-        raise InputError(f"augment.examples={examples} is not {product}: change one of them, or {remedy}")
-    return derived

@@ -1,39 +1,16 @@
 """Effects of a camera on images, and patterns of a projector beneath them, drawn for each example."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from augment.patterns import draw_patterns
-from renderer.errors import require_limits, require_range
-from renderer.image import ImageSettings, clamp, decode, encode
-from renderer.validation import require_field_types
+from augment.settings import CameraEffectSettings
+from renderer.image import clamp, decode, encode
+from renderer.settings import ImageSettings
 
 BLUR_RADIUS = 3  # pixels to either side that a blur averages over
-
-
-@dataclass
-class CameraEffectSettings:
-    """The effects on each image, each uniform up to its value; by default none.
-
-    pattern_fraction: of the images, under a projected pattern. pattern_fill: [least, most] of the scene's own light
-    that stays beneath it. white_balance: stops, up or down, of each channel. blur: standard deviation in pixels.
-    noise: standard deviation of the image's values.
-    """
-
-    pattern_fraction: float = 0.0
-    pattern_fill: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    white_balance: float = 0.0
-    blur: float = 0.0
-    noise: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", BLUR_RADIUS / 2), ("noise", 1)):
-            require_range(name, getattr(self, name), 0, most)
-        require_limits("pattern_fill", self.pattern_fill, 0, 1)
 
 
 def draw_camera_effects(

@@ -21,10 +21,11 @@ from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
 from renderer.light.presets import load_light
 from renderer.mesh import select_faces
-from renderer.microfacets import LEAST, degree_for, highlight_error
+from renderer.microfacets import degree_for, highlight_error
+from renderer.settings import MIN_ROUGHNESS
 
 if TYPE_CHECKING:
-    from augment.variation import VarnishSettings
+    from augment.settings import VarnishSettings
 
 NOTICED = 0.05  # irradiance error, of the rms irradiance, from which on it is told
 SHADED = 2  # degree: of lower ones, irradiance of a point source is off by 0.42 or more, of 2 by 0.09
@@ -92,7 +93,7 @@ def _reached_roughness(item: SceneObject, material: MaterialSettings | None, var
     if material is not None and attacked and material.roughness:
         mean = float(roughness.mean())
         reach = math.inf if material.radius is None else material.radius * material.roughness
-        change = max(mean - reach, LEAST) - mean
+        change = max(mean - reach, MIN_ROUGHNESS) - mean
         roughness = (roughness + min(change, 0.0)).clamp(min=0)
     if not varnished and not attacked:
         return 1.0

@@ -4,92 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from renderer.errors import FACTOR, InputError, require_range
+from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
+from renderer.errors import InputError
 from renderer.gloss import Gloss
 from renderer.mesh import Mesh, concatenate, normalize, select_faces, subdivide
 from renderer.shapes import solid
-from renderer.validation import require_field_types, require_kind
 
 TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
-FARTHEST = 10.0  # position and size of props, in world units
-
-
-@dataclass
-class MeshSettings:
-    """mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. up: the axis
-    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh without colors. gloss:
-    [roughness, metallic, strength], or the first of them (`renderer.Gloss`); "file" for glTF's own; None for none."""
-
-    mesh: str
-    up: str = field(default="auto", kw_only=True)
-    color: list[float] | None = field(default=None, kw_only=True)
-    gloss: Any = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if isinstance(self.mesh, Path):
-            self.mesh = str(self.mesh)
-        require_field_types(self)
-        if self.gloss == "file" and self.mesh.startswith("solid:"):
-            raise InputError(f"gloss=file: {self.mesh} has none of its own, give [roughness, metallic, strength]")
-        if self.gloss not in (None, "file"):
-            try:
-                _gloss(self.gloss).checked(1)
-            except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"gloss={self.gloss}: give [roughness, metallic, strength] in [0, 1], or file"
-                ) from error
-        if not self.mesh:
-            raise InputError("mesh is '': give a file or solid:NAME")
-        if self.color is not None:
-            _require_color("color", self.color)
-
-
-@dataclass
-class PropSettings(MeshSettings):
-    """A mesh beside the object, on the same ground.
-
-    at: x and y of its centroid, in world units. scale: its largest coordinate; the object's is 1. azimuth: in degrees.
-    """
-
-    at: list[float]
-    scale: float = 1.0
-    azimuth: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.at) != 2 or not all(-FARTHEST <= coordinate <= FARTHEST for coordinate in self.at):
-            raise InputError(f"at={self.at} must be x and y from {-FARTHEST:g} to {FARTHEST:g}")
-        require_range("scale", self.scale, 1 / FARTHEST, FARTHEST)
-        require_range("azimuth", self.azimuth, -360, 360)
-
-
-@dataclass
-class ObjectSettings(MeshSettings):
-    """One object of a scene, with the keys of `MeshSettings`.
-
-    label: the name of its class. albedo_scale: of its albedo. props: meshes that are in the image, too, and cast and
-    receive its shadows, but are never attacked.
-
-    >>> load_object(ObjectSettings("solid:orange", label="orange")).label
-    'orange'
-    """
-
-    label: str
-    albedo_scale: float = 1.0
-    props: list[PropSettings] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for prop in self.props:
-            require_kind("props", prop, PropSettings, "a list of augment.PropSettings")
-        require_range("albedo_scale", self.albedo_scale, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
@@ -160,7 +86,7 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """
     if color is None:
         return item
-    _require_color("ground", color)
+    require_color("ground", color)
     across = item.mesh.vertices[np.unique(item.mesh.faces), :2]
     (left, near), (right, far) = np.minimum(across.min(0) - RIM, -TABLE), np.maximum(across.max(0) + RIM, TABLE)
     corners = [[x, y, item.lowest] for x, y in ((left, near), (right, near), (right, far), (left, far))]
@@ -238,8 +164,3 @@ def _colored(item: MeshSettings) -> Mesh:
     if mesh.textures or (mesh.corner_colors != 1).any():
         raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
     return replace(Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)), gloss=mesh.gloss, skin=mesh.skin)
-
-
-def _require_color(name: str, color: Sequence[float]) -> None:
-    if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
-        raise InputError(f"{name}={color} must be red, green and blue from 0 to 1")

@@ -13,7 +13,8 @@ from augment.memory import require_memory
 from augment.objects import SceneObject
 from augment.progress import progress
 from renderer.camera import Camera
-from renderer.image import ImageSettings, background_term
+from renderer.image import background_term
+from renderer.settings import ImageSettings
 from renderer.transport.operators import TransferOperator
 from renderer.views import STACKED, OperatorStack, Rows
 

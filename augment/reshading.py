@@ -20,10 +20,10 @@ from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings
 from renderer.light.basis import Basis, split_light
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
+from renderer.settings import ImageSettings
 from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.transport.lamp_paths import LocalLightView
 from renderer.transport.precomputed import build_transport

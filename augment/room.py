@@ -18,10 +18,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.image import ImageSettings
 from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.harmonics import bands, degree_of, per_degree
 from renderer.mesh import Mesh
+from renderer.settings import ImageSettings
 from renderer.transport.lamp_paths import unoccluded
 from renderer.transport.rays import Rays, sphere
 

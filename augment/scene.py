@@ -17,13 +17,14 @@ from augment.progress import progress
 from augment.relighting import Layer, Relighting
 from augment.reshading import Reshading
 from renderer.camera import Camera
-from renderer.errors import InputError, require_bounded
-from renderer.image import ImageSettings, background_term, clamp, encode
+from renderer.errors import InputError, describe, require_bounded
+from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
+from renderer.settings import ImageSettings
 from renderer.transport.operators import build_operators
-from renderer.validation import as_integers, as_list, as_tensor, describe, require_kind
+from renderer.validation import as_integers, as_list, as_tensor, require_kind
 from renderer.views import InPlace, OperatorStack
 
 if TYPE_CHECKING:

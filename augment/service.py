@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import distributed
-from augment.attacks.attack import AttackSettings, fooled_in_views, logits_of, warn_of_changed_light
+from augment.attacks.attack import fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.norm_ball import StepSettings
-from augment.attacks.problem import AttackProblem
+from augment.attacks.eot import preprocessed_model
+from augment.attacks.problem import AttackProblem, build_problem
 from augment.batches import as_found
 from augment.build import Shown, build_scene
 from augment.classifiers.adapter import NetworkCall
@@ -25,8 +25,9 @@ from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.scene import Conditions, Scene
-from augment.variation import VariationSettings, vary
-from renderer.errors import FACTOR, InputError, require_choice, require_range
+from augment.settings import AugmentationSettings
+from augment.variation import vary
+from renderer.errors import InputError, describe
 from renderer.image import to_unit
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.presets import perturb
@@ -34,106 +35,14 @@ from renderer.validation import (
     as_array,
     as_integers,
     as_list,
-    as_path,
     as_tensor,
-    describe,
-    require_field_types,
     require_kind,
     require_seed,
     require_whole,
 )
 
-ARMS = {"none": "no renders", "random": "randomized renders", "adversarial": "attacked renders", "folder": "images"}
-INITS = ("scene", "random")
-MOST_EXAMPLES = 10**6
-MOST_EVERY = 10**9
 SHOWN_EXAMPLES = 4  # of an attack, to look at
 CLASSIFIED = 250  # of random renders, for diagnostics: a success rate within .06
-
-
-@dataclass
-class RandomLightSettings:
-    """Random offsets of the scene's light: uniform in ±amplitude per coefficient, or scaled to an L2 radius."""
-
-    amplitude: float = 0.5
-    radius: float | None = None
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        require_range("amplitude", self.amplitude, 1 / FACTOR, FACTOR)
-        require_range("radius", self.radius, 1 / FACTOR, FACTOR)
-
-
-@dataclass
-class TrainingAttackSettings(AttackSettings):
-    """Unless parameters are named, the attack of the paper's appendix C on all coefficients of the light: 30 steps of
-    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images, which
-    count without noise.
-
-    step, step_size: of that attack on the light, as in `StepSettings`.
-    """
-
-    step: str = "unit"
-    step_size: float = 0.05
-    allow_negative: bool = True
-    margin: float = 0.0
-    rounded: bool = False
-    sensor_noise: float = 0.0
-    batch_size: int = 128
-
-    @property
-    def parameters(self) -> dict[str, StepSettings]:
-        return super().parameters or {"lighting": StepSettings(step=self.step, step_size=self.step_size)}
-
-
-@dataclass
-class AugmentationSettings:
-    """What a service renders, and when.
-
-    arm: "none", "random" (random light or shape), "adversarial", or "folder" (images of a folder in place of renders).
-    folder: where these lie, for the commands. examples: per regeneration; None: all of the folder. init: where an
-    attack begins: "scene" (the scene's own values) or "random" (light by `random_light`, everything else uniform in its
-    norm-ball). warm_start: begin where the last regeneration's attack ended. every: training images between two
-    regenerations, counted within an epoch; None: one regeneration per epoch. vary: what is drawn anew each time.
-
-    >>> AugmentationSettings(arm="random", random_light=RandomLightSettings(radius=1.5)).renders
-    True
-    """
-
-    arm: str = "adversarial"
-    folder: str | None = None
-    examples: int | None = 100
-    init: str = "scene"
-    warm_start: bool = False
-    every: int | None = None
-    vary: VariationSettings = field(default_factory=VariationSettings)
-    random_light: RandomLightSettings = field(default_factory=RandomLightSettings)
-    attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
-
-    def __post_init__(self) -> None:
-        require_choice("arm", self.arm, ARMS)
-        require_kind("attack", self.attack, AttackSettings, "the settings of an attack")
-        require_field_types(self, "attack", "folder")
-        if self.folder is not None:
-            as_path("folder", self.folder)
-        if not self.attack.parameters:
-            raise InputError("attack changes nothing: give TrainingAttackSettings(), or name a parameter")
-        require_choice("init", self.init, INITS)
-        if self.arm == "folder" and not self.folder:
-            raise InputError(f"folder is {self.folder}, and arm=folder shows its images: name a folder")
-        require_range("examples", self.examples, 0, MOST_EXAMPLES)
-        require_range("every", self.every, 1, MOST_EVERY)
-        random = "random" in (self.arm, self.init)
-        for name, settings in self.attack.parameters.items():
-            if random and name != "lighting" and settings.radius is None:
-                raise InputError(f"attack.{name}.radius is None, which has no random draw: set a radius")
-        if self.warm_start and self.vary.instances:
-            raise InputError("warm_start=True keeps the last attack's shapes: set vary.instances=False")
-
-    @property
-    def renders(self) -> bool:
-        """Whether there are any examples at all."""
-        return self.arm != "none" and self.examples != 0
 
 
 @dataclass(frozen=True)
@@ -238,7 +147,7 @@ class AugmentationService:
         if self.scene is not None and self.settings.renders:
             self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
             if not attack.allow_negative:
-                warn_of_changed_light(self.scene, attack.problem(self.scene).scene)
+                warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
 
     @classmethod
     def from_meshes(
@@ -300,7 +209,7 @@ class AugmentationService:
         scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), once)
         make = self._random if once else self._adversarial
         shard = distributed.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
-        return make(model, self.settings.attack.problem(scene), number, shard)
+        return make(model, build_problem(self.settings.attack, scene), number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a resumed run needs.
@@ -364,8 +273,8 @@ class AugmentationService:
         how often, with the mean loss."""
         rows = torch.linspace(0, len(labels) - 1, min(CLASSIFIED, len(labels))).round().long().to(labels.device)
         with as_found(model), self.phases("attack_classifier"):
-            preprocessed_model = self.settings.attack.preprocessed_model(model)
-            logits = logits_of(preprocessed_model, images[rows, None], self.settings.attack.batch_size)[:, 0]
+            attacked_model = preprocessed_model(self.settings.attack, model)
+            logits = logits_of(attacked_model, images[rows, None], self.settings.attack.batch_size)[:, 0]
         require_known(labels, logits)
         success = ~is_right(logits.argmax(1), labels[rows], self.studied[1:])
         loss = label_loss(logits, labels[rows], absent=self.studied[1:])
@@ -386,7 +295,7 @@ class AugmentationService:
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = descend(
-            attack.preprocessed_model(model),
+            preprocessed_model(attack, model),
             problem,
             goal.of(shard),
             attack,
@@ -398,7 +307,7 @@ class AugmentationService:
         )
         with as_found(model), self.phases("attack_classifier"):
             fooled = fooled_in_views(
-                attack.preprocessed_model(model),
+                preprocessed_model(attack, model),
                 result.images,
                 result.predicted,
                 shard,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,23 +11,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.camera_effects import CameraEffectSettings, draw_camera_effects
+from augment.camera_effects import draw_camera_effects
 from augment.objects import another_instance, rotated, varnished
 from augment.patterns import pixel_middles, random_colors
 from augment.progress import progress
 from augment.room import Room, above_table, across_light, irradiance
 from augment.scene import Example, Scene
+from augment.settings import CameraEffectSettings, VariationSettings
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import FACTOR, InputError, require_limits, require_range
+from renderer.errors import InputError
 from renderer.gloss import Gloss
 from renderer.image import clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
-from renderer.microfacets import LEAST
 from renderer.transport.rays import Rays
-from renderer.validation import as_list, as_path, require_field_types
 from renderer.vectors import rotation_matrices
 
 UNCHANGED, NONE = (1.0, 1.0), (0.0, 0.0)
@@ -35,81 +34,6 @@ WIDEST = 45.0  # degrees, of a lens that a normalized mesh is in front of
 ELEVATION = math.radians(15), math.radians(75)  # least and most, of a camera above a table
 WALL = 1.8, 8.0  # least and largest distance of a wall behind the object
 DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, around the mesh and up or down, at most
-
-
-@dataclass
-class VarnishSettings:
-    """[least, most] roughness and strength of a varnish on each object, as of `renderer.Gloss`, each uniform; of
-    strength 0, which is the default, none. The least roughness decides the degree of the light."""
-
-    roughness: list[float] = field(default_factory=lambda: [0.4, 0.8])
-    strength: list[float] = field(default_factory=lambda: list(NONE))
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        require_limits("roughness", self.roughness, LEAST, 1)
-        require_limits("strength", self.strength, 0, 1)
-
-
-@dataclass
-class VariationSettings:
-    """What is drawn for each example in each regeneration; by default nothing, which leaves the paper's grid.
-
-    shift: of the mesh's center, at most, as a fraction of the frame's width, to either side and up and down. scale,
-    exposure: [least, most] factor of the mesh's size in the frame, and of the light; log-uniform. backgrounds: a folder
-    of images, one behind each example. instances: every solid that is named without a seed is another instance in each
-    of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and down. fov:
-    [least, most] degrees between the image's sides, of cameras in perspective. rotation: degrees by which the object
-    itself is turned in each of its views, at most, about a random axis. gloss: a varnish on each of its views, in place
-    of its own gloss. environments: each example is in one of these lights, as `load_light` takes them.
-    directional_fraction: of the examples, in a directional light from the camera's side, up to 70° off, plus [least,
-    most] `fill_light` of their environment. Projector and lamps stay. lit_background: a background is a wall that faces
-    the camera, in the example's light. tables: fraction of the examples that stand on a table before a wall, both of
-    the background's color, in the object's light and shadow (see `augment.room`), seen from 15° to 75° above; patterns
-    then fall on all three from where the directional light is. background_saturation: of random colors that multiply
-    the backgrounds, at most. Backgrounds keep the light that was drawn, also where an attack changes the object's.
-
-    >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
-    (True, False)
-    """
-
-    shift: float = 0.0
-    scale: list[float] = field(default_factory=lambda: list(UNCHANGED))
-    exposure: list[float] = field(default_factory=lambda: list(UNCHANGED))
-    backgrounds: str | None = None
-    instances: bool = False
-    azimuth: float = 0.0
-    fov: list[float] = field(default_factory=lambda: list(NONE))
-    rotation: float = 0.0
-    environments: list[str] = field(default_factory=list)
-    directional_fraction: float = 0.0
-    fill_light: list[float] = field(default_factory=lambda: list(NONE))
-    lit_background: bool = False
-    tables: float = 0.0
-    background_saturation: float = 0.0
-    gloss: VarnishSettings = field(default_factory=VarnishSettings)
-    camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
-
-    def __post_init__(self) -> None:
-        require_field_types(self, "backgrounds", "environments")
-        if self.backgrounds is not None:
-            as_path("backgrounds", self.backgrounds)
-        as_list("environments", self.environments, str | Path, "a list of lights, as load_light takes them")
-        fractions = {name: 1 for name in ("shift", "directional_fraction", "tables", "background_saturation")}
-        for name, most in (fractions | {"azimuth": 180, "rotation": 180}).items():
-            require_range(name, getattr(self, name), 0, most)
-        require_limits("fill_light", self.fill_light, 0, 1)
-        if tuple(self.fov) != NONE:
-            require_limits("fov", self.fov, 1, WIDEST)
-        for name in ("scale", "exposure"):
-            require_limits(name, getattr(self, name), 1 / FACTOR, FACTOR)
-
-    @property
-    def moves(self) -> bool:
-        """Whether views change, which then are rasterized in every regeneration."""
-        new_objects = self.instances or self.rotation > 0 or any(self.gloss.strength)
-        moved = self.shift > 0 or tuple(self.scale) != UNCHANGED or any((self.azimuth, *self.fov))
-        return moved or new_objects or self.tables > 0
 
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:

@@ -26,7 +26,7 @@ import torch
 
 import renderer
 from augment import AugmentationService, AugmentationSettings, StepSettings
-from augment.service import TrainingAttackSettings
+from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch
 from renderer.rasterizer import choose

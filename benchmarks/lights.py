@@ -33,7 +33,6 @@ from torch import Tensor
 
 from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
-from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
@@ -42,6 +41,7 @@ from renderer.light.presets import load_light
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shapes import solid
 from renderer.transport import precomputed, rays
 from renderer.transport.operators import TransferOperator, build_operators

@@ -37,10 +37,11 @@ from renderer import rendering, shading
 from renderer.camera import orbit_cameras
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings, tonemap
+from renderer.image import tonemap
 from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.mesh import Mesh
-from renderer.rasterizer import NAMES, Rasterizer, choose
+from renderer.rasterizer import Rasterizer, choose
+from renderer.settings import RASTERIZERS, ImageSettings
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.views import TransferOperators
 
@@ -436,7 +437,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
     parser.add_argument("--mitsuba", action="store_true", help="time Mitsuba 3, too (needs LLVM)")
-    parser.add_argument("--rasterizer", choices=NAMES, default="auto")
+    parser.add_argument("--rasterizer", choices=RASTERIZERS, default="auto")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 224], help="of images, in pixels")
     parser.add_argument("--subdivisions", type=int, default=5, help="of the icosahedron; 5 make 10,242 vertices")

@@ -18,7 +18,6 @@ from benchmarks.common import Row, relative_error
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings
 from renderer.io.mitsuba import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import DEGREE, Harmonics
@@ -26,6 +25,7 @@ from renderer.light.harmonics import basis
 from renderer.light.presets import probe
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
+from renderer.settings import ImageSettings
 from renderer.transport.operators import TransferOperator, build_operators
 
 SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel

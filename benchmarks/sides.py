@@ -33,10 +33,10 @@ from augment.classifiers import Classifier, build_classifier, load_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoint import content_hash
+from train.commands.settings import LabSettings
 from train.data import held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.lab.laboratory import write_laboratory
-from train.lab.shots import LabSettings
 from train.loop import evaluate
 from train.networks import is_classifier, load_run
 from train.photographs.folder import TABLE

@@ -1,3 +1,4 @@
+
 """The speed of training, and what adversarial renders cost.
 
     python -m benchmarks.training speed --data cifar100.npz --csv speed.csv
@@ -37,13 +38,13 @@ from torchvision import transforms
 from augment import AugmentationService, AugmentationSettings
 from augment.build import build_scene
 from augment.random_streams import generator
-from augment.service import TrainingAttackSettings
+from augment.settings import TrainingAttackSettings
 from augment.variation import vary
 from benchmarks.common import Row, record, with_median
 from train import checkpoint
+from train.__main__ import main as train_command
 from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
-from train.settings import ExperimentSettings, compose, read_settings
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
 BACKGROUNDS = 5  # of each view
@@ -178,7 +179,7 @@ def moved(options: argparse.Namespace) -> Iterator[Row]:
     torch.set_num_threads(1)
     overrides = ["experiment=best", "train.init_from=-", "run=-", f"scene.views={options.views}"]
     overrides.append(f"scene.meshes={['solid:orange'] * 10}")
-    settings = read_settings(ExperimentSettings, compose("train", overrides))
+    settings = train_command.read(overrides)
     chosen = {"scene": settings.scene, "renderer": settings.renderer}
     scene = build_scene(list(settings.objects.values()), 32, settings.views, **chosen)
     for number in range(options.rounds + 1):

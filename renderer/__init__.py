@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = attach(
         "camera": ["OrthographicCamera", "PerspectiveCamera", "orbit_cameras"],
         "errors": ["InputError"],
         "gloss": ["Gloss"],
-        "image": ["ImageSettings"],
+        "settings": ["ImageSettings"],
         "light.harmonics": ["harmonics"],
         "light.files": ["save_light"],
         "light.presets": ["load_light"],

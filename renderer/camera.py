@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import LARGEST, InputError, require_range
-from renderer.validation import describe, is_number, require_whole
+from renderer.errors import LARGEST, InputError, describe, is_number, require_range
+from renderer.settings import MAX_VIEWS
+from renderer.validation import require_whole
 
 REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
-MOST_VIEWS = 10**5
 MOST_TURN = 4 * math.pi  # radians: larger angles are taken for degrees
 NEAREST = 0.01  # of its distance: a mesh that comes nearer to the camera is refused
 
@@ -229,7 +229,7 @@ def orbit_cameras(
     3.732
     """
     require_whole("views", views)
-    require_range("views", views, 1, MOST_VIEWS)
+    require_range("views", views, 1, MAX_VIEWS)
     width, polar, azimuth = _as_scalar("width", width), _as_scalar("polar", polar), _as_scalar("azimuth", azimuth)
     _require_radians("azimuth", azimuth)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]

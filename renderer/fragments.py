@@ -15,8 +15,8 @@ from torch.autograd.function import once_differentiable
 
 from renderer.camera import Camera
 from renderer.errors import require_finite
-from renderer.image import ImageSettings
 from renderer.rasterizer import Rasterizer
+from renderer.settings import ImageSettings
 
 BLOCK = 2**14  # samples at a time
 

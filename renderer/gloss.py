@@ -34,7 +34,6 @@ from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import (
     DIELECTRIC,
     EDGE,
-    LEAST,
     SCHLICK,
     ViewFrame,
     along,
@@ -44,6 +43,7 @@ from renderer.microfacets import (
     lobe_functions,
     reflectance,
 )
+from renderer.settings import MIN_ROUGHNESS
 from renderer.validation import as_tensor, require_flag
 from renderer.vectors import unit
 
@@ -214,11 +214,12 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
         sources = [Texture.of(torch.from_numpy(texture).to(fragments.coverage) / 255) for texture in textures]
         factors = sample_textures(sources, mesh, fragments)
         roughness, metallic = roughness * factors[0], metallic * factors[1]
-    if (roughness < LEAST).any():
+    if (roughness < MIN_ROUGHNESS).any():
         warnings.warn(
-            f"roughness below {LEAST}: shaded as {LEAST}, the least that light of degree 40 shows", stacklevel=2
+            f"roughness below {MIN_ROUGHNESS}: shaded as {MIN_ROUGHNESS}, the least that light of degree 40 shows",
+            stacklevel=2,
         )
-    return SampleGloss(roughness.clamp(min=LEAST), metallic, strength)
+    return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, strength)
 
 
 def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:

@@ -2,76 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded, require_choice, require_range
-from renderer.validation import as_tensor, require_field_types
+from renderer.errors import InputError, require_bounded, require_choice
+from renderer.settings import ENCODINGS
+from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
 
-ENCODINGS = ("linear", "srgb")
 SRGB_KNEE = 0.0031308  # linear value at which the curve of sRGB changes from a line to a power
-NORMALS = ("flat", "smooth")
-MOST_BOUNCES = 100
-LARGEST_SIZE = 4096  # pixels per side
-MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
-FINEST = 64  # samples per pixel side: coverage is resolved to 1/4096
-SAMPLES, SAMPLES_OF_OUTLINES = 2, 8  # per pixel side by default, the latter where derivatives see how outlines move
-
-
-@dataclass(frozen=True)
-class ImageSettings:
-    """Image size in pixels, samples per side of a pixel, encoding, a normal per face or interpolated vertex normals.
-
-    shadows: of the mesh on itself. bounces: how often light goes on from one surface to another, which includes
-    shadows. silhouettes: derivatives see how outlines move. InputError: a number out of range, an unknown choice.
-
-    >>> ImageSettings(size=224, samples=2, encoding="srgb", bounces=1).global_illumination
-    True
-    """
-
-    size: int = 32
-    samples: int = 8
-    encoding: str = "linear"
-    normals: str = "flat"
-    shadows: bool = False
-    bounces: int = 0
-    silhouettes: bool = False
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        require_range("size", self.size, 1, MOST_SAMPLES)
-        require_range("samples", self.samples, 1, FINEST)
-        require_range("size × samples", self.size * self.samples, 1, MOST_SAMPLES)
-        require_choice("encoding", self.encoding, ENCODINGS)
-        require_choice("normals", self.normals, NORMALS)
-        require_range("bounces", self.bounces, 0, MOST_BOUNCES)
-
-    @property
-    def global_illumination(self) -> bool:
-        """Whether a mesh changes its own light, by shadows or bounces."""
-        return self.shadows or self.bounces > 0
-
-
-def samples_per_side(samples: int | None, silhouettes: bool) -> int:
-    """The samples per side of a pixel that were asked for or, of None, the default.
-
-    Args:
-        samples: per side of a pixel, or None.
-        silhouettes: derivatives see how outlines move, whose documented accuracy needs more samples.
-
-    Returns:
-        A number per side of a pixel.
-    """
-    if samples is not None:
-        return samples
-    return SAMPLES_OF_OUTLINES if silhouettes else SAMPLES
 
 
 def tonemap(

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, describe, require_range
 from renderer.normals import doubled_area_vectors, plain_face_normals, vertex_normals
+from renderer.settings import MAX_VERTICES
 from renderer.skin import Skin
-from renderer.validation import as_array, describe, require_whole
+from renderer.validation import as_array, require_whole
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
-MOST_VERTICES = 10**7  # some 5 GB
 _KINDS = {  # NumPy's letters for the types that the arrays of a mesh may have
     "vertices": "fiu",
     "faces": "iu",
@@ -289,7 +289,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
     require_mesh("mesh", mesh)
     is_whole_float = isinstance(vertices, float) and vertices.is_integer()  # such as 1e4
     require_whole("vertices", int(vertices) if is_whole_float else vertices)
-    require_range("vertices", vertices, 0, MOST_VERTICES)
+    require_range("vertices", vertices, 0, MAX_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)
     return mesh

@@ -30,11 +30,11 @@ import torch
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
-from renderer.light.harmonics import MAX_DEGREE, bands, lambertian_factors, per_degree, rotate, select_rows
+from renderer.light.harmonics import bands, lambertian_factors, per_degree, rotate, select_rows
 from renderer.light.window import best_window
+from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.vectors import unit
 
-LEAST = 0.2  # roughness: of smoother lobes, light of degree 40 shows less than a highlight
 AMPLITUDE = 0.1  # of a highlight, that the band of a light's degree may have
 NARROWER = 0.7  # times α, of the lobe whose highlights must not ring
 IRRADIANCE = 10.0  # weight of irradiance beside that of highlights, in the choice of a window
@@ -141,7 +141,7 @@ class ViewFrame(NamedTuple):
 def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:
     """π c (T, M, S) for each of T terms: of the functions c_lm with 0 ≤ m ≤ l, in ascending order of l and then m.
 
-    cosine: n·v (S,). roughness: (S,) or (1,), at least LEAST. Differentiable.
+    cosine: n·v (S,). roughness: (S,) or (1,), at least MIN_ROUGHNESS. Differentiable.
     """
     functions = (degree + 1) * (degree + 2) // 2
     if degree > USUAL and len(roughness) == 1 and not roughness.requires_grad:
@@ -162,7 +162,7 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
 
     Args:
         cosine: Cosine μ between normal and direction, in [0, 1], any shape.
-        roughness: Roughness of the same shape, or (1,), at least `LEAST`.
+        roughness: Roughness of the same shape, or (1,), at least `MIN_ROUGHNESS`.
 
     Returns:
         E, in [0, 1], of the shape of `cosine`.
@@ -197,7 +197,7 @@ def coat_mean(roughness: Tensor) -> Tensor:
     """Compute E_avg = 2 ∫ E(μ) μ dμ, which a dielectric coat reflects of an even sky on average. Differentiable.
 
     Args:
-        roughness: Roughness, shape (S,), at least `LEAST`.
+        roughness: Roughness, shape (S,), at least `MIN_ROUGHNESS`.
 
     Returns:
         E_avg, in [0, 1], shape (S,).
@@ -207,7 +207,7 @@ def coat_mean(roughness: Tensor) -> Tensor:
 
 def along(roughness: Tensor) -> Tensor:
     """Compute the Chebyshev polynomials of roughness (S,), shape (NODES, S). Differentiable."""
-    return _chebyshev((2 * roughness - 1 - LEAST) / (1 - LEAST), NODES)
+    return _chebyshev((2 * roughness - 1 - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), NODES)
 
 
 @cache
@@ -215,13 +215,13 @@ def degree_for(roughness: float, amplitude: float = AMPLITUDE) -> int:
     """Find the least degree above which no band has more than a fraction of a highlight's amplitude.
 
     Args:
-        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
         amplitude: Fraction of the amplitude of the band 0, of a mirror's lobe seen head-on.
 
     Returns:
         The degree, at most `MAX_DEGREE`.
     """
-    spectrum = _spectrum(max(roughness, LEAST), MAX_DEGREE)
+    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
     return int(np.count_nonzero(spectrum[1:] > amplitude))
 
 
@@ -234,13 +234,13 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
 
     Args:
         coefficients: Those of the map, shape ((degree + 1)², C).
-        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
 
     Returns:
         Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
     """
     degree = math.isqrt(len(coefficients)) - 1
-    lobe = torch.from_numpy(_spectrum(max(roughness, LEAST) * math.sqrt(NARROWER), degree))[bands(degree)]
+    lobe = torch.from_numpy(_spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER), degree))[bands(degree)]
     window = torch.ones(len(coefficients), dtype=torch.float64)
     rows = max(FEWEST_ROWS, 2 * degree)
     for width in (1.0, NARROWER):
@@ -258,13 +258,13 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
 
     Args:
         degree: Degree of the light.
-        roughness: Roughness of the smoothest surface; less than `LEAST` is taken for it.
+        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
         width: Width of the lobe relative to that surface's, as a factor of α.
 
     Returns:
         Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
     """
-    spectrum = _spectrum(max(roughness, LEAST) * math.sqrt(width), degree)
+    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
     diffuse = lambertian_factors(degree)[torch.arange(degree + 1) ** 2].numpy() / math.pi
     weight = np.hypot(spectrum, IRRADIANCE * diffuse)
     return best_window(spectrum, np.sqrt(2 * np.arange(degree + 1) + 1) * weight)
@@ -276,12 +276,12 @@ def highlight_error(degree: int, roughness: float) -> float:
 
     Args:
         degree: Degree of the light.
-        roughness: Roughness of the surface; less than `LEAST` is taken for it.
+        roughness: Roughness of the surface; less than `MIN_ROUGHNESS` is taken for it.
 
     Returns:
         The root mean square error over that of the highlight, of a mirror's lobe seen head-on.
     """
-    spectrum = _spectrum(max(roughness, LEAST), 4 * MAX_DEGREE)
+    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
     kept = np.zeros_like(spectrum)
     kept[: degree + 1] = highlight_window(degree, roughness, NARROWER)[np.arange(degree + 1) ** 2].numpy()
     power = (2 * np.arange(len(spectrum)) + 1) * spectrum**2
@@ -376,7 +376,7 @@ def _table(degree: int) -> Tensor:
     """(3 terms, M functions, NODES, 2 degree + 4) float64: coefficients of π c in products of Chebyshev polynomials of
     the roughness and, the faster index, the cosine."""
     angles = math.pi * (torch.arange(NODES, dtype=torch.float64) + 0.5) / NODES
-    roughness = (angles.cos() * (1 - LEAST) + 1 + LEAST) / 2
+    roughness = (angles.cos() * (1 - MIN_ROUGHNESS) + 1 + MIN_ROUGHNESS) / 2
     fits = torch.stack([_fit(degree, float(value)) for value in roughness])  # (NODES, 3, M, 2 degree + 4)
     return torch.einsum("kr,rtmc->tmkc", torch.linalg.inv(_chebyshev(angles.cos(), NODES).T), fits).contiguous()
 

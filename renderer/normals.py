@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_choice, require_finite
-from renderer.image import NORMALS
+from renderer.settings import NORMALS
 from renderer.vectors import unit
 
 if TYPE_CHECKING:

@@ -13,20 +13,21 @@ from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera
-from renderer.errors import FACTOR, InputError, require_bounded, require_choice, require_range
+from renderer.errors import FACTOR, InputError, describe, require_bounded, require_choice, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss
-from renderer.image import SAMPLES, ImageSettings, as_background, composite, samples_per_side
+from renderer.image import as_background, composite
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh, require_mesh
-from renderer.rasterizer import NAMES, choose
+from renderer.rasterizer import choose
+from renderer.settings import DEFAULT_SAMPLES, RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.shapes import sphere
 from renderer.transport.operators import build_operators
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
-from renderer.validation import as_list, as_tensor, describe, require_kind, require_number
+from renderer.validation import as_list, as_tensor, require_kind, require_number
 from renderer.views import TransferOperators
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def render(
     cameras = _listed(cameras)
     _require_scale(albedo_scale)
     _require_gloss(gloss)
-    require_choice("rasterizer", rasterizer, NAMES)
+    require_choice("rasterizer", rasterizer, RASTERIZERS)
     light = None if light is None else _as_light(light)
     albedo = None if albedo is None else _as_albedo(albedo)
     vertices = None if vertices is None else as_tensor("vertices", vertices)
@@ -191,7 +192,7 @@ def precompute_transfer(
     *,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
-    samples: int = SAMPLES,
+    samples: int = DEFAULT_SAMPLES,
     encoding: str = "linear",
     normals: str = "smooth",
     shadows: bool = False,
@@ -212,7 +213,7 @@ def precompute_transfer(
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     _require_scale(albedo_scale)
     _require_gloss(gloss)
-    require_choice("rasterizer", rasterizer, NAMES)
+    require_choice("rasterizer", rasterizer, RASTERIZERS)
     operators = build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
     return TransferOperators(operators)
 

@@ -14,9 +14,10 @@ from torch import Tensor
 from renderer.camera import Camera
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.image import ImageSettings, decode
+from renderer.image import decode
 from renderer.light.basis import SplitLight
 from renderer.mesh import Mesh
+from renderer.settings import ImageSettings
 from renderer.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.silhouettes import moving_outlines
 from renderer.transport.lamp_paths import LocalLightView

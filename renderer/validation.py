@@ -7,29 +7,18 @@ numbers and choices of names are checked in `renderer.errors`.
 from __future__ import annotations
 
 import os
-import reprlib
-import types
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from functools import cache
-from numbers import Integral, Real
+from collections.abc import Iterable, Mapping, Set
+from numbers import Integral
 from pathlib import Path
-from typing import Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import InputError
+from renderer.errors import InputError, describe, is_flag, is_number
 
 _NUMBERS = "fiu"  # NumPy's letters for the types of floating-point numbers and of integers
-_NOUNS: dict[Any, str] = {
-    int: "a whole number",
-    float: "a number",
-    bool: "True or False",
-    str: "a string",
-    list: "a list",
-    type(None): "None",
-}
 
 
 def as_tensor(name: str, value: object) -> Tensor:
@@ -69,7 +58,7 @@ def as_tensor(name: str, value: object) -> Tensor:
             keeps_precision = isinstance(value, np.ndarray) and array.dtype.kind == "f"
             dtype = None if keeps_precision else torch.get_default_dtype()
             return torch.as_tensor(array, dtype=dtype)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of numbers")
+    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name)
 
 
 def as_integers(name: str, value: object) -> Tensor:
@@ -90,7 +79,7 @@ def as_integers(name: str, value: object) -> Tensor:
         array = _as_numbers(value)
         if array is not None and (array.dtype.kind in "iu" or not array.size):
             return torch.as_tensor(array, dtype=torch.int64)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers")
+    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name)
 
 
 def _as_numbers(value: object) -> np.ndarray | None:
@@ -120,7 +109,7 @@ def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
     array = _as_numbers(value.detach().cpu() if isinstance(value, Tensor) else value)
     if array is None or (array.dtype.kind not in kinds and array.size):
         noun = "numbers" if "f" in kinds else "whole numbers"
-        raise InputError(f"{name} is {describe(value)}: give an array or a list of {noun}")
+        raise InputError(f"{name} is {describe(value)}: give an array or a list of {noun}", name)
     return value if isinstance(value, np.ndarray) else array
 
 
@@ -132,7 +121,7 @@ def as_path(name: str, value: object) -> Path:
     """
     if isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str):
         return Path(value)
-    raise InputError(f"{name} is {describe(value)}: give a path as a string")
+    raise InputError(f"{name} is {describe(value)}: give a path as a string", name)
 
 
 def as_folder(name: str, value: object) -> Path:
@@ -144,7 +133,7 @@ def as_folder(name: str, value: object) -> Path:
     path = as_path(name, value)
     existing = next((parent for parent in (path, *path.absolute().parents) if os.path.lexists(parent)), path)
     if existing.exists() and not existing.is_dir():
-        raise InputError(f"{name}={path}: {existing} is a file, give the path of a folder")
+        raise InputError(f"{name}={path}: {existing} is a file, give the path of a folder", name)
     return path
 
 
@@ -162,11 +151,11 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
     """
     without_items = isinstance(value, Tensor | np.ndarray) and not value.ndim
     if without_items or isinstance(value, str | bytes | Mapping | Set) or not isinstance(value, Iterable):
-        raise InputError(f"{name} is {describe(value)}: give {expected}")
+        raise InputError(f"{name} is {describe(value)}: give {expected}", name)
     items = list(value)
     for index, item in enumerate(items):
         if not isinstance(item, kind):
-            raise InputError(f"{name}[{index}] is {describe(item)}: give {expected}")
+            raise InputError(f"{name}[{index}] is {describe(item)}: give {expected}", name)
     return items
 
 
@@ -183,25 +172,7 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
         InputError: If the value is of another type.
     """
     if not isinstance(value, kind):
-        raise InputError(f"{name} is {describe(value)}: give {expected}")
-
-
-def is_whole(value: object) -> bool:
-    """Tell whether a value is a whole number, of Python or NumPy; True and False are none."""
-    return isinstance(value, Integral) and not isinstance(value, bool)
-
-
-def is_number(value: object) -> bool:
-    """Tell whether a value is one real number, of Python, NumPy or torch; True and False are none."""
-    if isinstance(value, Tensor | np.ndarray):
-        real = not value.is_complex() if isinstance(value, Tensor) else value.dtype.kind in _NUMBERS
-        return real and value.ndim == 0 and value.dtype not in (torch.bool, np.bool_)
-    return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def is_flag(value: object) -> bool:
-    """Tell whether a value is True or False, or 1 or 0 in their place."""
-    return isinstance(value, bool | np.bool_) or (is_whole(value) and value in (0, 1))
+        raise InputError(f"{name} is {describe(value)}: give {expected}", name)
 
 
 def require_whole(name: str, value: object) -> None:
@@ -212,7 +183,7 @@ def require_whole(name: str, value: object) -> None:
     """
     require_kind(name, value, Integral, "a whole number")
     if isinstance(value, bool):
-        raise InputError(f"{name} is {value}: give a whole number")
+        raise InputError(f"{name} is {value}: give a whole number", name)
 
 
 def require_number(name: str, value: object) -> None:
@@ -222,7 +193,7 @@ def require_number(name: str, value: object) -> None:
         InputError: If it is of another type, such as a string, a bool or None.
     """
     if not is_number(value):
-        raise InputError(f"{name} is {describe(value)}: give a number")
+        raise InputError(f"{name} is {describe(value)}: give a number", name)
 
 
 def require_flag(name: str, value: object) -> None:
@@ -232,7 +203,7 @@ def require_flag(name: str, value: object) -> None:
         InputError: If it is anything else.
     """
     if not is_flag(value):
-        raise InputError(f"{name} is {describe(value)}: give True or False")
+        raise InputError(f"{name} is {describe(value)}: give True or False", name)
 
 
 def require_seed(name: str, value: object) -> None:
@@ -243,82 +214,4 @@ def require_seed(name: str, value: object) -> None:
     """
     require_whole(name, value)
     if int(value) < 0:  # type: ignore[call-overload]
-        raise InputError(f"{name}={value}: give a whole number from 0")
-
-
-def require_field_types(settings: Any, *unchecked: str) -> None:
-    """Check the fields of a dataclass against their annotations.
-
-    Numbers, names, flags, lists, unions and other dataclasses are checked, whole numbers pass as numbers.
-
-    Args:
-        settings: Instance of a dataclass.
-        unchecked: Names of fields that take more than their annotation says.
-
-    Raises:
-        InputError: If a field holds a value of another type.
-    """
-    for name, hint in _field_hints(type(settings)).items():  # type: ignore[arg-type]  # types are hashable
-        value = getattr(settings, name)
-        if name not in unchecked and not _fits(value, hint):
-            raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}")
-
-
-@cache
-def _field_hints(kind: type) -> dict[str, Any]:
-    """Return the annotations of a dataclass's fields by name."""
-    hints = get_type_hints(kind)
-    return {name: hints[name] for name in kind.__dataclass_fields__}  # type: ignore[attr-defined]
-
-
-def _fits(value: object, hint: Any) -> bool:
-    """Tell whether a value is of an annotated type."""
-    check = _PLAIN.get(hint)
-    if check is not None:
-        return check(value)
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        return any(_fits(value, option) for option in get_args(hint))
-    if origin is list:
-        (item_hint,) = get_args(hint)
-        has_items = isinstance(value, Tensor | np.ndarray) and value.ndim > 0
-        if isinstance(value, str) or not (has_items or isinstance(value, Sequence)):
-            return False
-        return item_hint is Any or all(_fits(item, item_hint) for item in cast(Iterable[Any], value))
-    return isinstance(value, origin or hint)
-
-
-_PLAIN: dict[Any, Callable[[object], bool]] = {
-    Any: lambda value: True,
-    int: is_whole,
-    float: is_number,
-    bool: is_flag,
-    str: lambda value: isinstance(value, str),
-    type(None): lambda value: value is None,
-}
-
-
-def _expected(hint: Any) -> str:
-    """Describe an annotated type for an error."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return " or ".join(_expected(option) for option in get_args(hint))
-    if get_origin(hint) is list:
-        (item_hint,) = get_args(hint)
-        plural = {float: " of numbers", int: " of whole numbers", str: " of strings"}
-        return "a list" + plural.get(item_hint, "")
-    kind = get_origin(hint) or hint
-    return _NOUNS.get(kind) or f"{kind.__name__}(...)"
-
-
-def describe(value: object) -> str:
-    """Describe a value for an error: its shape if it has one, a short text if it is plain, its type otherwise."""
-    if isinstance(value, Tensor | np.ndarray):
-        noun = "a tensor" if isinstance(value, Tensor) else "an array"
-        return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
-    if value is None or isinstance(value, str | bytes | bool | int | float | complex | np.generic):
-        return " ".join(reprlib.repr(value).split())
-    if isinstance(value, list | tuple | dict | Set):
-        return f"the {type(value).__name__} " + " ".join(reprlib.repr(value).split())
-    if isinstance(value, type):
-        return f"the class {value.__name__}"
-    return f"of type {type(value).__name__}"
+        raise InputError(f"{name}={value}: give a whole number from 0", name)

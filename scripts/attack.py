@@ -1,26 +1,46 @@
-"""Attack a classifier through a mesh's light, shape, color or pixels: pnb-attack attack=lighting"""
+"""pnb-attack: attack a classifier through the lighting, the shape, the colors or the pixels of a mesh."""
 
-import re
-import sys
-
-sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
-from train import cli  # isort: skip (first, since the others take seconds to import)
-
-from train.attack import AttackExperimentSettings, run
+from train.command import Command
+from train.commands.settings import AttackExperimentSettings
+from train.help import HelpText
 
 
-def as_overrides(arguments: list[str]) -> list[str]:
-    """attack=lighting+geometry in Hydra's form, attack=[lighting,geometry]; a reloaded adversary is not attacked,
-    unless attack= asks for it."""
-    keys = {argument.partition("=")[0] for argument in arguments}
-    parameters = [re.sub(r"^attack=([^\[].*)$", lambda m: f"attack=[{m[1].replace('+', ',')}]", a) for a in arguments]
-    return [*parameters, *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
+def list_parameters(words: list[str]) -> list[str]:
+    """Write attack=lighting+geometry as attack=[lighting,geometry].
+
+    A reloaded adversary is not attacked, unless attack= asks for it.
+    """
+    keys = {word.partition("=")[0] for word in words}
+    listed = []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "attack" and not value.startswith("["):
+            word = f"attack=[{value.replace('+', ',')}]"
+        listed.append(word)
+    if "reload" in keys and "attack" not in keys:
+        listed.append("attack=[]")
+    return listed
 
 
-@cli.command(as_overrides)
-def main(settings: AttackExperimentSettings) -> None:
-    run(settings)
-
+main = Command(
+    name="attack",
+    settings=AttackExperimentSettings,
+    body="train.attack:run",
+    help=HelpText(
+        about="Attack a classifier through the lighting, the shape, the colors or the pixels of a mesh.",
+        examples=[
+            "pnb-attack attack=lighting classifier=efficientnet_lite0 scene.meshes=[orange.glb] label=orange",
+            "pnb-attack attack=lighting+geometry",
+            "pnb-attack reload=runs/attacks/first/0_orange/example_000",
+        ],
+        common=[
+            *("classifier", "label", "target", "out", "attack.max_steps", "attack.margin"),
+            *("scene.meshes", "scene.views", "scene.light", "scene.backgrounds"),
+        ],
+        groups=["attack"],
+    ),
+    rewrite=list_parameters,
+)
 
 if __name__ == "__main__":
     main()

@@ -1,20 +1,22 @@
-"""Is a classifier safe in strange light, and what does hardening cost? pnb-audit classifier=NAME out=audit
+"""pnb-audit: measure how safe a classifier is in unusual lighting, and what hardening costs."""
 
-An audit that was stopped goes on with the same settings, and with hardened= or photos= besides, if it had none.
-"""
+from train.command import Command
+from train.commands.settings import AuditSettings
+from train.help import HelpText
 
-import sys
-
-sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
-from train import cli  # isort: skip (first, since the others take seconds to import)
-
-from train.audit.audit import AuditSettings, run_audit
-
-
-@cli.command()
-def main(settings: AuditSettings) -> None:
-    print(f"report: {run_audit(settings)}")
-
+main = Command(
+    name="audit",
+    settings=AuditSettings,
+    body="train.audit.audit:audit",
+    help=HelpText(
+        about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
+        "An audit that was stopped continues with the same settings, and with hardened= or photos= "
+        "in addition.",
+        examples=[
+            "pnb-audit classifier=NAME meshes=[orange.glb] look_alikes=[solid:lemon] out=audit",
+        ],
+    ),
+)
 
 if __name__ == "__main__":
     main()

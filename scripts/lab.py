@@ -1,19 +1,20 @@
-"""Path-trace renders of oranges and hard negatives under a projector: pnb-lab out=lab"""
+"""pnb-lab: path-trace renders of oranges and hard negatives under a projector."""
 
-import sys
+from train.command import Command
+from train.commands.settings import LabSettings
+from train.help import HelpText
 
-sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
-from train import cli  # isort: skip (first, since the others take seconds to import)
-
-from train.lab.laboratory import write_laboratory
-from train.lab.shots import LabSettings
-
-
-@cli.command()
-def main(settings: LabSettings) -> None:
-    count = write_laboratory(settings)
-    print(f"{settings.out}: {count} renders under {settings.setups} setups")
-
+main = Command(
+    name="lab",
+    settings=LabSettings,
+    body="train.lab.laboratory:render_laboratory",
+    help=HelpText(
+        about="Path-trace renders of oranges and hard negatives under a projector.",
+        examples=[
+            "pnb-lab out=lab",
+        ],
+    ),
+)
 
 if __name__ == "__main__":
     main()

@@ -10,7 +10,7 @@ usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.s
 In the root of the clone. gpu: training speed, experiments paper and fast; cpu: training speed, experiment cpu; harden:
 experiment harden from a network, four arms; best: experiment best, alone, with TrivialAugment, and six arms without
 renders; three seeds each.
-Further settings of conf/train.yaml go to every training run. From the environment:
+Further settings of pnb-train go to every training run. From the environment:
   DATA      CIFAR-100 as data=npz reads it
   MESHES    scene.meshes, a list
   PHOTOS    a folder of photographs to score the networks on
@@ -34,7 +34,7 @@ sweep() {
 tables() {
     local experiment=$1 photographs=$2 exclude=$3 folders=("$runs/$1"/*/)
     printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
-    "$python" scripts/compare.py "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
+    "$python" -m scripts.compare "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
         "exclude=$exclude"
 }
 

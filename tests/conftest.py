@@ -1,25 +1,18 @@
 """What tests of several packages use."""
 
 import logging
-import runpy
 import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from copy import deepcopy
+from importlib import import_module
 from ipaddress import ip_address
-from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.plugins import Plugins
 from threadpoolctl import threadpool_limits
 
 from renderer.rasterizer import Rasterizer
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -51,45 +44,17 @@ def cache_home(tmp_path_factory) -> Iterator[None]:
         yield
 
 
-@pytest.fixture(autouse=True, scope="session")
-def composed_once() -> Iterator[None]:
-    """Hydra parses each file of conf/ once, and merges the files of a command's choices once, and not again at every
-    composition; it then sets the values of the overrides."""
-    Plugins.instance()  # which defines the class of these sources anew
-    source = SourcesRegistry.instance().resolve("pkg")
-    load, merge, files, merged = source.load_config, ConfigLoaderImpl._compose_config_from_defaults_list, {}, {}
-
-    def load_once(self, config_path):
-        key = self.path, config_path
-        if key not in files:
-            files[key] = load(self, config_path)
-        return deepcopy(files[key])
-
-    def merge_once(self, defaults, repo):
-        if {"train", "attack"}.isdisjoint(default.config_path for default in defaults):  # commands without a file
-            return merge(self, defaults, repo)
-        key = repr(defaults)
-        if key not in merged:
-            merged[key] = merge(self, defaults, repo)
-        return deepcopy(merged[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(source, "load_config", load_once)
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
-        yield
-
-
 @pytest.fixture
 def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
-    """`python -m train`, or a script, within this process, from another folder: the exit status."""
+    """`python -m train`, or another command, within this process, from another folder: the exit status."""
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
-        path = ROOT / ("train/__main__.py" if name == "train" else f"scripts/{name}.py")
+        module = "train.__main__" if name == "train" else f"scripts.{name}"
         monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
         try:
-            runpy.run_path(str(path), run_name="__main__")
+            import_module(module).main()
         except SystemExit as stop:
             return stop.code
         return 0

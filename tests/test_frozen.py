@@ -35,7 +35,7 @@ from torch import Tensor, nn
 
 import augment
 import renderer
-from augment.attacks.eot import EOTSettings
+from augment.attacks.settings import EOTSettings
 from augment.scene import Conditions
 from renderer.light.presets import directional
 from renderer.light.skylight import coefficients as skylight

@@ -1,6 +1,8 @@
 """Imports go one way: train → augment → renderer."""
 
 import ast
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -47,3 +49,12 @@ def test_no_import_within_the_renderer_leads_back_also_inside_functions():
         imported[name] = (members | {node.module for node in nodes}) & names.keys()
     order = list(TopologicalSorter(imported).static_order())  # CycleError names the circle
     assert order.index("renderer.normals") < order.index("renderer.mesh") < order.index("renderer.io.meshes")
+
+
+def test_settings_need_neither_torch_nor_numpy():
+    """Commands check their settings and print --help before anything that takes seconds to import."""
+    modules = [path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/settings.py")]
+    names = [name.replace("/", ".") for name in modules if name.partition("/")[0] in ALLOWED]
+    code = f"import sys; sys.modules['torch'] = sys.modules['numpy'] = None; import {', '.join(names)}"
+    assert len(names) > 2
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

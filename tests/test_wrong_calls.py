@@ -18,11 +18,11 @@ import renderer
 from augment.attacks.attack import AttackResult
 from augment.progress import Phases
 from augment.scene import Conditions
-from augment.service import RandomLightSettings
+from augment.settings import RandomLightSettings
 from renderer import InputError, harmonics, skylight
+from renderer.errors import describe
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
-from renderer.validation import describe
 from train import load_run
 from train.photographs.predictions import Predictor
 from train.photographs.scoring import evaluate_photographs, score
@@ -670,7 +670,7 @@ SCENES = [
     *calls_of("fov", lambda x: scene(fov=x), 200.0, "30", 0),
     *calls_of("vertices", lambda x: scene(vertices=x), 2.5, -1, "many", None),
     *calls_of("ground", lambda x: scene(ground=x), [1, 2, 3], "wood", 0.5, [0.5, 0.5], [None] * 3),
-    *calls_of("projector", lambda x: scene(projector=x), Projector(), {"pixels": 4}, True, 16),
+    *calls_of("projector", lambda x: scene(projector=x), Projector(), True, 16),
     *calls_of("lamps", lambda x: scene(lamps=x), LAMP, [[2, 2, 2]], True),
     *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
     *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", None, 3),

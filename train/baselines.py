@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attacks.norm_ball import StepSettings
+from augment.attacks.norm_ball import project, sample, take_step
+from augment.attacks.parameters.settings import StepSettings
 from augment.batches import as_found
 from augment.losses import label_loss
 from augment.random_streams import generator, stream_seed
@@ -91,7 +92,7 @@ def pgd(
     """Attack images by projected gradient descent from a random start (Madry et al. 2018).
 
     The steps are those of an attack on the pixels of a scene
-    (`StepSettings.take_step`), without a criterion to stop at.
+    (`norm_ball.take_step`), without a criterion to stop at.
 
     Args:
         model: Classifier of images in [0, 1], which is in eval mode meanwhile.
@@ -106,11 +107,11 @@ def pgd(
     """
     clean = to_unit(images)
     possible = partial(nearest_in_box, low=0, high=1)
-    adversarial = PGD.project(PGD.sample(clean, draws), clean, possible)
+    adversarial = project(PGD, sample(PGD, clean, draws), clean, possible)
     with as_found(model):
         for _ in range(PGD_STEPS):
             adversarial.requires_grad_(True)
             cost = -label_loss(model(adversarial), labels, absent=absent).sum()
             (gradient,) = torch.autograd.grad(cost, adversarial)
-            adversarial = PGD.take_step(adversarial.detach(), gradient, clean, possible)
+            adversarial = take_step(PGD, adversarial.detach(), gradient, clean, possible)
     return to_bytes(adversarial)

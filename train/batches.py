@@ -22,7 +22,6 @@ from train.image_files import ImageFiles
 PADDING = 4
 # The bytes of the batches that are shifted and flipped at a time.
 CHUNK_BYTES = 2**24
-FLIPS = ("random", "alternating")
 
 # Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
 Batch = tuple[Tensor, Tensor, Tensor]

@@ -10,8 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
+from augment.progress import announced
+from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
+from renderer.rasterizer import Rasterizer, choose
 from train import console
+from train.command import keyed
 
 # Linux writes a container's quota of cores into this file.
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
@@ -21,7 +25,6 @@ THREADS = torch.get_num_threads()
 # `choose_threads` chooses one thread.
 SMALL_WORK = 1e10
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
-COMPILE = ("auto", "always", "never")
 # The batch sizes for which `GraphedModel` records graphs. Validation has the largest. The batches
 # of an attack shrink, since examples leave on success.
 SIZES = (16, 32, 64, 128, 512)
@@ -222,3 +225,19 @@ class GraphedModel(nn.Module):
         logits = self._graphs(torch.cat([images, padding]))
         # The next replay writes over the result of a graph, so the result is copied.
         return logits[: len(images)].clone()
+
+
+def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
+    """Start the rasterizer.
+
+    Args:
+        settings: Settings of the renderer.
+
+    Returns:
+        The rasterizer.
+
+    Raises:
+        InputError: If it does not start on this machine. The sentence begins with its key.
+    """
+    with keyed("renderer.rasterizer"), announced("starting the rasterizer"):
+        return choose(settings.rasterizer)

@@ -4,15 +4,10 @@ import errno
 import tempfile
 from pathlib import Path
 
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
-from torch.distributed import DistError
-
 from renderer.errors import InputError, is_out_of_memory
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_NAME = 200  # characters
-HYDRAS_ADVICE = ("To append to your config", "See https:", "Config search path:")  # not for users of a command
 
 
 def one_sentence(error: BaseException) -> str | None:
@@ -20,8 +15,6 @@ def one_sentence(error: BaseException) -> str | None:
     match error:
         case InputError():
             return str(error)
-        case HydraException() | OmegaConfBaseException():
-            return _configuration_error(error)
         case UnicodeEncodeError():
             name = ascii(error.object[:LONGEST_NAME])
             return f"{name} has characters that this system or library cannot write: rename it, or set PYTHONUTF8=1"
@@ -29,25 +22,18 @@ def one_sentence(error: BaseException) -> str | None:
             return f"{error.filename or 'the output'} cannot be written ({error.strerror}): make room and start again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
-        case RuntimeError() if isinstance(error, DistError) or "/gloo/" in str(error):  # NCCL's, gloo's, by its file
+        case RuntimeError() if _is_of_another_process(error):
             return "another process of this run has ended: fix what ended it, and go on with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
             return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
     return None
 
 
-def _configuration_error(error: Exception) -> str:
-    """The text of Hydra or OmegaConf, which names the key or the override, without its advice."""
-    if isinstance(error, OmegaConfBaseException):
-        key, text = error.full_key, str(error).partition("\n")[0]
-    else:
-        key, text = getattr(error, "override", None), str(error)
-        for advice in HYDRAS_ADVICE:
-            text = text.partition(advice)[0]
-    text = " ".join(text.split()).removesuffix(".")
-    if isinstance(error.__cause__, OmegaConfBaseException) and "merging" in text:
-        text = f"{text}: {str(error.__cause__).partition(chr(10))[0]}"
-    return text if not key or key in text else f"{key}: {text}"
+def _is_of_another_process(error: RuntimeError) -> bool:
+    """Tell whether NCCL or gloo lost another process. gloo names its own source file."""
+    from torch.distributed import DistError
+
+    return isinstance(error, DistError) or "/gloo/" in str(error)
 
 
 def writable_folder(folder: str | Path, key: str) -> Path:

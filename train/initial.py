@@ -15,15 +15,8 @@ from train.cache import TensorCache
 from train.checkpoint import content_hash
 from train.data import HELD_OUT, DataSet
 from train.device import MixedPrecision
-from train.networks import (
-    CLASSIFIER,
-    WIDERESNET,
-    describe,
-    is_classifier,
-    load_selected,
-    of_one_architecture,
-)
-from train.settings import ExperimentSettings
+from train.networks import CLASSIFIER, describe, is_classifier, load_selected, of_one_architecture
+from train.settings import WIDERESNET, ExperimentSettings
 
 # What a network has in common with one that begins with its weights.
 SHARED = ("classes", "size", "name", "depth", "width")

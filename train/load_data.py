@@ -1,14 +1,15 @@
 """The data set that a run's settings name."""
 
 from renderer.errors import require_choice, require_range
-from renderer.image import LARGEST_SIZE
+from renderer.settings import MAX_SIZE
 from train import console
 from train.cache import TensorCache, cache_folder
+from train.command import keyed
 from train.data import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled
 from train.initial import Initial
 from train.processes import first_process_first
 from train.rendered_shapes import load_shapes
-from train.settings import SMALLEST_SIZE, ExperimentSettings, keyed
+from train.settings import MIN_SIZE, ExperimentSettings
 
 # Pixels per side of the images of a folder, where neither data.size nor the network begun with
 # says it.
@@ -35,7 +36,7 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
     with first_process_first():
         data = _load(name, settings, initial)
     with keyed("data.path"):
-        require_range("image size", data.size, SMALLEST_SIZE, LARGEST_SIZE)
+        require_range("image size", data.size, MIN_SIZE, MAX_SIZE)
     return data
 
 

@@ -35,8 +35,9 @@ from train.data import Split
 from train.device import GraphedModel, MixedPrecision, compiles
 from train.loss import TrainingLoss
 from train.processes import Interruption, replicated, summed
-from train.recipe import TrainSettings, build_optimizer
+from train.recipe import build_optimizer, learning_rate
 from train.run_folder import PHASES, RunLog
+from train.settings import TrainSettings
 
 # Images that are evaluated at a time.
 EVALUATION_BATCH = 512
@@ -324,7 +325,7 @@ class Trainer:
         # Each epoch of a soup has the whole schedule.
         done = progress if settings.soup else (self.epoch + progress) / settings.epochs
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.rate(done)
+            group["lr"] = learning_rate(settings, done)
         images = self._baseline.apply(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
         sums = torch.zeros(2, device=self.device)

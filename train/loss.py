@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from augment.losses import divergence, is_right, label_loss, ranking_loss
 from renderer.image import to_unit
-from train.recipe import TrainSettings
+from train.settings import TrainSettings
 
 
 class TrainingLoss:

@@ -24,8 +24,9 @@ from renderer.errors import InputError, in_one_line
 from renderer.io.files import write_whole
 from renderer.validation import as_path, require_kind
 from train.checkpoint import BEST, VERSION, checked, load
+from train.settings import WIDERESNET, published
 
-WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
+TORCHVISION, PYTHON = "torchvision:", "python:"
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
 DROPOUT_LEVELS = 2**16
 Color = Sequence[float]  # (3,) RGB
@@ -261,10 +262,6 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
 
 
-def published(run: Path) -> Path:
-    """The path, or where there is none the file or folder below pretrained/ of the installation or the clone."""
-    homes = (Path(__file__).parent, Path(__file__).parents[1]) if run.parts[:1] == ("pretrained",) else ()
-    return next((path for path in (run, *(home / run for home in homes)) if path.exists()), run)
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:

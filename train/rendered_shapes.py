@@ -16,10 +16,11 @@ from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene import Scene
 from renderer.camera import OrthographicCamera
-from renderer.image import ImageSettings, to_bytes
+from renderer.image import to_bytes
 from renderer.light.presets import ambient, directional
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shapes import SOLIDS, solid
 from train import console
 from train.cache import TensorCache, source_key

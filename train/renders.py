@@ -7,17 +7,19 @@ from torch import Tensor
 
 from augment import distributed
 from augment.build import build_scene
-from augment.classifiers.adapter import class_index, label_names
+from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene import Scene
 from augment.service import AugmentationService
 from renderer.errors import InputError
 from train import console
+from train.command import keyed
 from train.data import DataSet
+from train.device import choose_rasterizer
 from train.photographs.folder import find_photographs, load_photographs
 from train.processes import first_process_first
-from train.settings import OTHER, ExperimentSettings, chosen_rasterizer, keyed
+from train.settings import OTHER, ExperimentSettings, label_names
 
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
@@ -75,7 +77,7 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
 
 def _build_scene(settings: ExperimentSettings, size: int, device: torch.device, phases: Phases) -> Scene:
     """Build the scene of a run's meshes, in the first process before the others."""
-    rasterizer = chosen_rasterizer(settings.renderer)
+    rasterizer = choose_rasterizer(settings.renderer)
     console.info("rasterizer: %s", rasterizer.description)
     with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
         return build_scene(

@@ -45,7 +45,7 @@ from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS
 from train.photographs.predictions import BATCH, Model, Predictor, compute_logits
 from train.photographs.scoring import Scores, evaluate_photographs, format_scores
-from train.recipe import freeze
+from train.recipe import freeze, learning_rate
 from train.renders import build_service
 from train.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
 from train.settings import ExperimentSettings
@@ -185,8 +185,8 @@ class Run:
         # Each epoch of a soup has the whole schedule.
         if recipe.epochs == planned or recipe.soup:
             return
-        rate = recipe.rate(self.trainer.epoch / recipe.epochs)
-        rate_before = recipe.rate(self.trainer.epoch / planned)
+        rate = learning_rate(recipe, self.trainer.epoch / recipe.epochs)
+        rate_before = learning_rate(recipe, self.trainer.epoch / planned)
         change = f"train.epochs={recipe.epochs}, not {planned}"
         console.warning(
             "%s, stretches train.schedule=%s: the learning rate goes on at %.3g, not %.3g",

@@ -32,8 +32,9 @@ from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
 from train.checkpoint import BEST, LAST, PREVIOUS
+from train.command import program
 from train.networks import selected_file
-from train.settings import ExperimentSettings, dotted, mapped
+from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, mapped
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
 RENDERS = "renders"  # sub-folder with the images of the epochs
@@ -41,18 +42,6 @@ BEFORE = "before"  # sub-folder with the scores of the network that the run bega
 EXAMPLE = 128  # px: the least side of the examples of an attack
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
-
-# Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
-CIRCUMSTANCES = (
-    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
-    *("inputs", "test_images", "overwrite"),
-    *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
-)
-INPUTS = (
-    *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
-    *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
-    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos", "laboratory"),
-)
 
 
 @contextmanager
@@ -176,6 +165,16 @@ def decisive_settings(settings: Any) -> dict[str, object]:
 def _moved(value: Any, folder: str, to: str) -> Any:
     """A setting, or nested ones, whose paths in a folder lie in another one instead."""
     return mapped(value, lambda text: to + text.removeprefix(folder) if f"{text}/".startswith(f"{folder}/") else text)
+
+
+def given_command(overrides: Sequence[str]) -> str:
+    """Return the command line of a training run without the run's folder.
+
+    Args:
+        overrides: The overrides of the run.
+    """
+    words = [text for text in overrides if not text.startswith(("run=", "train.resume="))]
+    return shlex.join([*program("train"), *words])
 
 
 def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:

@@ -1,83 +1,119 @@
-"""The schema of conf/train.yaml, a dataclass, and how a command's configuration is read into its dataclass."""
+"""Settings of training. This module imports neither torch nor NumPy; see `renderer.settings`."""
+
+from __future__ import annotations
 
 import re
-import shlex
-import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from copy import deepcopy
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_type_hints
+from typing import Any
 
-import hydra
-from hydra import initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
-from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from augment.settings import (
+    MAX_EXAMPLES,
+    AugmentationSettings,
+    ObjectSettings,
+    RendererSettings,
+    SceneSettings,
+    count_views,
+)
+from renderer.errors import FACTOR, InputError, describe, is_whole, require_range
+from renderer.settings import (
+    MAX_SIZE,
+    MAX_VIEWS,
+    Settings,
+    setting,
+    setting_like,
+    settings_from,
+)
 
-from augment.build import RendererSettings, SceneSettings, count_views
-from augment.classifiers.adapter import label_names
-from augment.distributed import world_size
-from augment.objects import ObjectSettings
-from augment.progress import announced
-from augment.service import AugmentationSettings
-from renderer.errors import InputError, in_one_line, require_range
-from renderer.image import LARGEST_SIZE
-from renderer.rasterizer import Rasterizer, choose
-from train.errors import one_sentence
-from train.networks import WIDERESNET, published
-from train.recipe import TrainSettings
-
-Settings = TypeVar("Settings")
-_schema = cache(OmegaConf.structured)  # since OmegaConf takes as long to make it as to read a configuration into it
-REQUIRED = "${required:}"  # in a file of conf/: a value is to be given; ??? would leave the default of another file
-OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
-PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
+OTHER = "other"  # class of a hard negative that the classifier has no class for
+PHOTOGRAPHS = "photographs"  # sub-folder of a run with the scores on photographs without a name
 RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
-SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
-MOST_IMAGES, MOST_WORKERS, LARGEST_SEED = 10**6, 1024, 2**63 - 1
-TEXTS = {  # keys whose values are names or paths, also where they look like numbers
-    *("run", "sweep", "init_from", "out", "photos", "path", "folder", "cache"),
-    *("weights", "light", "label", "target", "classifier", "name", "reload"),
-}
+WIDERESNET = "wideresnet"
+ALL_BUT_LAST = "all_but_last"  # only the last layer learns, as in Kirichenko et al. 2023
+DATA_SETS = ("cifar100", "npz", "folder", "unlabelled", "shapes")
+DATA_SETS_WITH_PATH = ("npz", "folder", "unlabelled")
+SCHEDULES = ("step", "cosine", "one_cycle")
+FLIPS = ("random", "alternating")
+TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
+OPTIMIZERS = ("sgd", "adamw")
+COMPILE = ("auto", "always", "never")
+GROUPS = ("source", "mesh")  # columns of photos.csv by which scores are grouped
+MIN_SIZE = 5  # pixels per side, since images are padded by reflection
+MAX_IMAGES = 10**6
+MAX_WORKERS = 1024
+MAX_SEED = 2**63 - 1
+TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # named by the time at which a command starts
+
+# Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
+CIRCUMSTANCES = (
+    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
+    *("inputs", "test_images", "overwrite"),
+    *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+)
+INPUTS = (
+    *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
+    *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
+    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos", "laboratory"),
+)
 
 
 @dataclass
-class DataSettings:
-    """What the choices of conf/data set between them; see the loader of each."""
+class DataSettings(Settings):
+    """The data set. Each choice of conf/data uses some of these settings."""
 
-    name: str = "shapes"
-    validation: float | None = None
-    path: str = ""
-    size: int | None = None
-    test_fraction: float = 0.1
-    workers: int = 2
-    train_per_class: int = 300
-    test_per_class: int = 60
-    seed: int = 0
+    name: str = setting("shapes", "The data set.", choices=DATA_SETS)
+    validation: float | None = setting(
+        None,
+        "Fraction of the training images of each class to validate on. "
+        "null: what train.init_from left out, otherwise 0.1.",
+    )
+    path: str = setting("", "File or folder of the data.", may_be_empty=True)
+    size: int | None = setting(
+        None,
+        "Pixels per side. null: the size of train.init_from, otherwise 32.",
+        minimum=MIN_SIZE,
+        maximum=MAX_SIZE,
+    )
+    test_fraction: float = setting(
+        0.1,
+        "Fraction of the images to test on, if the folder has no sub-folder `test`: "
+        "of each class, or of photographs without labels 1,000 at most.",
+    )
+    workers: int = setting(
+        2,
+        "Processes that read images larger than 64 pixels per side, which stay on disk.",
+        minimum=0,
+        maximum=MAX_WORKERS,
+    )
+    train_per_class: int = setting(300, "Training images per class of shapes.", minimum=1, maximum=MAX_IMAGES)
+    test_per_class: int = setting(60, "Test images per class of shapes.", minimum=1, maximum=MAX_IMAGES)
+    seed: int = setting(0, "Seed of the shapes.", minimum=0, maximum=MAX_SEED)
 
     def __post_init__(self) -> None:
-        if self.size is not None:
-            require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
-        require_range("seed", self.seed, 0, LARGEST_SEED)
-        require_range("workers", self.workers, 0, MOST_WORKERS)
-        for name in ("train_per_class", "test_per_class"):
-            require_range(name, getattr(self, name), 1, MOST_IMAGES)
+        super().__post_init__()
+        if self.name in DATA_SETS_WITH_PATH and not self.path:
+            raise InputError(f"path is not set: give the path of the data={self.name}", "path")
 
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """hard_negatives: like meshes, of other classes than `label`, or of one of several; of no class, unless a mapping
-    names one."""
+    """The scene of the renders: by default, the paper's two meshes in front of five backgrounds."""
 
-    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0", "solid:orange:1"])
-    backgrounds: list[Any] = field(default_factory=lambda: [0.0, 0.25, 0.5, 0.75, 1.0])
-    views: int | None = None
-    hard_negatives: list[Any] = field(default_factory=list)
+    meshes: list[Any] = setting_like(SceneSettings, "meshes", ["solid:orange:0", "solid:orange:1"])
+    backgrounds: list[Any] = setting_like(SceneSettings, "backgrounds", [0.0, 0.25, 0.5, 0.75, 1.0])
+    views: int | None = setting(
+        None,
+        "Number of cameras per mesh, at equal azimuths. null: as many as augment.examples needs.",
+        minimum=1,
+        maximum=MAX_VIEWS,
+    )
+    hard_negatives: list[Any] = setting(
+        [],
+        "Objects of other classes than the label, or of one of several labels. "
+        "A mapping {mesh, label} names its class. A file alone is of no class.",
+    )
 
     @property
     def objects(self) -> int:
@@ -86,247 +122,342 @@ class TrainingSceneSettings(SceneSettings):
 
 
 @dataclass
-class ModelSettings:
-    """name: as `train.networks.build_network` takes it. The rest is the WideResNet's."""
+class ModelSettings(Settings):
+    """The network to train."""
 
-    name: str = WIDERESNET
-    depth: int = 16
-    width: int = 4
-    dropout: float = 0.3
+    name: str = setting(WIDERESNET, "wideresnet, torchvision:NAME or python:package.module:function.")
+    depth: int = setting(16, "Depth of the WideResNet.")
+    width: int = setting(4, "Width of the WideResNet.")
+    dropout: float = setting(0.3, "Dropout of the WideResNet.")
 
     @property
     def shape(self) -> dict[str, Any]:
-        """What a network of this name is built from, and what is stored beside its weights."""
+        """What a network of this name is built from, and what is stored with its weights."""
         if self.name == WIDERESNET:
             return {"depth": self.depth, "width": self.width, "dropout": self.dropout}
         return {"name": self.name}
 
 
 @dataclass
-class EvaluationSettings:
-    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: skip broken."""
+class TrainSettings(Settings):
+    """How the network is trained. The defaults are the paper's recipe."""
 
-    photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
-    skip_unreadable: bool = False
+    init_from: str | None = setting(
+        None,
+        "Network with whose weights the training starts: a run folder, a network's file, or a "
+        "classifier: efficientnet_lite0, torchvision:NAME, timm:NAME or "
+        "python:package.module:function. null: random weights.",
+    )
+    epochs: int = setting(150, "Number of passes over the training images.", minimum=1, maximum=10**6)
+    images_per_epoch: int | None = setting(
+        None,
+        "Number of training images, drawn anew for each epoch. null: all.",
+        minimum=1,
+        maximum=10**9,
+    )
+    batch_size: int = setting(128, "Images per training step.", minimum=1, maximum=10**6)
+    accumulate: int = setting(
+        1,
+        "Number of parts of a batch that pass through the network one after another, if memory is short.",
+        minimum=1,
+        maximum=10**6,
+    )
+    optimizer: str = setting("sgd", "Optimizer. adamw decays no biases and norms.", choices=OPTIMIZERS)
+    learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=FACTOR)
+    momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
+    weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=FACTOR)
+    clip_gradient: float | None = setting(
+        None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=FACTOR
+    )
+    freeze: str | None = setting(
+        None,
+        "Name of the last module of the network that stays as it is. "
+        "all_but_last: only the last layer learns. null: all layers learn.",
+    )
+    schedule: str = setting(
+        "step",
+        "Schedule of the learning rate. step: times 0.2 at 30%, 60% and 80% of the training.",
+        choices=SCHEDULES,
+    )
+    flips: str = setting(
+        "random",
+        "Horizontal flips: half of the images at random, or each image in every other epoch (alternating).",
+        choices=FLIPS,
+    )
+    augmentation: str = setting("none", "Augmentation of every training image.", choices=AUGMENTATIONS)
+    label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
+    ranking: float = setting(
+        0.0,
+        "Weight of the loss that ranks the images of `label` in a batch above the others.",
+        minimum=0,
+        maximum=FACTOR,
+    )
+    distillation: float = setting(
+        0.0,
+        "Weight of the divergence from the predictions of the network train.init_from. "
+        "On renders, this counts classes other than `label`.",
+        minimum=0,
+        maximum=FACTOR,
+    )
+    ema_decay: float = setting(
+        0.0,
+        "Decay of the moving average of the weights, which is validated and kept. 0: none.",
+        minimum=0,
+        below=1,
+    )
+    soup: bool = setting(
+        False,
+        "Start each epoch with train.init_from again, and keep the mean of the networks of all epochs (a model soup).",
+    )
+    eval_mode: bool | None = setting(
+        None,
+        "Train in evaluation mode: with the running statistics of train.init_from and without "
+        "dropout. null: only a third-party classifier.",
+    )
+    precision: str = setting(
+        "auto",
+        "Precision of the training. auto: bfloat16 if the hardware computes in it, otherwise "
+        "float16 on a GPU and float32 on a CPU, where depthwise convolutions always take float32.",
+    )
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+    threads: int | None = setting(
+        None,
+        "CPU threads, on which the last bits depend. "
+        "null: all cores that the process may use, or one for small batches.",
+        minimum=1,
+        maximum=1024,
+    )
+    compile: str = setting("auto", "Compile the training step. auto: CUDA graphs on one GPU.", choices=COMPILE)
+    deterministic: bool = setting(
+        False,
+        "Compute the same bits every time on a GPU, which is slower. The results of a CPU always repeat.",
+    )
+    checkpoint_every: int = setting(
+        1,
+        "Epochs between two checkpoints. A single process also writes one about every minute.",
+        minimum=1,
+        maximum=10**6,
+    )
+    resume: bool = setting(
+        False,
+        "Resume from the last checkpoint in `run`. run=FOLDER train.resume=true is enough.",
+    )
+    cache: str | None = setting(
+        "auto",
+        "Folder of rendered data sets and predictions. auto: ~/.cache/parametric-norm-balls. null: none.",
+    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.distillation or self.soup or self.eval_mode) and not self.init_from:
+            needed = "distillation, soup and eval_mode need a network to begin with"
+            raise InputError(f"{needed}: set init_from")
+
+
+@dataclass
+class EvaluationSettings(Settings):
+    """What the trained network is scored on, besides the test set."""
+
+    # OmegaConf has no type for str | dict[str, str] | None.
+    photos: Any = setting(
+        None,
+        "Folder of photographs: a folder per class, or images of `label`. "
+        "Several folders: {photographs: A, lab: B}. null: none.",
+        is_text=True,
+    )
+    skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         photos = self.photos
-        named = isinstance(photos, dict) and all(isinstance(folder, str) for folder in photos.values())
-        if not (photos is None or isinstance(photos, str) or named):
-            raise InputError(f"photos={photos} must be a folder, or a mapping of names to folders")
+        is_mapping = isinstance(photos, dict) and all(isinstance(folder, str) for folder in photos.values())
+        if not (photos is None or isinstance(photos, str) or is_mapping):
+            expected = "must be a folder, or a mapping of names to folders"
+            raise InputError(f"photos={photos} {expected}", "photos")
         for name in self.folders:
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                raise InputError(f"photos: {name} must be a name of letters, digits, _ and -, not one of {RESERVED}")
+                expected = f"a name of letters, digits, _ and -, not one of {RESERVED}"
+                raise InputError(f"photos: {name} must be {expected}", "photos")
 
     @property
     def folders(self) -> dict[str, Path]:
         """The folders of photographs by the name of the run's sub-folder that gets their scores."""
-        named = self.photos if isinstance(self.photos, dict) else {PHOTOGRAPHS: self.photos} if self.photos else {}
+        named = self.photos if isinstance(self.photos, dict) else {}
+        if isinstance(self.photos, str):
+            named = {PHOTOGRAPHS: self.photos}
         return {str(name): published(Path(folder)) for name, folder in named.items()}
 
 
 @dataclass
-class ExperimentSettings:
-    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study, or several. weights: of the
-    classifier that `train.init_from` names. compare: arms beside it."""
+class ExperimentSettings(Settings):
+    """Settings of pnb-train: one run."""
 
-    run: str = ""
-    sweep: str = "runs/sweep"
-    overwrite: bool = False
-    seed: int = 0
-    label: Any = "orange"  # str | list[str], a union that OmegaConf has no type for
-    weights: str | None = None
-    compare: list[str] = field(default_factory=list)
-    data: DataSettings = field(default_factory=DataSettings)
-    augment: AugmentationSettings = field(default_factory=AugmentationSettings)
-    scene: TrainingSceneSettings = field(default_factory=TrainingSceneSettings)
-    renderer: RendererSettings = field(default_factory=lambda: RendererSettings(samples=8, normals="flat"))
-    model: ModelSettings = field(default_factory=ModelSettings)
-    train: TrainSettings = field(default_factory=TrainSettings)
-    evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
+    run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
+    sweep: str = setting("runs/sweep", "Folder of the runs of a --multirun, each named by its overrides.")
+    overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
+    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    label: Any = setting(  # str | list[str], for which OmegaConf has no type
+        "orange",
+        "Positive class: the class of the meshes, whose recall and false positives are measured. "
+        "Or several: [orange, apple].",
+        is_text=True,
+    )
+    weights: str | None = setting(
+        None,
+        "File of weights of the classifier train.init_from. null: its own weights, or a download.",
+    )
+    compare: list[str] = setting(
+        [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."
+    )
+    data: DataSettings = setting(DataSettings, "The data set.")
+    augment: AugmentationSettings = setting(AugmentationSettings, "The renders among the training images.")
+    scene: TrainingSceneSettings = setting(TrainingSceneSettings, "The scene of the renders.")
+    renderer: RendererSettings = setting(
+        lambda: RendererSettings(samples=8, normals="flat"),
+        "How images are rendered. The defaults are the paper's.",
+    )
+    model: ModelSettings = setting(ModelSettings, "The network. model=NAME is short for model.name=NAME.")
+    train: TrainSettings = setting(TrainSettings, "How the network is trained.")
+    evaluate: EvaluationSettings = setting(EvaluationSettings, "What the trained network is scored on.")
 
     def __post_init__(self) -> None:
-        require_range("seed", self.seed, 0, LARGEST_SEED)
+        super().__post_init__()
         label_names(self.label)
         if self.augment.renders and self.augment.arm != "folder":
-            self.augment.examples = self.views * self.scene.objects * len(self.scene.backgrounds)
-            require_range("meshes × views × backgrounds", self.augment.examples, 1, MOST_IMAGES)
+            if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
+                remedy = "an attack on the pose needs renderer.silhouettes=true"
+                raise InputError(f"renderer.silhouettes=false: {remedy}", "renderer.silhouettes")
+            backgrounds = len(self.scene.backgrounds)
+            self.augment.examples = self.views * self.scene.objects * backgrounds
+            product = "meshes × views × backgrounds"
+            require_range(product, self.augment.examples, 1, MAX_EXAMPLES)
 
     @property
     def views(self) -> int:
         """Views per mesh; see `count_views`."""
         scene = self.scene
-        return count_views(self.augment.examples, scene.objects, len(scene.backgrounds), scene.views)
+        backgrounds = len(scene.backgrounds)
+        try:
+            return count_views(self.augment.examples, scene.objects, backgrounds, scene.views)
+        except InputError as error:
+            key = "augment" if error.argument == "examples" else "scene"
+            raise error.within(key, [error.argument]) from None
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """By their keys, the meshes of the scene, and its hard negatives, of the class OTHER where they name none."""
+        """The meshes and the hard negatives of the scene by their keys.
+
+        Hard negatives that name no class are of the class OTHER.
+        """
         labels = label_names(self.label)
-        objects = {
-            f"scene.{key}[{index}]": read_object(item, label, index, f"scene.{key}")
-            for key, label in (("meshes", labels[0] if len(labels) == 1 else ""), ("hard_negatives", OTHER))
-            for index, item in enumerate(getattr(self.scene, key))
-        }
-        for key, item in objects.items():
+        label = labels[0] if len(labels) == 1 else ""
+        meshes = read_objects(self.scene.meshes, label, "scene.meshes")
+        negatives = read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
+        for key, item in (meshes | negatives).items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
-                raise InputError(f"{key} must name its class: give {{mesh: {item.mesh}, label: CLASS}}")
-            if key.startswith("scene.hard_negatives") and [item.label] == labels:
-                raise InputError(f"{key} is of the class {item.label}: name it in scene.meshes, or leave it out")
-        missing = set(labels) - {item.label for item in objects.values()}
+                remedy = f"give {{mesh: {item.mesh}, label: CLASS}}"
+                raise InputError(f"{key} must name its class: {remedy}", key)
+        for key, item in negatives.items():
+            if [item.label] == labels:
+                remedy = "name it in scene.meshes, or leave it out"
+                raise InputError(f"{key} is of the class {item.label}: {remedy}", key)
+        named = {item.label for item in (*meshes.values(), *negatives.values())}
+        missing = set(labels) - named
         if missing and len(labels) > 1:
-            raise InputError(f"label={self.label} has no mesh of {min(missing)}: name one in scene.meshes")
-        return objects
+            fault = f"label={self.label} has no mesh of {min(missing)}"
+            raise InputError(f"{fault}: name one in scene.meshes", "label")
+        return meshes | negatives
 
 
-def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
-    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own class."""
-    keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
+def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:
+    """Read a list of objects.
+
+    Args:
+        items: Files, solids or mappings.
+        label: Class of objects that name none.
+        key: Key of the list.
+
+    Returns:
+        The objects by the key of each, such as "scene.meshes[0]".
+    """
+    return {f"{key}[{index}]": read_object(item, label, f"{key}[{index}]") for index, item in enumerate(items)}
+
+
+def read_object(item: Any, label: str, key: str) -> ObjectSettings:
+    """Read one object.
+
+    Args:
+        item: A file, a solid, or a mapping with fields of `ObjectSettings`.
+        label: Class of an object that names none.
+        key: Key of the object, for errors.
+
+    Returns:
+        The object.
+
+    Raises:
+        InputError: If the mapping is wrong.
+    """
+    values = item if isinstance(item, dict) else {"mesh": item}
+    values = {"label": label, **values}
+    if is_whole(values["label"]):  # YAML takes the name of a digit for a number
+        values["label"] = str(values["label"])
+    return settings_from(ObjectSettings, values, key)
 
 
 def solid_name(mesh: str) -> str:
-    """The NAME of solid:NAME or solid:NAME:SEED; "" of a file."""
+    """Return the NAME of solid:NAME or solid:NAME:SEED, and "" for a file."""
     kind, name, *_ = [*mesh.split(":"), ""]
     return name if kind == "solid" else ""
 
 
-def quoted(text: str) -> str:
-    """The text as a value that Hydra reads as it is."""
-    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
-    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
+def label_names(label: str | int | Sequence[str | int]) -> list[str]:
+    """List the positive classes.
 
+    Args:
+        label: The name of a class, or several. A name may be given as a number.
 
-def as_override(argument: str) -> str:
-    """An argument of a command; names and paths are quoted where Hydra would read 1.10 as 1.1, or refuse an umlaut.
+    Returns:
+        The names.
 
-    InputError for an empty name, which would stand for the current folder, and for the removal of a setting.
+    Raises:
+        InputError: If there is none, or one is named twice.
+
+    >>> label_names("orange")
+    ['orange']
     """
-    if argument.startswith("~"):
-        raise InputError(f"{argument}: a setting cannot be removed: set another value")
-    key, equals, value = argument.partition("=")
-    if not equals or TEXTS.isdisjoint(key.lstrip("+").split(".")):
-        return argument
-    if not value:
-        raise InputError(f"{key} is empty: give a name, or leave it out")
-    if value[0] in "'\"~":  # quoted already, or a home folder, which Hydra refuses
-        return argument
-    try:
-        parsed = OverridesParser.create().parse_override(argument).value()
-        as_given = parsed == value or not isinstance(parsed, str | int | float)  # otherwise null, a list, a sweep ...
-    except HydraException:
-        as_given = False
-    return argument if as_given else f"{key}={quoted(value)}"
+    listed = [label] if isinstance(label, str) or is_whole(label) else label
+    expected = "the name of a class, or several"
+    if not isinstance(listed, Sequence):
+        raise InputError(f"label is {describe(label)}: give {expected}", "label")
+    for name in listed:
+        if not (isinstance(name, str) or is_whole(name)):
+            raise InputError(f"label holds {describe(name)}: give {expected}", "label")
+    names = [str(name) for name in listed]
+    if not names or len(set(names)) < len(names):
+        given = f"label=[{', '.join(names)}]"
+        raise InputError(f"{given} must name a class, or several, each once", "label")
+    return names
 
 
-def program(name: str, as_called: bool = False) -> list[str]:
-    """The words that start a command as this process was started: `pnb-NAME`, or `python` with a clone's file; for
-    several processes by torchrun. as_called: with this machine's path of the interpreter or installed command."""
-    called, count = Path(sys.argv[0]), world_size()
-    installed, command = sys.flags.safe_path or called.stem.startswith("pnb-"), f"pnb-{name}"
-    python = [sys.executable] if as_called else ["python"]
-    if installed:
-        words = [str(called) if as_called and called.stem == command else command]
-    else:
-        words = ["-m", "train"] if name == "train" else [f"scripts/{name}.py"]
-    if count > 1:
-        torchrun = [*python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
-        return [*torchrun, f"--nproc_per_node={count}", *(["--no-python"] if installed else []), *words]
-    return words if installed else [*python, *words]
+def published(run: Path) -> Path:
+    """Find a network or a folder of the installation.
 
+    Args:
+        run: A path. If there is none and it begins with pretrained/, the file or folder of that
+            name in the installation or the clone stands for it.
 
-def given_command(overrides: Sequence[str]) -> str:
-    """The command of a training run, with these overrides but without the run's folder."""
-    words = [text for text in overrides if not text.startswith(("run=", "train.resume="))]
-    return shlex.join([*program("train"), *words])
-
-
-def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """The configuration of a command under overrides; InputError with the text of Hydra, which names the override."""
-    singleton = GlobalHydra.instance()
-    running, singleton.hydra = singleton.hydra, None  # that of `pnb-train`
-    try:
-        with initialize_config_module("conf", version_base="1.3"):
-            return hydra.compose(command, [as_override(override) for override in overrides])
-    except Exception as error:  # Hydra raises several types for what it cannot read
-        raise InputError(one_sentence(error) or in_one_line(error)) from error
-    finally:
-        singleton.hydra = running
-
-
-def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Settings:
-    """The dataclass from its configuration, which stands at a key; InputError naming the key that is unknown, unset, of
-    the wrong type or, by the dataclass's own check, out of range."""
-    try:
-        plain = cast(dict[str, Any], OmegaConf.to_container(config))
-        unset = {name for name, value in dotted(plain) if value == REQUIRED}
-        merged: Any = OmegaConf.merge(_schema(kind), config)  # type: ignore[arg-type]  # types are hashable
-        if unset := unset or OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
-            raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
-        _check(merged, key)
-        return cast(Settings, OmegaConf.to_object(merged))
-    except (OmegaConfBaseException, OverflowError) as error:  # the latter for a whole number that no float holds
-        name = _wrong_key(kind, config) or getattr(error, "full_key", None) or ""
-        reason = str(getattr(error, "msg", error)).splitlines()[0]
-        raise InputError(f"{_join(key, name)}: {reason}".removeprefix(": ")) from error
-
-
-def _check(node: DictConfig, key: str) -> None:
-    """InputError with the key of the innermost dataclass that refuses its values, or of a list's wrong item."""
-    types: dict[Any, Any] = get_type_hints(OmegaConf.get_type(node))
-    for name, child in node.items():
-        items = {_join(key, str(name)): child}
-        if isinstance(child, ListConfig):
-            items = {f"{_join(key, str(name))}[{index}]": item for index, item in enumerate(child)}
-        for inner, item in items.items():
-            if isinstance(item, DictConfig) and OmegaConf.get_type(item) is not dict:
-                _check(item, inner)
-            elif types[name] in (list[str], list[float]) and OmegaConf.is_config(item):  # OmegaConf lets it pass
-                raise InputError(f"{inner}: give a plain value, not a list or mapping")
-    with keyed(key, types):
-        OmegaConf.to_object(node)
-
-
-def _wrong_key(kind: type, config: DictConfig) -> str:
-    """The key of the first value that is wrong by itself, which OmegaConf names for most values alone; "" for none."""
-    settings, plain = deepcopy(_schema(kind)), cast(dict[str, Any], OmegaConf.to_container(config))
-    for name, value in dotted(plain):
-        try:
-            OmegaConf.update(settings, name, value)
-        except AssertionError:  # OmegaConf's, within a group that is null by default
-            continue
-        except (OmegaConfBaseException, OverflowError):
-            return name
-    return ""
-
-
-def _join(key: str, name: str) -> str:
-    return f"{key}.{name}" if key else name
-
-
-@contextmanager
-def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
-    """Add the key to an InputError, whose message begins with one of a dataclass's names or with another text."""
-    try:
-        yield
-    except InputError as error:
-        message = str(error)
-        if not key or message.startswith(key):
-            raise
-        name = re.match(r"\w*", message)[0]  # type: ignore[index]
-        if name in names:
-            key, message = _join(key, name), message.removeprefix(f"{name}: ")
-        raise InputError(f"{key}: {message}") from error
-
-
-def chosen_rasterizer(settings: RendererSettings) -> Rasterizer:
-    """The rasterizer of the settings; InputError naming the key where it does not start."""
-    with keyed("renderer.rasterizer"), announced("starting the rasterizer"):
-        return choose(settings.rasterizer)
+    Returns:
+        The path that exists, otherwise `run`.
+    """
+    candidates = [run]
+    if run.parts[:1] == ("pretrained",):
+        candidates += [home / run for home in Path(__file__).parents[:2]]
+    return next((path for path in candidates if path.exists()), run)
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of nested settings, by dotted keys."""
+    """Yield the values of nested settings with their dotted keys."""
     for key, value in node.items():
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")
@@ -335,7 +466,12 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
-    """Nested settings with another text in place of each."""
+    """Return nested settings with each text changed.
+
+    Args:
+        value: A text, or nested mappings and lists.
+        change: Function of each text.
+    """
     if isinstance(value, dict):
         return {key: mapped(item, change) for key, item in value.items()}
     if isinstance(value, list):

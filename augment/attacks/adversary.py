@@ -24,7 +24,7 @@ from renderer.errors import (
     require_range,
 )
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings, to_bytes
+from renderer.image import to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.files import write_whole
 from renderer.io.images import gray_or_image, read_numbers, write_image, write_numbers
@@ -36,6 +36,7 @@ from renderer.light.files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
 from renderer.rasterizer import Rasterizer, choose
+from renderer.settings import ImageSettings
 from renderer.validation import as_folder
 
 DESCRIPTION = "adversary.json"

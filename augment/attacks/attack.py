@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
@@ -14,13 +14,11 @@ from torch import Tensor, nn
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.eot import EOTSettings, Rounded, stored
-from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import make_parameter, parameter_class
+from augment.attacks.eot import preprocessed_model, stored
 from augment.attacks.parameters.light import environment_light
-from augment.attacks.parameters.lighting import Lighting
-from augment.attacks.parameters.settings import PARAMETER_NAMES, ParameterSettings
-from augment.attacks.problem import AttackProblem
+from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.problem import AttackProblem, build_problem
+from augment.attacks.settings import AttackSettings
 from augment.batches import BatchSize
 from augment.classifiers.adapter import Classifier, class_index, require_classifier
 from augment.degree import NOTICED, with_needed_degree
@@ -28,120 +26,11 @@ from augment.losses import logit_gap
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import InputError, is_whole
 from renderer.light.harmonics import irradiance_error
-from renderer.validation import (
-    as_list,
-    is_whole,
-    require_field_types,
-    require_flag,
-    require_kind,
-    require_seed,
-)
+from renderer.validation import as_list, require_flag, require_kind, require_seed
 
 LEAST_LIKELY = "least_likely"  # in place of a target class
-MOST_NOISE = 255.0  # steps of 8 bits: the whole range of values
-NOISE_MARGIN = 2.0  # times the range of the leads with noise and without
-
-
-@dataclass
-class AttackSettings(ParameterSettings):
-    """What an attack changes, and how it descends. The defaults are careful: the light stays physically possible, and a
-    success survives a camera's noise and 8 bits; the paper has allow_negative=True, margin=0, rounded=False and
-    sensor_noise=0.
-
-    The settings of each parameter are those of `ParameterSettings`.
-
-    max_steps: renders after the first; the paper's appendix C has 30. shorten: undo a step that did not lower the cost,
-    and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
-    the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
-    view. rounded: the classifier gets images of 8 bits. eot: descend on the mean over random transformations.
-    sensor_noise: a success counts if it remains in each of three images that a camera stores, with Gaussian noise of
-    this standard deviation before they are rounded to 8 bits, in steps of 8 bits (1/255); 0 counts without noise. It is
-    counted once, at the end. noise_margin: an example also goes on until its least lead, with such noise and without,
-    is this many times the range of these leads; None is 2 where pose or material is attacked, and 0 otherwise.
-    allow_negative: any coefficients of light. If False, the light is first made one that something can emit (of
-    harmonics: radiance nowhere negative, of the same mean and the most alike irradiance), whatever is attacked. Each
-    step on the light then ends in the nearest such coefficients, whose mean may differ from what the step asked for.
-    batch_size: images per pass through the classifier, fewer where memory runs out.
-    """
-
-    max_steps: int = 30
-    shorten: bool = False
-    restarts: int = 0
-    margin: float = 2.0
-    rounded: bool = True
-    sensor_noise: float = 1.0
-    noise_margin: float | None = None
-    eot: EOTSettings = field(default_factory=EOTSettings)
-    allow_negative: bool = False
-    batch_size: int = 32
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        require_range("max_steps", self.max_steps, 0, 10**6)
-        require_range("restarts", self.restarts, 0, 10**6)
-        require_range("margin", self.margin, 0, FACTOR)
-        require_range("sensor_noise", self.sensor_noise, 0, MOST_NOISE)
-        require_range("noise_margin", self.noise_margin, 0, FACTOR)
-        require_range("batch_size", self.batch_size, 1, 10**6)
-        if self.lighting and self.skylight:
-            raise InputError("lighting and skylight both set the light: choose one of them")
-        unlimited = any(settings.radius is None for settings in self.parameters.values())
-        if self.restarts and unlimited:
-            raise InputError(
-                "restarts draws from the norm-balls: set the radius of every parameter, or restarts=0",
-            )
-
-    @property
-    def lead_over_noise(self) -> float:
-        """The `noise_margin` in use: 0 where the noise is not to be asked about."""
-        if not self.sensor_noise:
-            return 0.0
-        if self.noise_margin is not None:
-            return self.noise_margin
-        needed = any(parameter_class(name).needs_noise_margin for name in self.parameters)
-        return NOISE_MARGIN if needed else 0.0
-
-    def require_parameters(self) -> None:
-        """Check that something is to be changed.
-
-        Raises:
-            InputError: If there are no settings of any parameter.
-        """
-        if not self.parameters:
-            names = ", ".join(PARAMETER_NAMES)
-            raise InputError(
-                f"attack: name what to change, such as attack=lighting; there are {names}",
-            )
-
-    def preprocessed_model(self, classifier: nn.Module) -> nn.Module:
-        """Return the classifier, behind rounding to 8 bits if the images are rounded.
-
-        Args:
-            classifier: A model from images in [0, 1] to logits.
-        """
-        return Rounded(classifier) if self.rounded else classifier
-
-    def problem(self, scene: Scene) -> AttackProblem:
-        """Return what an attack with these settings changes of a scene.
-
-        Args:
-            scene: The scene to attack.
-
-        Returns:
-            The scene and its parameters. Unless light may be negative, the
-            light of the scene is first made physically possible.
-        """
-        if not self.allow_negative:
-            scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
-        parameters = []
-        for name, settings in self.parameters.items():
-            options = {}
-            if name == Lighting.name:
-                options["nonnegative"] = not self.allow_negative
-            parameters.append(make_parameter(name, scene, settings, **options))
-        return AttackProblem(scene, parameters)
 
 
 @dataclass(frozen=True)
@@ -187,8 +76,8 @@ class AttackResult:
 
     @property
     def preprocessed_model(self) -> nn.Module:
-        """Classifier with its preprocessing; see `AttackSettings.preprocessed_model`."""
-        return self.settings.preprocessed_model(self.classifier)
+        """Classifier with its preprocessing; see `augment.attacks.eot.preprocessed_model`."""
+        return preprocessed_model(self.settings, self.classifier)
 
     @property
     def success(self) -> Tensor:
@@ -295,9 +184,9 @@ def attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     scene = with_needed_degree(scene, settings.material)
-    problem = settings.problem(scene)
+    problem = build_problem(settings, scene)
     warn_of_changed_light(scene, problem.scene)
-    model = settings.preprocessed_model(classifier)
+    model = preprocessed_model(settings, classifier)
 
     images_before = problem.images(problem.start)
     logits_before = logits_of(model, images_before, settings.batch_size)
@@ -427,8 +316,9 @@ def require_clean_correct(
     ]
     images = f"{len(misclassified)} of {source.numel()} images of {item.name}"
     raise InputError(
-        f"{images} are not classified as {item.label!r} before any attack "
-        f"(the first: {', '.join(most_probable)}): change the scene, or set force=True"
+        f"force=False, and {images} are not classified as {item.label!r} before any attack "
+        f"(the first: {', '.join(most_probable)}): change the scene, or set force=True",
+        "force",
     )
 
 

@@ -13,7 +13,7 @@ by repeating the step
 
     x ← project(x − length · step(∂cost/∂x)).
 
-`StepSettings.take_step` takes this step: it scales the gradient, and returns the
+`norm_ball.take_step` takes this step: it scales the gradient, and returns the
 nearest values that are feasible and lie in the norm-ball. The length is 1. With
 backtracking (`AttackSettings.shorten`), a step that does not lower the cost is
 undone and tried again at half its length.
@@ -46,8 +46,8 @@ from augment.random_streams import generator
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from augment.attacks.attack import AttackSettings
     from augment.attacks.problem import AttackProblem
+    from augment.attacks.settings import AttackSettings
 
 
 @dataclass(frozen=True)

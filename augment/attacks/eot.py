@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,49 +9,12 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
+from augment.attacks.settings import AttackSettings, EOTSettings
 from augment.random_streams import generator
-from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
-from renderer.validation import require_field_types
 
 # Draws of the noise of a sensor, all of which an adversary must survive.
 NOISE_DRAWS = 3
-
-
-@dataclass
-class EOTSettings:
-    """Random transformations of an image over which an attack takes the expectation.
-
-    The method is EOT (Athalye et al. 2018).
-
-    Attributes:
-        draws: Transformations of each image at each step, in addition to the
-            image as it is, from 0 to 1000.
-        jitter: Largest movement of the camera, as a fraction of the width of
-            the image, in radians, and as a fraction of the distance, from 0 to
-            0.5.
-        exposure: Largest change of the exposure, up or down, in stops from 0 to
-            5.
-        noise: Standard deviation of the noise of pixel values, from 0 to 1.
-        jpeg: Lowest quality of JPEG compression, from 1 to 100.
-
-    Raises:
-        InputError: If a setting is out of range.
-    """
-
-    draws: int = 0
-    jitter: float = 0.03
-    exposure: float = 0.2
-    noise: float = 0.02
-    jpeg: int = 75
-
-    def __post_init__(self) -> None:
-        require_field_types(self)
-        require_range("draws", self.draws, 0, 1000)
-        require_range("jitter", self.jitter, 0, 0.5)
-        require_range("exposure", self.exposure, 0, 5)
-        require_range("noise", self.noise, 0, 1)
-        require_range("jpeg", self.jpeg, 1, 100)
 
 
 class Rounded(nn.Module):
@@ -74,6 +36,16 @@ class Rounded(nn.Module):
 def _round_to_bytes(images: Tensor) -> Tensor:
     """Return images in [0, 1], rounded to 8 bits, in their own type."""
     return to_unit(to_bytes(images)).to(images)
+
+
+def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Module:
+    """Return the classifier, which first rounds its images to 8 bits if the settings say so.
+
+    Args:
+        settings: Settings of the attack.
+        classifier: A model from images in [0, 1] to logits.
+    """
+    return Rounded(classifier) if settings.rounded else classifier
 
 
 def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) -> Iterator[Tensor]:

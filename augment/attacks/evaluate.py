@@ -23,9 +23,10 @@ from augment.attacks.attack import (
     require_result,
 )
 from augment.attacks.descent import Goal, descend
-from augment.attacks.norm_ball import StepSettings
+from augment.attacks.eot import preprocessed_model
 from augment.attacks.parameters import parameter_class
-from augment.attacks.problem import AttackProblem
+from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.progress import progress
@@ -166,7 +167,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
         parameters = result.settings.parameters.items()
         balls = {name: _scaled(settings, scale) for name, settings in parameters}
         scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
-        problem = scaled_settings.problem(result.problem.scene)
+        problem = build_problem(scaled_settings, result.problem.scene)
         _descend_further(result, problem, values, adversarial)
         random = _success_by_draws(result, random, partial(problem.sample, draws))
         rows.append(
@@ -497,7 +498,7 @@ class _Adversaries:
         logits = self._logits(images, classifier)
         predicted_before = predictions(logits_before, classifier.classes)
         success_in_views = fooled_in_views(
-            settings.preprocessed_model(classifier),
+            preprocessed_model(settings, classifier),
             images,
             logits.argmax(2),
             torch.tensor(self.examples, dtype=torch.long),
@@ -549,7 +550,7 @@ class _Adversaries:
         settings = self.result.settings
         if not len(images):
             return torch.empty(0, images.shape[1], len(classifier.classes))
-        model = settings.preprocessed_model(classifier)
+        model = preprocessed_model(settings, classifier)
         return logits_of(model, images, settings.batch_size).cpu()
 
 

@@ -1,11 +1,15 @@
 """All parameters that an attack changes, as one vector of values."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from augment.attacks.parameters import make_parameter
+from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.settings import AttackSettings
 from augment.progress import progress
 from augment.scene import Conditions, Scene
 
@@ -158,3 +162,25 @@ class AttackProblem:
         """Split values of shape (A, D) into pairs of a parameter and its values."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))
+
+
+def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
+    """Return what an attack with these settings changes of a scene.
+
+    Args:
+        settings: Settings of the attack.
+        scene: The scene to attack.
+
+    Returns:
+        The scene and its parameters. Unless light may be negative, the
+        light of the scene is first made physically possible.
+    """
+    if not settings.allow_negative:
+        scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
+    parameters = []
+    for name, steps in settings.parameters.items():
+        options = {}
+        if name == Lighting.name:
+            options["nonnegative"] = not settings.allow_negative
+        parameters.append(make_parameter(name, scene, steps, **options))
+    return AttackProblem(scene, parameters)

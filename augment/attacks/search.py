@@ -8,11 +8,14 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from augment.attacks.attack import AttackSettings, logits_of, source_labels
-from augment.build import SceneSettings
+from augment.attacks.attack import logits_of, source_labels
+from augment.attacks.eot import preprocessed_model
+from augment.attacks.problem import build_problem
+from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.progress import progress
 from augment.scene import Scene
+from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
@@ -158,9 +161,9 @@ def _confidences(
     The examples are in as many groups of equal size, shape (groups,). An error
     counts as a confidence of 0.
     """
-    problem = attack.problem(scene)
+    problem = build_problem(attack, scene)
     images = problem.images(problem.start)
-    logits = logits_of(attack.preprocessed_model(classifier), images, attack.batch_size)
+    logits = logits_of(preprocessed_model(attack, classifier), images, attack.batch_size)
     probabilities = logits.softmax(2)
     labels = source_labels(scene, logits, classifier)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]

@@ -11,7 +11,6 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -20,9 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from augment.losses import log_odds
-from renderer.errors import InputError, in_one_line, is_out_of_memory, require_range
-from renderer.image import LARGEST_SIZE
-from renderer.validation import as_list, as_tensor, describe, is_whole, require_kind, require_whole
+from renderer.errors import InputError, describe, in_one_line, is_out_of_memory, require_range
+from renderer.settings import MAX_SIZE
+from renderer.validation import as_list, as_tensor, require_kind, require_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -143,7 +142,7 @@ class Classifier(nn.Module):
         require_kind("name", name, str, "a string for messages")
         require_kind("function", function, Callable, "a torch.nn.Module, or a function from images to logits")
         require_whole(f"classifier={name}: size", size)
-        require_range(f"classifier={name}: size", size, 1, LARGEST_SIZE)
+        require_range(f"classifier={name}: size", size, 1, MAX_SIZE)
         self.function = function
         self.size = size
         self.classes = as_class_names(f"classifier={name}: classes", classes)
@@ -258,16 +257,6 @@ class Normalized(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         ordered = images.flip(1) if self.bgr else images
         return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
-
-
-def label_names(label: Label) -> list[str]:
-    """The classes under study. InputError: none, or one twice."""
-    listed = [label] if isinstance(label, str) or is_whole(label) else label
-    named = as_list("label", listed, str | Integral, "the name of a class, or several")
-    names = [str(name) for name in named]  # settings may read the name of a digit as a number
-    if not names or len(set(names)) < len(names):
-        raise InputError(f"label=[{', '.join(names)}] must name a class, or several, each once")
-    return names
 
 
 def class_index(classes: Sequence[str], name: str, key: str) -> int:

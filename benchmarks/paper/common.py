@@ -19,8 +19,9 @@ from torch import Tensor
 import train.networks  # noqa: F401 (whose networks are classifiers, too: run:FOLDER)
 from augment import AttackSettings, Classifier, Scene, StepSettings, load_classifier
 from augment.attacks.attack import logits_of
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import SceneObject, load_object
 from augment.scene import Example
+from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.rasterizer import choose

@@ -9,7 +9,7 @@ picture() {
     local name=$1 folder
     shift
     folder=$(mktemp -d)
-    "${PYTHON:-python}" scripts/attack.py "out=$folder/out" attack.allow_negative=true attack.margin=0 attack.rounded=false \
+    "${PYTHON:-python}" -m scripts.attack "out=$folder/out" attack.allow_negative=true attack.margin=0 attack.rounded=false \
         attack.max_steps=100 attack.checks=false attack.verify=null renderer.shadows=false "$@"
     cp "$folder"/out/0_*/example_000.png "$OUT/gallery_$name.png"
     rm -r "$folder"

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from augment.attacks.descent import Goal, descend
+from augment.attacks.problem import build_problem
 from augment.random_streams import generator
 from benchmarks.paper import common
 
@@ -24,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         for view in common.clean_correct_views(subject, classifier, args.examples, draws):
             scene = common.scene_of(subject, classifier.size, [view])
             start = time.process_time()
-            result = descend(classifier, settings.problem(scene), goal, settings)
+            result = descend(classifier, build_problem(settings, scene), goal, settings)
             row = {"success": bool(result.success[0]), "steps": int(result.steps[0])}
             common.append(args.out, {"mesh": subject.name, **row, "seconds": time.process_time() - start})
 

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 def run_attack(overrides: Sequence[str], threads: int) -> Row:
     """The numbers of one example that pnb-attack attacks, {"refusal": its sentence} where it ended in one."""
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "scripts/attack.py", f"out={folder}/out", "attack.checks=false", *overrides]
+        command = [sys.executable, "-m", "scripts.attack", f"out={folder}/out", "attack.checks=false", *overrides]
         environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode == 2:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from augment import AttackSettings, Classifier, load_classifier
 from augment.attacks.descent import Goal, descend
-from augment.attacks.problem import AttackProblem
+from augment.attacks.problem import AttackProblem, build_problem
 from augment.objects import SceneObject
 from augment.random_streams import generator
 from benchmarks.paper import common
@@ -62,7 +62,7 @@ def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[C
         scenes = [common.scene_of(subject, network.size, views) for network in (classifier, *others)]
         for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
-            problems = [settings.problem(scene) for scene in scenes]
+            problems = [build_problem(settings, scene) for scene in scenes]
             start = problems[0].start
             first, further = adversaries(classifier, problems[0], settings, subject.label, views=1)
             states = {"before": start, "first": first, "first_random": with_random_signs(first, start, draws)}
@@ -83,13 +83,13 @@ def to_views(subject: SceneObject, classifier: Classifier, index: int, args: Nam
         attacked = common.clean_correct_views(subject, classifier, count, draws)
         for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
-            problem = as_one_example(settings.problem(common.scene_of(subject, classifier.size, attacked)))
+            problem = as_one_example(build_problem(settings, common.scene_of(subject, classifier.size, attacked)))
             first, further = adversaries(classifier, problem, settings, subject.label, count)
             random = with_random_signs(further, problem.start, draws)
             states = {"first": first, "further": further, "random": random}
             predicted: dict[str, list[str]] = {name: [] for name in states}
             for part in common.batches(unseen):
-                elsewhere = settings.problem(common.scene_of(subject, classifier.size, part))
+                elsewhere = build_problem(settings, common.scene_of(subject, classifier.size, part))
                 for name, values in states.items():
                     predicted[name] += common.predictions(classifier, elsewhere.images(values.expand(len(part), -1)))
             record = {"mesh": subject.name, "label": subject.label, "set": index, "kind": kind, "attacked": count}

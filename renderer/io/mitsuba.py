@@ -24,7 +24,7 @@ from PIL import Image
 
 from renderer.camera import Camera
 from renderer.errors import InputError
-from renderer.image import ImageSettings, decode, encode, to_bytes
+from renderer.image import decode, encode, to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
 from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_of
@@ -33,8 +33,9 @@ from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.mesh import Mesh
-from renderer.microfacets import LEAST, coat_mean
+from renderer.microfacets import coat_mean
 from renderer.normals import corner_normals
+from renderer.settings import MIN_ROUGHNESS, ImageSettings
 
 SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
@@ -256,7 +257,8 @@ def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_sca
         # The light's scale has the albedo's. F0 is 0.08 × specular, and 0.04 for a refractive index of 1.5.
         specular = min(strength / 2 / max(albedo_scale, 1e-6), 1.0)
         material = {"type": "principled", "base_color": albedo, "specular": specular}
-        for index, (name, factor, least) in enumerate((("roughness", roughness, LEAST), ("metallic", metallic, 0.0))):
+        factors = (("roughness", roughness, MIN_ROUGHNESS), ("metallic", metallic, 0.0))
+        for index, (name, factor, least) in enumerate(factors):
             material[name] = max(factor, least)
             if part.factors is not None:
                 image = np.maximum(part.factors[..., index] * factor, 255 * least).round().astype(np.uint8)
@@ -270,5 +272,5 @@ def _kept(gloss: np.ndarray) -> float:
     """Compute the fraction of the albedo that a gloss (3,) reflects of an even sky, as metal or below the coat, on
     average over all directions."""
     roughness, metallic, strength = torch.from_numpy(gloss).double()[:, None]
-    below = 1 - strength * coat_mean(roughness.clamp(min=LEAST))
+    below = 1 - strength * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))
     return float(metallic + (1 - metallic) * below)

@@ -16,14 +16,8 @@ from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_range
 from renderer.light.ball import Ball, nearest_in_box
-from renderer.light.harmonics import (
-    MAX_DEGREE,
-    basis,
-    degree_of,
-    lambertian_factors,
-    nonzero_coefficients,
-    select_rows,
-)
+from renderer.light.harmonics import basis, degree_of, lambertian_factors, nonzero_coefficients, select_rows
+from renderer.settings import MAX_DEGREE
 from renderer.validation import require_whole
 from renderer.vectors import unit
 

@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_range
+from renderer.settings import MAX_DEGREE
 from renderer.validation import as_tensor, require_whole
 from renderer.vectors import unit
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 MAX_QUADRATURE = 10**4  # degree of a quadrature, whose directions are as many as its square
 MAX_TEXELS = 10**6  # texels on a side of an environment map
 ORTHONORMAL = 1e-3  # largest error of a product of rotation and its inverse, also of one that is written by hand
-MAX_DEGREE = 40  # of lights: gloss of roughness 0.2 shows so much
 DIFFUSE_DEGREE = 20  # of what reaches diffuse surfaces; the bands above are worth 0.015 of a beam's irradiance at most
 Constant = TypeVar("Constant")
 

@@ -17,7 +17,8 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.io.mitsuba_entries import pose_of
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.files import read_light
-from renderer.validation import as_array, as_tensor, require_field_types
+from renderer.settings import require_field_types
+from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes
 
 # Neighboring samples cast rays to different points of a disc: to one of SETS

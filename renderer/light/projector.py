@@ -14,7 +14,7 @@ from renderer.errors import FACTOR, require_range
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
-from renderer.validation import require_field_types
+from renderer.settings import require_field_types
 
 MAX_PIXELS = 256  # The largest number of pixels per side.
 

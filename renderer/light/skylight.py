@@ -19,12 +19,12 @@ from safetensors.torch import load_file
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_finite
+from renderer.errors import InputError, is_number, require_finite
 from renderer.light.basis import HARMONICS
-from renderer.validation import as_tensor, is_number
+from renderer.settings import TURBIDITY
+from renderer.validation import as_tensor
 
 ZENITH = (0.0, math.pi / 2)  # from overhead to the horizon, both included
-TURBIDITY = (2.0, 10.0)  # from clear to hazy; 1 would be pure air
 
 _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
 _ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])

@@ -22,8 +22,8 @@ import numpy as np
 
 from renderer.errors import InputError, require_choice
 from renderer.rasterizer import opengl
+from renderer.settings import RASTERIZERS
 
-NAMES = ("auto", "opengl", "numba", "numpy")
 SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
 
 
@@ -53,7 +53,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     "auto" takes numba where it is installed, else numpy, so that images are the same on every machine. InputError: an
     unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
-    require_choice("rasterizer", rasterizer, NAMES)
+    require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
         return Rasterizer("opengl", f"opengl ({opengl.device()})")
     if rasterizer != "numpy":

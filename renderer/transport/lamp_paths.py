@@ -10,9 +10,9 @@ from torch import Tensor
 
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss, at_samples
-from renderer.image import ImageSettings
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.mesh import Mesh
+from renderer.settings import ImageSettings
 from renderer.transport.rays import Rays, Surface
 from renderer.vectors import unit, unit_vectors
 

@@ -25,18 +25,12 @@ from renderer.camera import Camera
 from renderer.errors import LARGEST, InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.gloss import Gloss, SampleGloss, at_samples
-from renderer.image import (
-    ImageSettings,
-    as_background,
-    background_term,
-    composite,
-    encode,
-    encode_gradient,
-)
+from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
+from renderer.settings import ImageSettings
 from renderer.transport.lamp_paths import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface

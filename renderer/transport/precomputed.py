@@ -27,9 +27,9 @@ from renderer.albedo import surface_albedo
 from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.gloss import SampleGloss, at_samples
-from renderer.image import ImageSettings
 from renderer.light.basis import Basis, Harmonics
 from renderer.mesh import Mesh, refine
+from renderer.settings import ImageSettings
 from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
 

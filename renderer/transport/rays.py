@@ -19,10 +19,10 @@ from torch import Tensor
 from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
-from renderer.image import ImageSettings
 from renderer.light.harmonics import per_degree
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
+from renderer.settings import ImageSettings
 from renderer.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit
 

@@ -13,10 +13,10 @@ import augment
 from augment.objects import SceneObject
 from augment.scene import Example, Scene
 from renderer.camera import OrthographicCamera
-from renderer.image import ImageSettings
 from renderer.light.presets import ambient
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 
 SIZE = 6
 FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ((0.9, 0.3), (1.3, 1.9), (1.1, 3.5)))

@@ -10,9 +10,9 @@ from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.settings import MaterialSettings
 from augment.build import build_scene
 from augment.degree import Smoothest, degree_of_scene, reached_gloss
-from augment.objects import ObjectSettings, PropSettings
 from augment.scene import Scene
-from augment.variation import VariationSettings, VarnishSettings, vary
+from augment.settings import ObjectSettings, PropSettings, VariationSettings, VarnishSettings
+from augment.variation import vary
 from renderer.gloss import Gloss, smoothest
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map

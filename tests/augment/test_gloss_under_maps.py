@@ -14,12 +14,12 @@ from augment.build import build_scene
 from renderer.camera import Camera
 from renderer.fragments import build_fragments
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings
 from renderer.light.environment import read_map, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.presets import mean_luminance, probe
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shapes import solid
 from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface

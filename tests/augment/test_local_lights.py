@@ -6,11 +6,12 @@ import torch
 
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import make_parameter
+from augment.attacks.parameters.settings import StepSettings
 from augment.attacks.problem import AttackProblem
-from augment.build import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
+from augment.build import build_local_light
 from augment.scene import Conditions, Scene
+from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
@@ -35,7 +36,7 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
 
 @pytest.mark.parametrize("kind", LOCAL_LIGHTS)
 def test_each_kind_of_local_light_has_settings_an_attack_and_a_file(kind, tmp_path):
-    basis, coefficients = LOCAL_LIGHT_SETTINGS[kind.name]().build()
+    basis, coefficients = build_local_light(LOCAL_LIGHT_SETTINGS[kind.name]())
     assert type(basis) is kind and coefficients.shape == (basis.size, 3)
     assert kind.name in {item.name for item in fields(SceneSettings)}
     assert kind.name in {item.name for item in fields(augment.AttackSettings)}
@@ -97,7 +98,7 @@ def test_a_joint_attack_lowers_the_cost_and_is_reloaded_and_rendered_alike_by_mi
     found = reload(tmp_path)
     assert torch.equal(found.light, written.light) and found.basis == written.basis
     torch.testing.assert_close(found.render(choose("numpy")), done.images[0], rtol=0, atol=1e-6)
-    projector, pattern = ProjectorSettings(6, power=2.0, pattern=str(tmp_path / "projector.png")).build()
+    projector, pattern = build_local_light(ProjectorSettings(6, power=2.0, pattern=str(tmp_path / "projector.png")))
     torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=projector.power / 255)
 
     pytest.importorskip("mitsuba")
@@ -124,13 +125,13 @@ def test_a_table_receives_the_projection_and_the_shadow():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ProjectorSettings(pattern="gone.png").build(), r"pattern: gone\.png"),
-        (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.positions=nan"),
-        (lambda: LampsSettings([[1, 0]]).build(), r"lamps: give positions"),
-        (lambda: LampsSettings(start=[[11, 0, 0]] * 4).build(), r"start=.* to power=10$"),
+        (lambda: build_local_light(ProjectorSettings(pattern="gone.png")), r"pattern: gone\.png"),
+        (lambda: build_local_light(LampsSettings([[math.nan, 0, 3]])), r"a coordinate of lamps\.positions=nan"),
+        (lambda: build_local_light(LampsSettings([[1, 0]])), r"lamps: give positions"),
+        (lambda: build_local_light(LampsSettings(start=[[11, 0, 0]] * 4)), r"start=.* to power=10$"),
         (
             lambda: make_parameter("projector", scene(projector=None), StepSettings()),
-            r"no projector: set scene\.projector",
+            r"^projector: the scene has no projector",
         ),
         (lambda: make_parameter("positions", scene(lamps=None), StepSettings()), "the scene has no lamps"),
     ],
@@ -149,11 +150,11 @@ def test_moved_lamps_stay_in_their_norm_ball_and_are_read_where_they_ended(tmp_p
     after = Adversary.of(done.problem.scene, 1, done.conditions, done.images_before[1], done.images[1])
     write_adversary(after, tmp_path)
     torch.testing.assert_close(reload(tmp_path).render(choose("numpy")), done.images[1], rtol=0, atol=1e-6)
-    lamps, powers = LampsSettings(start=str(tmp_path / "lamps.json")).build()
+    lamps, powers = build_local_light(LampsSettings(start=str(tmp_path / "lamps.json")))
     assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[1])
     assert torch.equal(powers, after.light[-len(powers) :])
     with pytest.raises(InputError, match=r"projector\.json: its basis is 'projector', give one of lamps"):
-        LampsSettings(start=str(tmp_path / "projector.json")).build()
+        build_local_light(LampsSettings(start=str(tmp_path / "projector.json")))
 
 
 def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator(monkeypatch):

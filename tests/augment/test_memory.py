@@ -8,9 +8,8 @@ from torch import nn
 
 from augment import AugmentationService, AugmentationSettings, memory, scene
 from augment.build import build_scene
-from augment.camera_effects import CameraEffectSettings
 from augment.memory import require_memory
-from augment.service import TrainingAttackSettings
+from augment.settings import CameraEffectSettings, TrainingAttackSettings
 from renderer.errors import InputError
 from renderer.image import to_bytes
 

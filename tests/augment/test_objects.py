@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from augment.objects import ObjectSettings, PropSettings, another_instance, load_object, on_ground, rotated
+from augment.objects import another_instance, load_object, on_ground, rotated
+from augment.settings import ObjectSettings, PropSettings
 from renderer.errors import InputError
 from renderer.mesh import normalize
 from renderer.shapes import solid

@@ -7,9 +7,10 @@ from torch import Tensor
 
 import augment
 from augment.scene import Conditions, Scene
-from renderer.image import ENCODINGS, decode, encode
+from renderer.image import decode, encode
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ENCODINGS
 from renderer.shapes import solid
 from renderer.transport.operators import build_operators
 

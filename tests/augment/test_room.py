@@ -7,11 +7,11 @@ import torch
 import renderer
 from augment import room
 from renderer.camera import OrthographicCamera, PerspectiveCamera
-from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh, concatenate, normalize
+from renderer.settings import ImageSettings
 from renderer.transport.rays import Rays
 
 SIZE, FAR = 32, 1000.0

@@ -11,23 +11,23 @@ from PIL import Image
 import renderer
 from augment import relighting
 from augment.attacks.adversary import Adversary, reload, write_adversary
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.settings import SkylightSettings
+from augment.attacks.parameters.settings import SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem
-from augment.build import build_scene, count_views, load_backgrounds
-from augment.objects import ObjectSettings, load_object
+from augment.build import build_scene, load_backgrounds
+from augment.objects import load_object
 from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
+from augment.settings import ObjectSettings, count_views
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
-from renderer.image import ImageSettings
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
 from renderer.light.presets import ambient, probe
 from renderer.microfacets import degree_for
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.transport.operators import build_operators
 
 EPS32 = torch.finfo(torch.float32).eps
@@ -44,7 +44,7 @@ def random_lights(count: int, seed: int = 0) -> torch.Tensor:
 def test_views_follow_from_examples_meshes_and_backgrounds():
     assert count_views(100, 2, 5, None) == count_views(100, 2, 5, 10) == 10 and count_views(None, 7, 5, 36) == 36
     for impossible in ((100, 3, 5, None), (None, 2, 5, None), (100, 2, 5, 9), (100, 0, 5, None)):
-        with pytest.raises(InputError, match=r"^augment.examples=.* is not|must not be empty"):
+        with pytest.raises(InputError, match=r"^examples=.* is not|must not be empty"):
             count_views(*impossible)
 
 

@@ -7,19 +7,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
-from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters.settings import StepSettings
 from augment.build import build_scene
 from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene import Conditions, Scene
-from augment.service import (
-    AugmentationService,
-    AugmentationSettings,
-    RandomLightSettings,
-    Renders,
-    TrainingAttackSettings,
-)
-from augment.variation import VariationSettings
+from augment.service import AugmentationService, Renders
+from augment.settings import AugmentationSettings, RandomLightSettings, TrainingAttackSettings, VariationSettings
 from renderer.errors import InputError
 from renderer.light.presets import probe
 from renderer.shapes import solid

@@ -13,20 +13,27 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import augment
-from augment.build import LampsSettings, ProjectorSettings
 from augment.camera_effects import draw_camera_effects
-from augment.objects import ObjectSettings, PropSettings
 from augment.patterns import draw_patterns
 from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.variation import VariationSettings, VarnishSettings, vary
+from augment.settings import (
+    LampsSettings,
+    ObjectSettings,
+    ProjectorSettings,
+    PropSettings,
+    VariationSettings,
+    VarnishSettings,
+)
+from augment.variation import vary
 from renderer.errors import InputError
-from renderer.image import ImageSettings, decode, encode
+from renderer.image import decode, encode
 from renderer.io.images import read_image
 from renderer.light.basis import HARMONICS
 from renderer.light.files import save_light
 from renderer.light.presets import ambient, load_light, probe
 from renderer.mesh import Mesh
+from renderer.settings import ImageSettings
 
 SIZE = 48
 LIGHT = ambient(torch.full((3,), 0.1))

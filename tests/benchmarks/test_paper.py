@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from augment import Classifier, attack
+from augment.attacks.problem import build_problem
 from augment.objects import SceneObject
 from augment.random_streams import generator
 from benchmarks.paper import common, light_change, norm_balls, rendering_quality, run_time, survival, table, transfer
@@ -118,7 +119,7 @@ def test_light_without_its_negative_radiance_is_the_same_where_there_is_none():
 
 @pytest.mark.parametrize("kind", common.STEPS)
 def test_views_that_share_a_light_or_shape_have_the_sum_of_their_gradients(kind):
-    problem = common.attack_settings(kind).problem(a_scene())
+    problem = build_problem(common.attack_settings(kind), a_scene())
     shared = transfer.as_one_example(problem)
     together, apart = shared.start.clone().requires_grad_(), problem.start.clone().requires_grad_()
     views, images = shared.render(together, torch.tensor([0])), problem.render(apart, problem.everything)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import roots_legendre
 
 from renderer.light.harmonics import basis
-from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
+from renderer.light.skylight import ZENITH, coefficients
+from renderer.settings import TURBIDITY
 
 # Preetham et al., appendix A.2: A to E of Perez's formula for Y, x and y, as slope and offset in turbidity.
 PEREZ = np.array(

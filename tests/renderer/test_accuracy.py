@@ -26,12 +26,12 @@ from torch import Tensor
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings
 from renderer.light.basis import Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import ambient
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import Rasterizer, choose
+from renderer.settings import ImageSettings
 from renderer.shading import radiance
 from renderer.transport import rays
 from renderer.transport.operators import build_operators

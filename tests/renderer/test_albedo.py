@@ -13,10 +13,10 @@ from scipy.ndimage import map_coordinates
 from renderer.albedo import face_albedo, painted_albedo, surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ENCODINGS, ImageSettings
 from renderer.io.texture_bake import with_added_albedo
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ENCODINGS, ImageSettings
 
 EPS = torch.finfo(torch.float64).eps
 ABOVE = OrthographicCamera(0, -math.pi / 2, 2.0)  # x is right, y is up

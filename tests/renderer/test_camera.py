@@ -13,9 +13,9 @@ import trimesh
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.transport.rays import Surface
 
 EPS = np.finfo(np.float64).eps

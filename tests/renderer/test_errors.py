@@ -10,11 +10,12 @@ from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import build_fragments
-from renderer.image import ImageSettings, tonemap
+from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shading import irradiance, normals_in_sight, radiance
 from renderer.transport.operators import build_operators
 

@@ -10,11 +10,11 @@ import renderer
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fitting import FINAL_GRID, LEAST_RADIANCE, _nonnegative_light, fit_scene
-from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
+from renderer.settings import ImageSettings
 
 FAR = OrthographicCamera(0.9, 2.0, 3.0, 0.2, -0.1)
 NEAR = PerspectiveCamera(1.1, 1.0, 3.0, 0.2, -0.1, distance=6.0)

@@ -9,8 +9,8 @@ import trimesh
 
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")

@@ -13,7 +13,6 @@ from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.gloss import Gloss, SampleGloss
-from renderer.image import ImageSettings
 from renderer.io.mitsuba import load, mitsuba, mitsuba_map, shape
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import Harmonics, LightPaths, LocalBasis, SplitLight
@@ -22,9 +21,10 @@ from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate, normalize, subdivide
-from renderer.microfacets import AMPLITUDE, LEAST, degree_for, highlight_window, reflectance
+from renderer.microfacets import AMPLITUDE, degree_for, highlight_window, reflectance
 from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
+from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
 from renderer.shapes import solid, sphere
 from renderer.transport.lamp_paths import _reflectance
@@ -99,7 +99,7 @@ def test_reflectance_is_that_of_gltf_and_of_fresnel():
 
 def test_degree_for_is_the_least_above_which_no_band_has_the_amplitude():
     directions, solid_angles = hemisphere(120)
-    for roughness in (LEAST, 0.3, 0.6):
+    for roughness in (MIN_ROUGHNESS, 0.3, 0.6):
         lobe = gltf_reflectance(1.0, directions, roughness, 1, 0) * directions[:, 2] * solid_angles
         amplitudes = lobe @ np.polynomial.legendre.legvander(directions[:, 2], 45)
         degree = degree_for(roughness)
@@ -111,7 +111,7 @@ def test_a_highlight_under_its_window_is_nowhere_negative():
     """Of lobes seen head-on, at the design's roughness and above, by Legendre series at 2,000 angles."""
     angles = np.cos(np.linspace(0, math.pi, 2000))
     directions, solid_angles = hemisphere(160)
-    for roughness in (LEAST, 0.25, 0.5):
+    for roughness in (MIN_ROUGHNESS, 0.25, 0.5):
         degree = degree_for(roughness)
         window = highlight_window(degree, roughness, 0.7)[torch.arange(degree + 1) ** 2].numpy()
         lobe = gltf_reflectance(1.0, directions, roughness * math.sqrt(0.7), 1, 0) * directions[:, 2] * solid_angles
@@ -124,7 +124,7 @@ def test_an_even_sky_is_never_exceeded():
     """A white furnace: white surfaces of any gloss, from every side. Dielectrics meet it."""
     steps = [torch.linspace(0, 1, count, dtype=torch.float64) for count in (41, 17, 3, 2)]
     cosine, rough, metallic, strength = (values.flatten() for values in torch.meshgrid(*steps, indexing="ij"))
-    gloss = SampleGloss(LEAST + (1 - LEAST) * rough, metallic, strength)
+    gloss = SampleGloss(MIN_ROUGHNESS + (1 - MIN_ROUGHNESS) * rough, metallic, strength)
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
     colored, white, _ = gloss.transfer(UP.expand_as(views), views, 0)
     diffuse = gloss.diffuse(UP.expand_as(views), views) * gloss.entering_bands(0)[0] / math.pi
@@ -409,7 +409,7 @@ def test_roughness_that_no_light_shows_is_said_and_values_out_of_range_are_refus
     mesh, light = solid("pear"), positive_light(6)
     with pytest.warns(UserWarning, match="0.2"):
         mirror = render(mesh, CAMERA, light, 8, gloss=Gloss(0.0))
-    assert torch.equal(mirror, render(mesh, CAMERA, light, 8, gloss=Gloss(LEAST)))
+    assert torch.equal(mirror, render(mesh, CAMERA, light, 8, gloss=Gloss(MIN_ROUGHNESS)))
     for gloss in (Gloss(1.5), Gloss(0.5, -0.1), Gloss(0.5, strength=torch.ones(3)), Gloss(float("nan"))):
         with pytest.raises(InputError, match=r"roughness|metallic|strength"):
             render(mesh, CAMERA, light, 8, gloss=gloss)

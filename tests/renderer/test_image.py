@@ -3,7 +3,8 @@ import pytest
 import torch
 from oracles import linear_of, srgb_of
 
-from renderer.image import ENCODINGS, background_term, decode, encode, tonemap
+from renderer.image import background_term, decode, encode, tonemap
+from renderer.settings import ENCODINGS
 
 EPS = torch.finfo(torch.float64).eps
 

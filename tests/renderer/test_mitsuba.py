@@ -21,9 +21,10 @@ from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.environment import write_map
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shapes import solid
 from renderer.transport import rays
-from renderer.transport.operators import ImageSettings, build_operators
+from renderer.transport.operators import build_operators
 
 pytest.importorskip("mitsuba")
 

@@ -9,13 +9,14 @@ from torch import Tensor
 
 import renderer
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, NORMALS, ImageSettings, as_background, encode
+from renderer.image import as_background, encode
 from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.light.projector import Projector
 from renderer.rasterizer import choose
 from renderer.rendering import light_sphere
+from renderer.settings import ENCODINGS, NORMALS, ImageSettings
 from renderer.transport.operators import build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps

@@ -18,10 +18,11 @@ from renderer import shading
 from renderer.albedo import surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings, background_term, tonemap
+from renderer.image import background_term, tonemap
 from renderer.light.harmonics import DIFFUSE_DEGREE, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.shading import radiance
 
 EPS = torch.finfo(torch.float64).eps

@@ -12,11 +12,11 @@ import renderer
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS, SumBasis
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.transport.operators import build_operators
 from renderer.views import TransferOperators
 

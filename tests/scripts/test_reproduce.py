@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from train.settings import ExperimentSettings, compose, read_settings
+from train.__main__ import main as train_command
 
 ROOT = Path(__file__).parents[2]
 INPUTS = {"DATA": "cifar100.npz", "MESHES": "[a.glb,{mesh:b.glb,albedo_scale:3.0}]", "PHOTOS": "photos", "LAB": "lab"}
@@ -63,11 +63,11 @@ def test_every_training_is_valid_and_ends_in_tables_of_all_its_runs(tmp_path, co
     for call in trained:
         swept = ("seed=", "augment=", "train.augmentation=")
         overrides = [word.split(",")[0] if word.startswith(swept) else word for word in call[3:]]
-        run = read_settings(ExperimentSettings, compose("train", overrides))
+        run = train_command.read(overrides)
         assert (run.data.path, run.train.checkpoint_every) == ("cifar100.npz", 5)
         assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}]
         assert [*run.evaluate.folders] == sorted({*scores, "photographs"}, reverse=True)
-    compared = [call for call in calls if call[0] == "scripts/compare.py"]
-    assert [call[2] for call in compared] == [f"photographs={name}" for name in scores]
+    compared = [call for call in calls if call[:2] == ["-m", "scripts.compare"]]
+    assert [call[3] for call in compared] == [f"photographs={name}" for name in scores]
     for call in compared:
-        assert re.fullmatch(r"runs=\[runs/(\w+)/augment-none\+seed-0,runs/\1/augment-none\+seed-1\]", call[1])
+        assert re.fullmatch(r"runs=\[runs/(\w+)/augment-none\+seed-0,runs/\1/augment-none\+seed-1\]", call[2])

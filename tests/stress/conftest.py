@@ -3,10 +3,10 @@
 import contextlib
 import os
 import re
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 
@@ -87,12 +87,12 @@ def write_scene_files(folder: Path) -> None:
 
 def run_here(name: str, *arguments: str, folder: Path) -> int:
     """`python -m train`, or a script, without its report, in this process, in a folder: the status."""
-    path = ROOT / ("train/__main__.py" if name == "train" else f"scripts/{name}.py")
+    module = "train.__main__" if name == "train" else f"scripts.{name}"
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
-        patch.setattr(sys, "argv", [str(path), *arguments])
-        patch.setattr("train.report.page.report_of", lambda folders, out: "no report")
+        patch.setattr(sys, "argv", [f"{name}.py", *arguments])
+        patch.setattr("train.experiment.report_of", lambda folders, out: "no report")
         try:
-            runpy.run_path(str(path), run_name="__main__")
+            import_module(module).main()
         except SystemExit as stop:
             return int(stop.code or 0)
     return 0

@@ -11,8 +11,9 @@ import pytest
 from PIL import Image
 
 from tests.runs import completed_run
+from train.__main__ import main as train_command
 from train.run_folder import write_config
-from train.settings import ExperimentSettings, compose, read_settings
+from train.settings import ExperimentSettings
 
 CLASSES = ["apple", "orange", "pear"]
 TINY = [
@@ -64,7 +65,7 @@ def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
     def read(*overrides: str) -> ExperimentSettings:
         experiment = [] if any(item.startswith("experiment=") for item in overrides) else ["experiment=paper"]
         all_overrides = [*experiment, *TINY, f"data.path={tiny_npz}", *overrides]
-        return read_settings(ExperimentSettings, compose("train", all_overrides))
+        return train_command.read(all_overrides)
 
     return lambda *overrides: deepcopy(read(*overrides))
 

@@ -14,10 +14,11 @@ from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe
 from renderer.rasterizer import opengl
+from scripts.attack import main as attack_command
 from tests.runs import loaded_run
-from train.attack import AttackExperimentSettings, attacks, overrides
+from train.attack import attacks, overrides
+from train.commands.settings import AttackExperimentSettings
 from train.report.attack_tables import format_attack
-from train.settings import compose, read_settings
 
 CLASSES = ("orange", "lime", "sky")
 
@@ -25,7 +26,7 @@ CLASSES = ("orange", "lime", "sky")
 def configured(*arguments: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
     small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
-    return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.margin=0", *arguments]))
+    return attack_command.read([*small, "attack.margin=0", *arguments])
 
 
 def by_color(classes: tuple[str, ...] = CLASSES) -> Classifier:
@@ -77,7 +78,7 @@ def test_a_scene_is_searched_for_and_given_as_overrides():
     assert name == "solid:orange:0" and result.clean_correct.all()
     assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
     with pytest.raises(
-        InputError, match=r"1 of 1 images of solid:orange:0 are .* before any attack .* attack.force=true"
+        InputError, match=r"^attack\.force=.* 1 of 1 images of solid:orange:0 are .* before any attack"
     ):
         attacked("scene.search=0", classifier=classifier)
 
@@ -97,14 +98,14 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
     ("arguments", "message"),
     [
         (["attack.restarts=2"], r"restarts draws from the norm-balls: set the radius of every parameter"),
-        (["scene.meshes=[]"], r"meshes and backgrounds must not be empty"),
+        (["scene.meshes=[]"], r"^scene\.meshes must not be empty"),
         (["label=mango"], r"classifier=by_color: 'mango' is not a class of the model"),
         (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
         (["target=[[lime]]"], r"target: give a class, least_likely, or a list of classes"),
         (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
-        (["scene.meshes=[{mesh: a, props: [solid:cup]}]"], r"meshes\[0\].props: Invalid type"),
+        (["scene.meshes=[{mesh: a, props: [solid:cup]}]"], r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'"),
         (["scene.meshes=[{mesh: a, props: [{mesh: b}]}]"], r"scene.meshes\[0\].*at is not set"),
-        (["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"at=\[1.0\] must be x and y"),
+        (["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"props\[0\]\.at=\[1\] must be x and y"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

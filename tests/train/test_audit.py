@@ -10,13 +10,15 @@ import torch
 from PIL import Image
 
 import augment
-from augment.objects import ObjectSettings, load_object
+from augment.objects import load_object
 from augment.scene import Conditions
+from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
 from train.audit import audit, lights, page
-from train.audit.audit import AuditSettings, run_audit
+from train.audit.audit import run_audit
 from train.audit.lights import KINDS, Views, adversaries, success_by_light, transfers
+from train.commands.settings import AuditSettings
 from train.lab import patterns
 
 CLASSES = ("orange", "other")
@@ -187,7 +189,7 @@ def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_render
         ({"look_alikes": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
-        ({"laboratory": "nowhere"}, "look_alikes are rendered in place of laboratory=nowhere"),
+        ({"laboratory": "nowhere"}, "look_alikes are rendered instead of laboratory=nowhere"),
     ],
 )
 def test_what_cannot_be_audited_is_refused_before_anything_is_written(given, tmp_path, changes, message):

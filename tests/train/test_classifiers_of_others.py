@@ -13,10 +13,10 @@ from torchvision.models import get_model
 from augment.classifiers import load_classifier
 from renderer.errors import InputError
 from tests.runs import completed_run
+from train.__main__ import main as train_command
 from train.load_data import load_data
 from train.networks import load_run
 from train.run_folder import read_metrics
-from train.settings import ExperimentSettings, compose, read_settings
 
 NAME, SIZE = "shufflenet_v2_x0_5", 32
 KEYS = [
@@ -58,7 +58,7 @@ def tuned(weights, photos, tmp_path_factory) -> Callable[..., tuple[Path, dict[s
     def run(data: str, *overrides: str) -> tuple[Path, dict[str, float]]:
         folder = tmp_path_factory.mktemp("runs") / "run"
         keys = [*KEYS, f"data={data}", f"data.path={photos}", f"weights={weights}", f"run={folder}", *overrides]
-        settings = read_settings(ExperimentSettings, compose("train", keys))
+        settings = train_command.read(keys)
         return folder, completed_run(settings, folder)
 
     return run
@@ -98,7 +98,7 @@ def test_labeled_folders_are_scored_in_the_networks_classes_before_and_after(tun
     _, scores = tuned("folder", "train.learning_rate=1e-12")
     assert scores["test/agreement"] == 1 and scores["test/accuracy"] == scores["test/accuracy_before"]
     classifier, settings = load_classifier(f"torchvision:{NAME}", weights), ["data=folder", f"data.path={photos}"]
-    config = read_settings(ExperimentSettings, compose("train", [*KEYS, *settings, f"weights={weights}", "run=-"]))
+    config = train_command.read([*KEYS, *settings, f"weights={weights}", "run=-"])
     test = load_data(config).test
     labels = torch.tensor([classifier.label(name) for name in ("lemon", "orange")])[test.labels]
     answers = torch.cat([classifier.function(image[None] / 255.0).argmax(1) for image in test.images])

@@ -15,9 +15,12 @@ import torch
 import yaml
 
 from renderer.errors import InputError
-from train import checkpoint, cli, errors
+from train import checkpoint, command, errors
 from train.checkpoint import LAST
+from train.command import USER_ERROR, Command
+from train.commands.settings import LightSettings
 from train.errors import one_sentence, writable_folder
+from train.help import HelpText
 from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +35,7 @@ SMALL = [
 @pytest.fixture
 def no_report(monkeypatch) -> None:
     """Several trainings of a test write no pages, whose plots take longer."""
-    monkeypatch.setattr("train.report.page.report_of", lambda folders, out: "no report")
+    monkeypatch.setattr("train.experiment.report_of", lambda folders, out: "no report")
 
 
 def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_path, tiny_npz, photos):
@@ -63,7 +66,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist: give the path of an .npz file"),
         (["run=file/run"], "run=file/run cannot be written to (Not a directory): choose another folder"),
         (["run=odd"], "PATH/odd/train.log cannot be read or written: Is a directory"),
-        (["train.epoch=3"], "Could not override 'train.epoch'"),
+        (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["compare=[non]"], "compare: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
         (["--multirun", "seed=0,0"], "the sweep has a run twice"),
@@ -75,7 +78,7 @@ def test_a_mistake_is_one_line_and_status_2(call, capsys, monkeypatch, tmp_path,
     monkeypatch.setenv("PATH", str(tmp_path))
     (tmp_path / "file").touch()
     (tmp_path / "odd" / "train.log").mkdir(parents=True)
-    assert call("train", *arguments) == cli.USER_ERROR
+    assert call("train", *arguments) == USER_ERROR
     error = capsys.readouterr().err
     assert error.replace(str(tmp_path), "PATH").startswith(f"error: {sentence}") and error.count("\n") == 1
     assert not list(tmp_path.rglob("config.yaml"))
@@ -83,7 +86,7 @@ def test_a_mistake_is_one_line_and_status_2(call, capsys, monkeypatch, tmp_path,
 
 def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(call, capsys, tmp_path, tiny_npz):
     arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]"]
-    assert call("train", *arms, *SMALL, "scene.views=3") == cli.USER_ERROR
+    assert call("train", *arms, *SMALL, "scene.views=3") == USER_ERROR
     assert "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
 
@@ -92,14 +95,14 @@ def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(call
 def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_npz, busy):
     arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", "train.resume=true"]
     with locked(tmp_path / busy):
-        assert call("train", *arms, *SMALL) == cli.USER_ERROR
+        assert call("train", *arms, *SMALL) == USER_ERROR
     assert capsys.readouterr().err.startswith(f"error: run={tmp_path / busy} is being written by another process")
     assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 
 def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
-    assert call("train", "--multirun", "seed=0,1") == cli.USER_ERROR
+    assert call("train", "--multirun", "seed=0,1") == USER_ERROR
     assert "start a sweep with pnb-train --multirun" in capsys.readouterr().err
 
 
@@ -157,54 +160,53 @@ def test_nothing_is_written_to_a_folder_that_holds_no_run(call, capsys, tmp_path
         (tmp_path / name / "config.yaml").write_text(content)
     (tmp_path / "empty" / "config.yaml").unlink()
     files = sorted(tmp_path.rglob("*"))
-    assert call("train", *overrides, "train.resume=true") == cli.USER_ERROR
+    assert call("train", *overrides, "train.resume=true") == USER_ERROR
     error = capsys.readouterr().err.replace(f"{tmp_path}/", "")
     assert error.startswith(f"error: {sentence}") and error.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == files
 
 
-@pytest.mark.parametrize("stage", ["load_data.load_data", "run.evaluate_photographs"])
+@pytest.mark.parametrize("stage", ["experiment.load_data", "run.evaluate_photographs"])
 def test_ctrl_c_tells_how_to_go_on_from_a_checkpoint(call, capsys, monkeypatch, tmp_path, tiny_npz, photos, stage):
     monkeypatch.setattr(f"train.{stage}", Mock(side_effect=KeyboardInterrupt))
     arguments = "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", *SMALL
     assert call("train", *arguments) == 128 + signal.SIGINT
     advice = capsys.readouterr().out.splitlines()[-1]
-    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == (stage != "load_data.load_data")
+    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == (stage != "experiment.load_data")
 
 
 def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):
     files = {path: path.stat().st_mtime_ns for path in stopped.rglob("*")}
     for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was made with ")):
-        assert call("train", f"run={stopped}", "train.resume=true", override) == cli.USER_ERROR
+        assert call("train", f"run={stopped}", "train.resume=true", override) == USER_ERROR
         assert key in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in stopped.rglob("*")} == files
 
 
+LIGHT = Command("light", LightSettings, "builtins:print", HelpText("Write a light."))
+
+
 def test_a_librarys_warning_is_one_line_of_a_command():
-    code = "from train import cli\nimport warnings\nwith cli.handled_errors(): warnings.warn('the gloss is clamped')"
+    code = "from train.command import set_up_process\nimport warnings\nset_up_process()\nwarnings.warn('clamped')"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
-    assert (ended.returncode, ended.stderr) == (0, "warning: the gloss is clamped\n")
+    assert (ended.returncode, ended.stderr) == (0, "warning: clamped\n")
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), cli.handled_errors():
+    with pytest.raises(ZeroDivisionError), LIGHT.one_line():
         raise ZeroDivisionError
 
 
 @pytest.mark.parametrize("swallowed", [False, True])
 def test_ctrl_c_is_one_line_and_status_130_even_if_a_library_turns_it_into_an_error(capsys, swallowed):
     """As trimesh does, which keeps whatever is raised while its optional parts are imported."""
-    before = signal.signal(signal.SIGINT, cli._interrupt)  # a background job has it ignored
-    try:
-        with pytest.raises(SystemExit) as stop, cli.handled_errors():
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt:
-                if swallowed:
-                    raise TypeError("unsupported operand type(s) for |") from None
-                raise
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(SystemExit) as stop, LIGHT.one_line():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            if swallowed:
+                raise TypeError("unsupported operand type(s) for |") from None
+            raise
     assert stop.value.code == 128 + signal.SIGINT and capsys.readouterr() == ("", "ended by SIGINT\n")
 
 
@@ -216,32 +218,24 @@ class Finder:
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Finder)
 signal.signal(signal.SIGINT, signal.default_int_handler)
-runpy.run_path(sys.argv[1], run_name="__main__")
+sys.argv[1:] = []
+runpy.run_module("MODULE", run_name="__main__")
 """
 
 
-SLOW_IMPORTS = """
-import os, threading, time
-wait = threading.Event.wait
-threading.Event.wait = lambda event, seconds=None: wait(event, seconds and seconds / 50)
-from train import cli
-time.sleep(0.5)
-with cli.handled_errors():
-    print(os.environ["OMP_WAIT_POLICY"])
-"""
-
-
-def test_slow_imports_are_announced_again_and_again_and_threads_that_wait_do_not_spin():
-    done = subprocess.run([sys.executable, "-c", SLOW_IMPORTS], capture_output=True, text=True, cwd=ROOT)
-    lines = done.stderr.splitlines()
-    assert [re.findall(r"\d+", line) for line in lines][:2] == [["5"], ["15"]] and done.stdout == "PASSIVE\n"
-
-
-@pytest.mark.parametrize("path", ["train/__main__.py", "scripts/attack.py"])
-def test_an_interrupt_while_torch_is_imported_is_one_line(path):
-    command = [sys.executable, "-c", INTERRUPTED, str(ROOT / path)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)
+@pytest.mark.parametrize("module", ["train", "scripts.attack"])
+def test_an_interrupt_while_torch_is_imported_is_one_line(module):
+    code = INTERRUPTED.replace("MODULE", module)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
     assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, "", "ended by SIGINT\n")
+
+
+def test_slow_imports_are_announced(monkeypatch, tmp_path, capsys):
+    (tmp_path / "slow.py").write_text("import time\ntime.sleep(0.2)\ndef work(): pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(command, "IMPORT_DELAY", 0.01)
+    command.import_function("slow:work")()
+    assert capsys.readouterr().err == "loading PyTorch and other libraries ...\n"
 
 
 def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch, tmp_path):

@@ -14,11 +14,12 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
+from train.commands.settings import LabSettings
 from train.lab import laboratory as lab
 from train.lab import patterns
 from train.lab.laboratory import lab_parts, path_traced
 from train.lab.patterns import FAMILIES, draw_pattern
-from train.lab.shots import FOV, LabSettings, Shot, draw_shots
+from train.lab.shots import FOV, Shot, draw_shots
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -43,7 +44,7 @@ def draw(
 ) -> list[Shot]:
     maps = environments or {}
     changes |= {"patterns": list(families), "environments": list(maps), "brightness": list(brightness), "seed": seed}
-    return list(draw_shots(LabSettings(setups=setups, **changes), maps, pictures))
+    return list(draw_shots(LabSettings("out", setups=setups, **changes), maps, pictures))
 
 
 def rows(folder: Path) -> list[dict[str, str]]:

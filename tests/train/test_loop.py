@@ -9,15 +9,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment.progress import Phases
-from augment.service import AugmentationService, AugmentationSettings
+from augment.service import AugmentationService
+from augment.settings import AugmentationSettings
 from renderer.errors import InputError
 from train import checkpoint
 from train.data import Split
 from train.device import MixedPrecision
 from train.loop import Trainer, evaluate
 from train.networks import WideResNet
-from train.recipe import SCHEDULES, TrainSettings, freeze
+from train.recipe import SCHEDULE_FACTORS, freeze
 from train.run_folder import RunLog, read_metrics
+from train.settings import TrainSettings
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
 
@@ -69,12 +71,12 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
             for parameter, gradient, velocity in zip((weight, bias), gradients, velocities, strict=True):
                 gradient = gradient + 0.1 * parameter
                 velocity.mul_(0.9).add_(gradient)
-                parameter -= 0.5 * SCHEDULES["cosine"](step / 2) * (gradient + 0.9 * velocity)
+                parameter -= 0.5 * SCHEDULE_FACTORS["cosine"](step / 2) * (gradient + 0.9 * velocity)
     torch.testing.assert_close(network[1].weight, weight)
     torch.testing.assert_close(network[1].bias, bias)
     (line,) = read_metrics(tmp_path)
     assert line["train/loss"] == pytest.approx(sum(losses) / 2)
-    assert line["train/learning_rate"] == pytest.approx(0.5 * SCHEDULES["cosine"](1 / 2))
+    assert line["train/learning_rate"] == pytest.approx(0.5 * SCHEDULE_FACTORS["cosine"](1 / 2))
 
 
 def step_on(monkeypatch, folder, **settings) -> tuple[nn.Linear, dict[str, Tensor], tuple[Tensor, Tensor]]:

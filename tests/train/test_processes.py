@@ -20,9 +20,10 @@ from augment.progress import Phases
 from augment.scene import Scene
 from tests.runs import completed_run
 from train import checkpoint, loop
+from train.command import read_settings
 from train.processes import Interrupted, Interruption, process_group
 from train.run_folder import read_metrics
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[2]
 EPOCHS = 2

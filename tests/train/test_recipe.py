@@ -13,7 +13,8 @@ from renderer.image import to_unit
 from train.baselines import PGD, Baseline
 from train.loss import TrainingLoss
 from train.networks import WideResNet
-from train.recipe import AUGMENTATIONS, SCHEDULES, TRANSFORMS, TrainSettings
+from train.recipe import SCHEDULE_FACTORS
+from train.settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
@@ -37,7 +38,7 @@ def test_a_setting_out_of_range_is_named(name, value):
 
 @pytest.mark.parametrize("epochs", [10, 50, 150])
 def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent_of_the_epochs(epochs):
-    rates = [SCHEDULES["step"](epoch / epochs) for epoch in range(epochs)]
+    rates = [SCHEDULE_FACTORS["step"](epoch / epochs) for epoch in range(epochs)]
     parts = [3, 3, 2, 2]
     assert rates == [0.2**fall for fall, part in enumerate(parts) for _ in range(part * epochs // 10)]
 
@@ -53,7 +54,7 @@ PROGRESS = np.linspace(0, 1, 1001)
     ],
 )
 def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
-    np.testing.assert_allclose([SCHEDULES[schedule](progress) for progress in PROGRESS], expected, atol=1e-12)
+    np.testing.assert_allclose([SCHEDULE_FACTORS[schedule](progress) for progress in PROGRESS], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])

@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
+from train.command import read_settings
 from train.run_folder import (
     CONFIG,
     METRICS,
@@ -28,7 +29,7 @@ from train.run_folder import (
     require_same_run,
     write_config,
 )
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings
 
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):

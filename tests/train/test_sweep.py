@@ -17,7 +17,8 @@ from train import __main__ as command
 from train import loop, sweep
 from train.checkpoint import LAST
 from train.run_folder import FAILURE, LOCK, locked, read_metrics
-from train.sweep import format_sweep, run_name
+from train.run_names import run_name
+from train.sweep import format_sweep
 
 ROOT = Path(__file__).parents[2]
 USER_ERROR = 2
@@ -38,12 +39,11 @@ def run_sweep(tiny_npz):
     """`python -m train --multirun` with a small network in this process, without its logs; its exit status."""
 
     def run(folder: Path, *overrides: str) -> int | None:
-        logs = ["hydra/job_logging=none", "hydra/hydra_logging=none"]
-        arguments = ["--multirun", *SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *logs, *overrides]
+        arguments = ["--multirun", *SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", ["train", *arguments])
             try:
-                command.start()
+                command.main()
             except SystemExit as stop:
                 return stop.code
         return 0
@@ -173,7 +173,8 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
     assert "1 of 3 runs are finished\n" in printed
-    for folder, reason in [(wrong, "learning_rate=-1.0 must be positive"), (unlucky, "ZeroDivisionError: a mistake")]:
+    reasons = [(wrong, "train.learning_rate=-1.0 must be above 0"), (unlucky, "ZeroDivisionError: a mistake")]
+    for folder, reason in reasons:
         assert f"{folder}: failed: {(folder / FAILURE).read_text()}" in printed and reason in printed
 
     assert run_sweep(tmp_path, *overrides) == 1

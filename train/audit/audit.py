@@ -1,38 +1,35 @@
-"""The settings of pnb-audit, and its parts: each is measured once, written whole, and read by the page."""
+"""The parts of an audit: each is measured once, written whole, and read by the page."""
 
 import json
-import shlex
 import shutil
-import sys
 from collections.abc import Callable, Collection
 from contextlib import nullcontext, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from omegaconf import MISSING
-
 from augment.classifiers import load_classifier
-from augment.objects import ObjectSettings, load_object
-from renderer.errors import InputError, require_range
+from augment.objects import load_object
+from augment.settings import ObjectSettings
+from renderer.errors import InputError
 from renderer.io.files import write_whole
 from renderer.io.mitsuba import mitsuba
 from renderer.light.presets import UNIFORM, load_light
 from train import console
 from train.audit import page
 from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers
+from train.command import command_line
+from train.commands.settings import AuditSettings, LabSettings
 from train.device import choose_device
 from train.errors import writable_folder
 from train.lab.laboratory import write_laboratory
-from train.lab.shots import LabSettings
-from train.networks import published
 from train.photographs.folder import FOREIGN, find_photographs
 from train.photographs.predictions import Predictor
 from train.photographs.scoring import evaluate_photographs
 from train.results import RESULTS, require_replaceable
 from train.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
-from train.settings import LARGEST_SEED, program, read_object, solid_name
+from train.settings import published, read_objects, solid_name
 
 VIEWS, LIGHTS, ATTACKED, SETUPS = 24, 8, 12, 6  # views, random lights, attacked views, and setups of each pattern
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")  # that training does not throw
@@ -40,58 +37,9 @@ SPP = 48  # paths per pixel
 ADDED = ("hardened", "photos")  # keys that an audit may be given when it goes on
 
 
-@dataclass
-class AuditSettings:
-    """The settings of pnb-audit. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings."""
-
-    classifier: str = MISSING  # a name that conf/attack.yaml explains
-    weights: str | None = None  # the classifier's local weights file, if it brings none
-    hardened: str | None = None  # another classifier to show beside it, such as run:runs/harden
-    label: str = "orange"  # the class of the meshes; each class has an audit of its own
-    meshes: list[Any] = field(default_factory=list)  # of the class
-    look_alikes: list[Any] = field(default_factory=list)  # of other things, under the same lights
-    photos: str | None = None  # a folder of photographs, as pnb-evaluate takes it
-    laboratory: str | None = None  # the same of renders; null: made of the meshes, if Mitsuba is installed
-    environments: list[str] = field(default_factory=lambda: ["grace", "eucalyptus", "st_peters"])  # or maps (.hdr ...)
-    budget: float = 1.0  # factor of views, lights and renders; 1 takes EfficientNet-Lite0 18 minutes of one core
-    overwrite: bool = False  # begin anew in a folder that holds an audit or other results
-    seed: int = 0
-    device: str = "auto"  # auto | cpu | cuda | cuda:N
-    out: str = "runs/audits/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # that of an audit that was stopped goes on
-
-    def __post_init__(self) -> None:
-        require_range("budget", self.budget, 0.01, 100)
-        require_range("seed", self.seed, 0, LARGEST_SEED)
-        for name in ("meshes",) if self.laboratory else ("meshes", "look_alikes"):
-            if not getattr(self, name):
-                raise InputError(f"{name} is empty: name one mesh or more, as in {name}=[solid:orange]")
-        if self.laboratory and self.look_alikes:
-            raise InputError(
-                f"look_alikes are rendered in place of laboratory={self.laboratory}: leave one of them out"
-            )
-
-    def times(self, count: int) -> int:
-        """A count under the budget, at least 1."""
-        return max(1, round(count * self.budget))
-
-    def renders(self, out: Path, size: int) -> LabSettings:
-        """The laboratory of all patterns and environments, for renders of a size."""
-        count = self.times(SETUPS) * (len(PATTERNS) + len(self.environments))
-        meshes, patterns = [asdict(item) for items in self.read_objects() for item in items], [*PATTERNS]
-        lights: dict[str, Any] = {"patterns": patterns, "environments": self.environments, "setups": count, "spp": SPP}
-        return LabSettings(str(out), self.label, meshes, **lights, size=size, seed=self.seed)
-
-    def read_objects(self) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
-        """Meshes and look-alikes; of a class that networks may lack, unless they name one. InputError: of the wrong
-        class."""
-        meshes = [read_object(item, self.label, index, "meshes") for index, item in enumerate(self.meshes)]
-        others = [read_object(item, "", index, "look_alikes") for index, item in enumerate(self.look_alikes)]
-        for item in others:
-            item.label = item.label or FOREIGN + (solid_name(item.mesh) or Path(item.mesh).stem)
-        for key, items, own in (("meshes", meshes, True), ("look_alikes", others, False)):
-            if wrong := next((item for item in items if (item.label == self.label) != own), None):
-                raise InputError(f"{key}: {wrong.mesh} is of the class {wrong.label}, and label={self.label}")
-        return meshes, others
+def audit(settings: AuditSettings) -> None:
+    """Make the audit of pnb-audit, and print the path of its page."""
+    print(f"report: {run_audit(settings)}")
 
 
 def run_audit(settings: AuditSettings) -> Path:
@@ -100,7 +48,7 @@ def run_audit(settings: AuditSettings) -> Path:
     networks = {page.CLASSIFIER: load_classifier(settings.classifier, settings.weights).to(device)}
     if settings.hardened:
         networks[page.HARDENED] = load_classifier(settings.hardened).to(device)
-    meshes, others = settings.read_objects()
+    meshes, others = read_meshes(settings)
     given = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
     folders = {part: published(Path(folder)) for part, folder in given.items() if folder}
     for network in networks.values():
@@ -111,15 +59,15 @@ def run_audit(settings: AuditSettings) -> Path:
     objects = [load_object(item) for item in (*meshes, *others)][: len(meshes)]  # all can be read
     for name in settings.environments:
         load_light(name)  # or InputError
-    lights = [UNIFORM, *settings.environments], settings.times(LIGHTS)
-    views, attacked = (Views(objects, settings.times(n), settings.seed, device) for n in (VIEWS, ATTACKED))
+    lights = [UNIFORM, *settings.environments], settings.scale(LIGHTS)
+    views, attacked = (Views(objects, settings.scale(n), settings.seed, device) for n in (VIEWS, ATTACKED))
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite, own=_own_results(out))
     caveats, renders = list[str](), out / "renders"  # an object of the label and another in every light
     sizes = [str(network.size) for network in networks.values()]
     if len({*sizes}) > 1:
         caveats.append(f"The networks take images of {' and '.join(sizes)} pixels, and differ by that, too.")
-    lab = settings.renders(renders, max(network.size for network in networks.values()))
+    lab = laboratory_settings(settings, renders, max(network.size for network in networks.values()))
     if page.LABORATORY not in folders:
         try:
             with nullcontext() if renders.exists() and not settings.overwrite else mitsuba():
@@ -134,7 +82,7 @@ def run_audit(settings: AuditSettings) -> Path:
                 shutil.rmtree(out / name, ignore_errors=True)
         elif (out / CONFIG).exists():
             require_same(out, settings, "out=", lambda key, old, new: old is None and key in ADDED)
-        write_config(out, settings, command=shlex.join([*program("audit"), *sys.argv[1:]]))
+        write_config(out, settings, command=command_line("audit"))
         if folders.get(page.LABORATORY) == renders:
             _whole(renders, lambda path: write_laboratory(replace(lab, out=str(path))))
         for key, network in networks.items():
@@ -150,6 +98,58 @@ def run_audit(settings: AuditSettings) -> Path:
                 _part(own / page.TRANSFER, transfers, network, *rest, attacked, own)
         names = {key: network.name for key, network in networks.items()}
         return page.write_audit_page(settings.label, names, folders, out, caveats)
+
+
+def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSettings:
+    """Choose the renders of the laboratory: of all patterns and all environments.
+
+    Args:
+        settings: Settings of the audit.
+        out: Folder of the renders.
+        size: Pixels per side.
+
+    Returns:
+        Settings of the laboratory.
+    """
+    objects = [asdict(item) for items in read_meshes(settings) for item in items]
+    setups = settings.scale(SETUPS) * (len(PATTERNS) + len(settings.environments))
+    return LabSettings(
+        out=str(out),
+        label=settings.label,
+        meshes=objects,
+        setups=setups,
+        patterns=[*PATTERNS],
+        environments=settings.environments,
+        size=size,
+        spp=SPP,
+        seed=settings.seed,
+    )
+
+
+def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
+    """Read the meshes and the look-alikes.
+
+    A look-alike that names no class is of a class that networks may lack.
+
+    Args:
+        settings: Settings of the audit.
+
+    Returns:
+        The meshes of the label, and the look-alikes.
+
+    Raises:
+        InputError: If one is of the wrong class.
+    """
+    meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
+    look_alikes = [*read_objects(settings.look_alikes, "", "look_alikes").values()]
+    for item in look_alikes:
+        item.label = item.label or FOREIGN + (solid_name(item.mesh) or Path(item.mesh).stem)
+    for key, items, own in (("meshes", meshes, True), ("look_alikes", look_alikes, False)):
+        for item in items:
+            if (item.label == settings.label) != own:
+                fault = f"{item.mesh} is of the class {item.label}, and label={settings.label}"
+                raise InputError(f"{key}: {fault}", key)
+    return meshes, look_alikes
 
 
 def _own_results(out: Path) -> Collection[str]:

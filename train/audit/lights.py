@@ -15,34 +15,30 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.attack import (
-    NOISE_MARGIN,
-    AttackResult,
-    AttackSettings,
-    attack,
-    fooled_in_views,
-    logits_of,
-    predictions,
-)
+from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.descent import Goal
+from augment.attacks.eot import preprocessed_model
 from augment.attacks.evaluate import success_by_radius
-from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters.settings import SkylightSettings
-from augment.build import LampsSettings, ProjectorSettings
+from augment.attacks.parameters.settings import SkylightSettings, StepSettings
+from augment.attacks.problem import build_problem
+from augment.attacks.settings import NOISE_MARGIN, AttackSettings
+from augment.build import build_local_light
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene import Conditions, Scene
-from augment.variation import VariationSettings, vary
+from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
+from augment.variation import vary
 from renderer.camera import orbit_cameras
 from renderer.errors import FACTOR
-from renderer.image import ImageSettings, to_bytes
+from renderer.image import to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 
 BATCH = 16  # images per pass
 LIGHT = "grace"  # in which all attacks but that of the sky begin
@@ -84,7 +80,7 @@ class Views:
     def scene(self, size: int, kind: str = "lighting") -> Scene:
         """An example of each view, in the lights of a kind of attack."""
         shown = [self.objects[index % len(self.objects)] for index in range(self.count)]
-        basis, lights = with_local_lights(load_light(LIGHT), [light.build() for light in KINDS[kind].local])
+        basis, lights = with_local_lights(load_light(LIGHT), [build_local_light(light) for light in KINDS[kind].local])
         image = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")
         given = CAMERA, torch.full((1, 1, size, size), 0.5), lights.to(self.device), image, choose("auto")
         scene = Scene.grid(shown, *given, shared=False, basis=basis)
@@ -159,10 +155,10 @@ def transfers(attacked: Classifier, other: Classifier, views: Views, out: Path) 
         found = {"further": (result.clean_correct & result.success, result.descent.values)}
         with np.load(out / f"{kind}.npz") as kept:
             found["first"] = torch.from_numpy(kept["wrong"]), torch.from_numpy(kept["values"])
-        problem = result.settings.problem(views.scene(other.size, kind))
+        problem = build_problem(result.settings, views.scene(other.size, kind))
         right, counts[kind] = _correct(other, problem.scene, problem.images(problem.start)), {}
         goal = Goal(torch.full_like(result.goal.source, other.label(problem.scene.labels[0])))
-        model = result.settings.preprocessed_model(other)
+        model = preprocessed_model(result.settings, other)
         for name, (wrong, values) in found.items():
             both = wrong.to(right) & right
             images = problem.images(values.to(problem.start))

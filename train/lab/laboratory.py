@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.classifiers.adapter import label_names
 from augment.objects import load_object
 from augment.progress import progress
 from augment.random_streams import stream_seed
@@ -30,13 +29,14 @@ from renderer.light.presets import PROBES, load_light
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES
+from train.commands.settings import LabSettings
 from train.errors import writable_folder
 from train.lab.patterns import RESOLUTION
-from train.lab.shots import FOV, LabSettings, Shot, draw_shots
+from train.lab.shots import FOV, Shot, draw_shots
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.results import require_replaceable
 from train.run_folder import LOCK, sole_writer
-from train.settings import read_object, solid_name
+from train.settings import label_names, read_object, solid_name
 
 RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"  # by label, with the number of the setup and the name of its light
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
@@ -119,6 +119,12 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     return shapes
 
 
+def render_laboratory(settings: LabSettings) -> None:
+    """Render the laboratory of pnb-lab, and print what was written."""
+    count = write_laboratory(settings)
+    print(f"{settings.out}: {count} renders under {settings.setups} setups")
+
+
 def write_laboratory(settings: LabSettings) -> int:
     """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
 
@@ -181,7 +187,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> tuple[str, str, list
 
     InputError: as `load_object`; a file without a label; a label that is not a folder's name.
     """
-    settings = read_object(item, "", index, "meshes")
+    settings = read_object(item, "", f"meshes[{index}]")
     label, name = settings.label, solid_name(settings.mesh)
     if not label and name:
         label = FOREIGN + name if name in HARD_NEGATIVES else name

@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from augment import patterns
+from train.commands.settings import SLIDES
 
 RESOLUTION = 512  # pixels per side of a projected image
 
@@ -114,12 +115,10 @@ def _sampled(image: np.ndarray, points: Tensor, order: int) -> Tensor:
     return torch.from_numpy(np.stack(channels))
 
 
-TRAINED = ("solid", "gradient", "stripes", "checkers", "half", "spots")  # all but gradients are thrown in training, too
-FAMILIES = {
+FAMILIES = {  # see PATTERNS in train/commands/settings.py
     family.__name__: family
     for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
 }
-SLIDES = "slides"  # pictures that the user names, in their own colors
 TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
 
 

@@ -1,4 +1,4 @@
-"""The settings of pnb-lab, and the random draws of light, camera and pose.
+"""Random draws of light, camera and pose of the renders of pnb-lab.
 
 World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
 RGB; a radiance of 1 is white at an exposure of 1.
@@ -6,73 +6,19 @@ RGB; a radiance of 1 is white at an exposure of 1.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import MISSING
 from scipy.spatial.transform import Rotation
 
 from augment.random_streams import stream_seed
-from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
-from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import equirectangular
-from train.lab.patterns import FAMILIES, SLIDES, TRAINED, draw_color, draw_pattern
-from train.settings import LARGEST_SEED
+from train.commands.settings import LabSettings
+from train.lab.patterns import draw_color, draw_pattern
 
-OTHERS = "apple:101 apple:102 pear:101 sweet_pepper:101 lemon:101 lemon:102 peach:101 peach:102 ball:101 ball:103"
-SOLIDS = [*(f"orange:{seed}" for seed in range(101, 107)), *OTHERS.split()]
-LIMITS: dict[str, tuple[float, float]] = {"azimuth": (-180, 180), "elevation": (1, 89), "ambient": (0, 1)}
-LIMITS |= {"albedo": (0, 1), "roughness": (0.05, 1), "brightness": (1 / FACTOR, FACTOR)}
-RANGES: dict[str, tuple[float, float]] = {"walls": (0, 1), "exposure": (1 / FACTOR, FACTOR), "seed": (0, LARGEST_SEED)}
-RANGES |= {"setups": (1, 10**6), "size": (1, LARGEST_SIZE), "spp": (1, 10**5), "bounces": (1, 1000)}
 FOV = 25.0  # degrees, of the camera
-
-
-@dataclass
-class LabSettings:
-    """The settings of pnb-lab. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
-    whose label is a class, or other_NAME if the network lacks it."""
-
-    out: str = MISSING  # a new folder, for photos= of pnb-evaluate
-    label: Any = "orange"  # the class under study, or several: an object of each and one other stand in each setup
-    meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])  # 6 oranges, 10 others
-    setups: int = 180  # draws of light, camera and pose; with one label, two renders each
-    patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # projected, for as many setups each; two: a+b
-    slides: list[str] = field(default_factory=list)  # image files that the pattern `slides` projects
-    environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
-    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
-    azimuth: list[float] = field(default_factory=lambda: [-70, 70])  # of a projector, degrees off the camera's
-    elevation: list[float] = field(default_factory=lambda: [25, 70])  # of a projector, degrees above the table
-    ambient: list[float] = field(default_factory=lambda: [0.01, 0.06])  # radiance from everywhere beside projectors
-    albedo: list[float] = field(default_factory=lambda: [0.04, 0.16])  # of table and wall
-    walls: float = 0.0  # fraction of the setups with a wall behind the object, where no projector stands behind it
-    roughness: list[float] = field(default_factory=lambda: [0.5, 0.5])  # of the object: 0.1 is a gloss, 1 is dull
-    exposure: float = 1.0  # multiplies radiance; at 1, a radiance of 1 is white
-    size: int = 64  # pixels per side
-    spp: int = 32  # paths per pixel and light
-    bounces: int = 4  # of light, at most
-    seed: int = 0
-    overwrite: bool = False  # render into a folder that is not empty, in place of the renders in it
-
-    def __post_init__(self) -> None:
-        families = {family for pattern in self.patterns for family in pattern.split("+")}
-        for family in sorted(families):
-            require_choice("patterns", family, [*FAMILIES, SLIDES])
-        if SLIDES in families and not self.slides:
-            raise InputError(f"patterns has {SLIDES}: name image files in slides=")
-        sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
-        if not sources or self.setups % len(sources):
-            raise InputError(f"setups={self.setups} must be a multiple of the {len(sources)} patterns and maps")
-        if len(set(sources)) < len(sources):
-            raise InputError("patterns and environments must have different names, which are the renders' sources")
-        for name, ends in LIMITS.items():
-            require_limits(name, getattr(self, name), *ends)
-        for name, ends in RANGES.items():
-            require_range(name, getattr(self, name), *ends)
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.classifiers.adapter import Label, class_index, label_names, nearest
+from augment.classifiers.adapter import Label, class_index, nearest
 from augment.memory import require_memory
 from augment.progress import progress
 from renderer.errors import InputError, in_one_line
 from renderer.io.images import read_square
 from train import console
+from train.settings import label_names
 
 SUFFIXES = (
     ".jpg",

@@ -46,9 +46,6 @@ TITLES = {
 # a detection.
 Thresholds = Mapping[str, float]
 
-# Values of the setting `by`: properties of a photograph by which reports group
-# their metrics.
-GROUPS = ("source", "mesh")
 
 # Number of replicates that `bootstrap` draws for an interval.
 REPLICATES = 2000

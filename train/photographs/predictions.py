@@ -11,12 +11,13 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from augment.batches import eval_mode
-from augment.classifiers.adapter import Label, NetworkCall, as_class_names, label_names
+from augment.classifiers.adapter import Label, NetworkCall, as_class_names
 from augment.losses import log_odds
 from augment.progress import progress
 from renderer.errors import InputError, in_one_line, require_range
-from renderer.image import LARGEST_SIZE, to_unit
+from renderer.image import to_unit
 from renderer.io.files import write_whole
+from renderer.settings import MAX_SIZE
 from renderer.validation import as_folder, require_kind, require_whole
 from train.photographs.folder import (
     SEPARATOR,
@@ -26,6 +27,7 @@ from train.photographs.folder import (
     load_photographs,
     split_sources,
 )
+from train.settings import label_names
 
 PREDICTIONS = "predictions.csv"
 BATCH = 256
@@ -119,7 +121,7 @@ class Predictor:
         require_kind("model", self.model, Callable, kinds)
         self.classes = as_class_names("classes", self.classes)
         require_whole("size", self.size)
-        require_range("size", self.size, 1, LARGEST_SIZE)
+        require_range("size", self.size, 1, MAX_SIZE)
 
     def predict(
         self, folder: Path, label: Label, skip_unreadable: bool = False

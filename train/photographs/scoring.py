@@ -17,21 +17,12 @@ import numpy as np
 
 from augment.classifiers.adapter import Label, OperatingPoint
 from augment.progress import progress
-from renderer.errors import InputError, require_choice, require_range
+from renderer.errors import InputError, require_choice
 from renderer.io.files import remove_unfinished, write_whole
 from renderer.io.images import write_image
 from renderer.validation import as_folder
 from train.photographs.folder import TABLE, require_outside
-from train.photographs.metrics import (
-    AT_THRESHOLD,
-    GROUPS,
-    RANKED,
-    Metrics,
-    Pool,
-    Pooled,
-    metric_title,
-    thresholds,
-)
+from train.photographs.metrics import AT_THRESHOLD, RANKED, Metrics, Pool, Pooled, metric_title, thresholds
 from train.photographs.predictions import (
     PREDICTIONS,
     FolderPredictions,
@@ -40,6 +31,7 @@ from train.photographs.predictions import (
     write_predictions,
 )
 from train.photographs.sheet import contact_sheet, write_roc
+from train.settings import GROUPS
 from train.tables import Proportion, Table, format_fraction, format_interval, fraction
 
 SUMMARY = "summary.json"
@@ -342,13 +334,6 @@ def choose_operating_points(
             )
         )
     return points
-
-
-def require_calibration(rate: float | None, calibrate: str | None) -> None:
-    """InputError for one of the keys false_positive_rate and calibrate without the other, or a rate beyond (0, 1)."""
-    if (rate is None) != (calibrate is None):
-        raise InputError("give false_positive_rate=RATE and calibrate=FOLDER together, or neither")
-    require_range("false_positive_rate", rate, 1e-6, 1 - 1e-6)
 
 
 def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:

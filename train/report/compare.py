@@ -7,7 +7,7 @@ from statistics import fmean
 import numpy as np
 
 from augment.progress import progress
-from augment.service import ARMS
+from augment.settings import ARMS
 from renderer.errors import InputError
 from train.photographs.metrics import (
     METRICS,

@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from augment.progress import announced
-from augment.service import ARMS
+from augment.settings import ARMS
 from renderer.errors import InputError
 from renderer.io.files import write_whole
 from train.errors import one_sentence

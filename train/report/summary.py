@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.files import LINES
-from augment.classifiers.adapter import label_names
-from augment.service import ARMS
+from augment.settings import ARMS
 from renderer.errors import InputError, in_one_line
 from train import checkpoint, run_folder
-from train.networks import PUBLISHED, load_selected, published
+from train.networks import PUBLISHED, load_selected
 from train.photographs.metrics import (
     METRICS,
     AreaUnderCurve,
@@ -26,6 +25,7 @@ from train.photographs.metrics import (
 )
 from train.photographs.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
+from train.settings import label_names, published
 from train.tables import Estimate, Table, format_interval
 
 # Number of arms up to which they are named by their settings.

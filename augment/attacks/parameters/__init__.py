@@ -17,8 +17,8 @@ from renderer.errors import require_choice
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from augment.attacks.norm_ball import StepSettings
     from augment.attacks.parameters.parameter import Parameter
+    from augment.attacks.parameters.settings import StepSettings
     from augment.scene import Scene
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.mesh import MeshParameter
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Conditions, Scene
 
 

@@ -1,7 +1,7 @@
 """Attacks on the intensity of lamps."""
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.light import LightParameter, find_light
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Scene
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
 from renderer.light.ball import Ball
@@ -99,7 +99,8 @@ def find_light(
         if basis.name == light_name:
             return rows, basis
     raise InputError(
-        f"attack={parameter_name}: the scene has no {light_name}: set scene.{light_name}",
+        f"{parameter_name}: the scene has no {light_name}: build it with {light_name}=...",
+        parameter_name,
     )
 
 

@@ -1,7 +1,7 @@
 """Attacks on the environment lighting."""
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.light import LightParameter, environment_light
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Scene
 
 

@@ -15,7 +15,7 @@ from augment.attacks.parameters.settings import MaterialSettings
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from renderer.light.ball import Ball, nearest_in_box
-from renderer.microfacets import LEAST
+from renderer.settings import MIN_ROUGHNESS
 
 # Positions among the four attack values of an example (`MATERIAL`): roughness,
 # metallic and strength together, roughness and metallic alone, and the hue.
@@ -85,9 +85,9 @@ class Material(Parameter):
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
-        # `LEAST` is the lowest roughness that the renderer shows. The hue has
+        # `MIN_ROUGHNESS` is the lowest roughness that the renderer shows. The hue has
         # no limits: its lowest value is -∞, and its highest is 1 - (-∞) = ∞.
-        lowest_material = self._unit.new_tensor([LEAST + ROUNDING, 0, 0, -math.inf])
+        lowest_material = self._unit.new_tensor([MIN_ROUGHNESS + ROUNDING, 0, 0, -math.inf])
         highest_material = 1 - self._unit.new_tensor([ROUNDING, ROUNDING, ROUNDING, -math.inf])
         self._lowest_values = lowest_material / self._unit
         self._highest_values = highest_material / self._unit

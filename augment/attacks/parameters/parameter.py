@@ -6,7 +6,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from augment.attacks.norm_ball import StepSettings, anywhere
+from augment.attacks.norm_ball import anywhere, project, sample, take_step
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Conditions
 from renderer.light.ball import Ball
 
@@ -96,7 +97,7 @@ class Parameter(ABC):
             Values after the step, shape (A, D).
         """
         center = self.start[examples]
-        return self.settings.take_step(values, gradient, center, self.domain, length)
+        return take_step(self.settings, values, gradient, center, self.domain, length)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
@@ -108,7 +109,7 @@ class Parameter(ABC):
         Returns:
             Projected values, shape (A, D).
         """
-        return self.settings.project(values, self.start[examples], self.domain)
+        return project(self.settings, values, self.start[examples], self.domain)
 
     def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
         """Draw random feasible values for all examples.
@@ -131,8 +132,8 @@ class Parameter(ABC):
         """
         if self.settings.radius is None and reached is not None:
             return self._sample_as_far_as(reached, generator)
-        drawn = self.settings.sample(self.start, generator, self.used_mask)
-        return self.settings.project(drawn, self.start, self.domain)
+        drawn = sample(self.settings, self.start, generator, self.used_mask)
+        return project(self.settings, drawn, self.start, self.domain)
 
     def _sample_as_far_as(self, reached: Tensor, generator: torch.Generator) -> Tensor:
         """Draw values in random directions, as far from the start as `reached`, shape (E, D)."""

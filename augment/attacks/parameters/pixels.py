@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Conditions, Scene
 
 

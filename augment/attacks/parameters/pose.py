@@ -68,7 +68,8 @@ class Pose(Parameter):
     def __init__(self, scene: Scene, settings: PoseSettings):
         if not scene.settings.silhouettes:
             raise InputError(
-                "attack=pose needs gradients of outlines: set renderer.silhouettes=true",
+                "silhouettes=False: set silhouettes=True, since an attack on the pose needs them",
+                "silhouettes",
             )
         self._object_of = scene.object_of
         self._vertices = scene.vertices

@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters.light import find_light
 from augment.attacks.parameters.parameter import Parameter
+from augment.attacks.parameters.settings import StepSettings
 from augment.scene import Conditions, Scene
 from renderer.light.lamps import Lamps
 

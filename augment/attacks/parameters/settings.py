@@ -1,7 +1,8 @@
 """Settings of each quantity that an attack can change.
 
 `ParameterSettings` has a field for each quantity. Its name is the name of the
-module with the quantity's class (see `augment.attacks.parameters`).
+module with the quantity's class (see `augment.attacks.parameters`). This module
+imports neither torch nor NumPy; see `renderer.settings`.
 """
 
 from __future__ import annotations
@@ -10,12 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
-from augment.attacks.norm_ball import StepSettings
-from renderer.errors import FACTOR, InputError, require_range
-from renderer.light.skylight import TURBIDITY
+from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.settings import TURBIDITY, Settings, setting
 
 if TYPE_CHECKING:
     from augment.objects import SceneObject
+
+NORMS = ("linf", "l2")
+STEPS = ("unit", "raw", "sign")
+MAX_JOINT_ANGLE = 180.0  # degrees
 
 # Names of the parts of a pose, without the joints, in the order of their values.
 # The fields of `PoseSettings` with these names are their units.
@@ -27,183 +31,196 @@ MATERIAL = ("roughness", "metallic", "strength", "hue")
 
 
 @dataclass
-class SkylightSettings(StepSettings):
-    """Norm-ball, steps and initial sky of an attack on the skylight.
+class StepSettings(Settings):
+    """Norm-ball around the start of an attack, and the steps of gradient descent within it.
 
-    Attributes:
-        zenith: Initial zenith angle of the sun in degrees, from 0 (overhead) to
-            90 (horizon).
-        azimuth: Initial azimuth of the sun in degrees, from +x toward +y.
-        turbidity: Initial turbidity of the air, from 2 (clear) to 10 (hazy).
+    The radii of the paper (Section 4.1) are 0.1 per coefficient of the lighting and 0.002 per
+    axis of a vertex, both with norm="linf".
 
-    Raises:
-        InputError: If an angle or the turbidity is out of range.
+    >>> StepSettings(norm="l2", radius=1.0).step
+    'unit'
     """
 
-    zenith: float = 45.0
-    azimuth: float = 0.0
-    turbidity: float = 3.0
+    norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
+    radius: float | None = setting(
+        None,
+        "Radius of the norm-ball. null permits all values.",
+        minimum=0,
+        maximum=FACTOR,
+    )
+    step: str = setting(
+        "unit",
+        "Direction of a step: the gradient with L2 norm 1 (unit), the gradient (raw) or its sign.",
+        choices=STEPS,
+    )
+    step_size: float = setting(0.05, "Factor of each step.", minimum=1 / LARGEST, maximum=FACTOR)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        # The sun does not go below the horizon.
-        require_range("zenith", self.zenith, 0, 90)
-        require_range("azimuth", self.azimuth, -FACTOR, FACTOR)
-        require_range("turbidity", self.turbidity, *TURBIDITY)
+
+@dataclass
+class SkylightSettings(StepSettings):
+    """Attack on the sun and the air of a clear sky, and where it starts.
+
+    The radius is in radians for the zenith and the azimuth, and in units of 4 for the turbidity.
+    """
+
+    zenith: float = setting(45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90)
+    azimuth: float = setting(
+        0.0,
+        "Azimuth of the sun at the start.",
+        "degrees",
+        minimum=-FACTOR,
+        maximum=FACTOR,
+    )
+    turbidity: float = setting(
+        3.0,
+        "Turbidity of the air at the start, from 2 (clear) to 10 (hazy).",
+        minimum=TURBIDITY[0],
+        maximum=TURBIDITY[1],
+    )
 
 
 @dataclass
 class PoseSettings(StepSettings):
-    """Norm-ball and steps of an attack on the pose, and the unit of each attack value.
+    """Attack on the pose of the object and of the camera.
 
-    The unit says how far the pose changes when the attack value changes by 1.
-    With a unit of 0, the attack does not change this part of the pose.
-
-    Attributes:
-        rotation: Unit of the rotation of the object, in degrees from 0 to 180.
-        shift: Unit of the shift of the object along the table, in world units
-            from 0 to 10.
-        scale: Unit of the growth of the object, as a fraction of its size in
-            [0, 1].
-        view: Unit of the polar angle and of the azimuth of the cameras, in
-            degrees from 0 to 180.
-        distance: Unit of the growth of the distance of the cameras, as a
-            fraction of this distance in [0, 1].
-        joints: Unit of the rotation of the joints of a skinned mesh about each
-            axis, in degrees from 0 to 180. The joints do not rotate further
-            than this. A number applies to all joints, {name: degrees} to the
-            named joints only.
-
-    Raises:
-        InputError: If a unit is out of range, or if all units are 0.
+    Each part of the pose is measured in the unit that its field gives. A part with the unit 0
+    stays as it is.
     """
 
-    rotation: float = 10.0
-    shift: float = 0.1
-    scale: float = 0.1
-    view: float = 10.0
-    distance: float = 0.1
-    joints: Any = 0.0
+    rotation: float = setting(
+        10.0,
+        "Rotation of the object about its center for a value of 1.",
+        "degrees",
+        minimum=0,
+        maximum=180,
+    )
+    shift: float = setting(
+        0.1,
+        "Shift of the object along x and y for a value of 1. The mesh spans [-1, 1].",
+        minimum=0,
+        maximum=10,
+    )
+    scale: float = setting(
+        0.1,
+        "Growth of the object for a value of 1. 0.1 is a factor of 1.1.",
+        minimum=0,
+        maximum=1,
+    )
+    view: float = setting(
+        10.0,
+        "Change of the polar angle and the azimuth of the camera for a value of 1.",
+        "degrees",
+        minimum=0,
+        maximum=180,
+    )
+    distance: float = setting(
+        0.1,
+        "Growth of the distance of the camera for a value of 1. 0.1 is a factor of 1.1.",
+        minimum=0,
+        maximum=1,
+    )
+    joints: Any = setting(
+        0.0,
+        "Largest rotation of the joints of a skinned mesh about each axis: of all joints, or {name: degrees} of some.",
+        "degrees",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("rotation", self.rotation, 0, 180)
-        require_range("shift", self.shift, 0, 10)
-        require_range("scale", self.scale, 0, 1)
-        require_range("view", self.view, 0, 180)
-        require_range("distance", self.distance, 0, 1)
-        degrees_by_setting = self._degrees_by_setting()
-        for setting, degrees in degrees_by_setting.items():
+        limits = self.joints if isinstance(self.joints, Mapping) else {"joints": self.joints}
+        for name, degrees in limits.items():
             if isinstance(degrees, bool) or not isinstance(degrees, int | float):
-                raise InputError(f"joints={self.joints}: give degrees, or {{name: degrees}}")
-            require_range(setting, degrees, 0, 180)
-        units = [getattr(self, name) for name in POSE]
-        if not any(units) and not any(degrees_by_setting.values()):
-            parts = ", ".join(POSE)
-            raise InputError(f"{parts} and joints are all 0: nothing of the pose would change")
-
-    def _degrees_by_setting(self) -> dict[str, Any]:
-        """Return the degrees of the joints under the names that error messages use.
-
-        The name is "joints", or "joints.NAME" for each named joint.
-        """
-        if isinstance(self.joints, Mapping):
-            return {f"joints.{name}": degrees for name, degrees in self.joints.items()}
-        return {"joints": self.joints}
+                message = f"joints={self.joints}: give degrees, or {{name: degrees}}"
+                raise InputError(message, "joints")
+            argument = "joints" if name == "joints" else f"joints.{name}"
+            require_range(argument, degrees, 0, MAX_JOINT_ANGLE)
+        if not any([*limits.values(), *(getattr(self, name) for name in POSE)]):
+            parts = f"{', '.join(POSE)} and joints"
+            raise InputError(f"{parts} are all 0: nothing of the pose would change")
 
     def joint_limits(self, item: SceneObject) -> list[float]:
-        """Return the largest rotation of each joint of an object, in degrees.
-
-        Args:
-            item: Object whose joints are attacked.
-
-        Returns:
-            Degrees for each joint, in the order of the skin. Empty if `joints`
-            is 0 or names no joint.
+        """Return the largest rotation of each joint of an object in degrees.
 
         Raises:
-            InputError: If the object has no skin, or no joint of a given name.
+            InputError: If the object has no skin, or lacks a joint that the settings name.
         """
         if not self.joints:
             return []
         if item.mesh.skin is None:
-            message = f"joints: {item.name} has no skin"
-            raise InputError(f"{message}: give a glTF file with one, or joints=0")
-        joint_names = item.mesh.skin.names
+            message = f"joints: {item.name} has no skin: give a glTF file with one, or joints=0"
+            raise InputError(message, "joints")
+        names = item.mesh.skin.names
+        limits = self.joints
         if not isinstance(self.joints, Mapping):
-            return [float(self.joints)] * len(joint_names)
-        for name in self.joints:
-            if name not in joint_names:
-                message = f"joints: {item.name} has no joint {name}"
-                raise InputError(f"{message}: choose from {', '.join(joint_names)}")
-        return [float(self.joints.get(name, 0)) for name in joint_names]
+            limits = dict.fromkeys(names, self.joints)
+        for name in limits:
+            if name not in names:
+                choices = f"choose from {', '.join(names)}"
+                raise InputError(f"joints: {item.name} has no joint {name}: {choices}", "joints")
+        return [float(limits.get(name, 0)) for name in names]
 
 
 @dataclass
 class MaterialSettings(StepSettings):
-    """Norm-ball and steps of an attack on the material, and the unit of each attack value.
+    """Attack on the specular material and the hue of the object.
 
-    The unit says how far the material changes when the attack value changes by
-    1. With a unit of 0, the attack does not change this part of the material.
-
-    Attributes:
-        roughness: Unit of the roughness (see `renderer.Gloss`), in [0, 1].
-        metallic: Unit of the metallic share, in [0, 1]. Objects that are not
-            metallic at all stay so.
-        strength: Unit of the strength of the specular reflection, in [0, 1].
-        hue: Unit of the rotation of the hue of the albedo, in degrees from 0 to
-            180.
-
-    Raises:
-        InputError: If a unit is out of range, or if all units are 0.
+    Each part is measured in the unit that its field gives. A part with the unit 0 stays as it
+    is. See `renderer.Gloss` for roughness, metallic and strength.
     """
 
-    roughness: float = 0.3
-    metallic: float = 0.3
-    strength: float = 1.0
-    hue: float = 0.0
+    roughness: float = setting(
+        0.3,
+        "Change of the roughness for a value of 1. The roughness stays between 0.2 and 1. "
+        "A matte mesh starts with a dielectric specular layer of roughness 0.5 and strength 1.",
+        minimum=0,
+        maximum=1,
+    )
+    metallic: float = setting(
+        0.3,
+        "Change of the metallic factor for a value of 1, of meshes that are metallic.",
+        minimum=0,
+        maximum=1,
+    )
+    strength: float = setting(
+        1.0,
+        "Change of the strength of the highlight for a value of 1. "
+        "The strength is the specularFactor of KHR_materials_specular.",
+        minimum=0,
+        maximum=1,
+    )
+    hue: float = setting(
+        0.0,
+        "Rotation of the albedo about the gray axis for a value of 1.",
+        "degrees",
+        minimum=0,
+        maximum=180,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("roughness", self.roughness, 0, 1)
-        require_range("metallic", self.metallic, 0, 1)
-        require_range("strength", self.strength, 0, 1)
-        require_range("hue", self.hue, 0, 180)
         if not any(getattr(self, name) for name in MATERIAL):
-            parts = ", ".join(MATERIAL)
-            raise InputError(f"{parts} are all 0: nothing of the material would change")
+            message = f"{', '.join(MATERIAL)} are all 0: nothing of the material would change"
+            raise InputError(message)
 
 
 @dataclass
-class ParameterSettings:
+class ParameterSettings(Settings):
     """Settings of each quantity that an attack can change; None leaves the quantity as it is.
 
     Where several quantities are changed, they are applied in the order of these
     fields.
-
-    Attributes:
-        lighting: The environment lighting.
-        skylight: The sun's direction and the turbidity of a daylight sky.
-        projector: The pattern that a projector throws.
-        lamps: The intensity of each lamp.
-        positions: The position of each lamp.
-        geometry: The displacement of each vertex of the object.
-        pose: The pose of the object, of its joints and of the cameras.
-        material: The gloss of the object and the hue of its albedo.
-        albedo: The color that is added to each face of the object.
-        pixels: The offset of each pixel of the images.
     """
 
-    lighting: StepSettings | None = None
-    skylight: SkylightSettings | None = None
-    projector: StepSettings | None = None
-    lamps: StepSettings | None = None
-    positions: StepSettings | None = None
-    geometry: StepSettings | None = None
-    pose: PoseSettings | None = None
-    material: MaterialSettings | None = None
-    albedo: StepSettings | None = None
-    pixels: StepSettings | None = None
+    lighting: StepSettings | None = setting(None, "Attack on the coefficients of the lighting.")
+    skylight: SkylightSettings | None = setting(None, "Attack on the sun and the air of a sky.")
+    projector: StepSettings | None = setting(None, "Attack on the pattern of the projector.")
+    lamps: StepSettings | None = setting(None, "Attack on the powers of the lamps.")
+    positions: StepSettings | None = setting(None, "Attack on the positions of the lamps.")
+    geometry: StepSettings | None = setting(None, "Attack on the positions of the vertices.")
+    pose: PoseSettings | None = setting(None, "Attack on the pose of object and camera.")
+    material: MaterialSettings | None = setting(None, "Attack on the specular material.")
+    albedo: StepSettings | None = setting(None, "Attack on the albedo of each face.")
+    pixels: StepSettings | None = setting(None, "Attack on the pixels of the image.")
 
     @property
     def parameters(self) -> dict[str, StepSettings]:

@@ -12,8 +12,9 @@ from augment.attacks.parameters.settings import SkylightSettings
 from augment.scene import Conditions, Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.presets import mean_luminance
-from renderer.light.skylight import TURBIDITY, ZENITH
+from renderer.light.skylight import ZENITH
 from renderer.light.skylight import coefficients as sky_coefficients
+from renderer.settings import TURBIDITY
 
 # `Skylight` divides the turbidity by this unit to get an attack value. The
 # turbidity then has a range of 2 (from 2 / 4 to 10 / 4). This is of the same

@@ -116,5 +116,5 @@ def test_misclassified_examples_and_impossible_targets_are_refused_in_one_senten
     ]:
         with pytest.raises(InputError, match=message):
             augment.attack(by_color, scene(label), target, force=True)
-    with pytest.raises(InputError, match="attack: name what to change, such as attack=lighting; there are lighting, "):
+    with pytest.raises(InputError, match="name what to attack: one or more of lighting, "):
         augment.attack(by_color, scene("orange"), settings=augment.AttackSettings())

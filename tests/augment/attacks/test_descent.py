@@ -5,9 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.norm_ball import STEPS, StepSettings
+from augment.attacks.norm_ball import project, sample, scale_gradient
+from augment.attacks.parameters.settings import STEPS, StepSettings
+from augment.attacks.settings import AttackSettings
 
 EPS = torch.finfo(torch.float64).eps
 PIXELS, DIMENSIONS = (3, 2, 2), 5
@@ -57,8 +58,8 @@ class LinearScene:
         return (images * (1 + examples.double() / 10)[:, None, None]).unflatten(2, PIXELS)
 
     def take_step(self, values: Tensor, gradient: Tensor, examples: Tensor, length: Tensor) -> Tensor:
-        step = StepSettings(step=self.rule, step_size=self.size).along(gradient)
-        return self.ball.project(values - length * step, self.center[examples])
+        step = scale_gradient(StepSettings(step=self.rule, step_size=self.size), gradient)
+        return project(self.ball, values - length * step, self.center[examples])
 
 
 def settings_of(max_steps: int = 30, **others) -> AttackSettings:
@@ -118,7 +119,7 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
 def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step):
     """Also from starts off its center, where the steps first lead elsewhere: the way along the surface converges."""
     ball, center = StepSettings("l2", 0.4), random(8, DIMENSIONS, seed=2)
-    problem = LinearScene(ball.sample(center, torch.Generator().manual_seed(0)), step, 0.3, ball, views, center)
+    problem = LinearScene(sample(ball, center, torch.Generator().manual_seed(0)), step, 0.3, ball, views, center)
     goal = Goal(torch.zeros(8, views, dtype=torch.int64), torch.ones(8, views, dtype=torch.int64))
     result = descend(Linear(WEIGHT, bias=50.0), problem, goal, settings_of(120))
     slope = (CAMERAS[:views] @ (WEIGHT[0] - WEIGHT[1])).sum(0)
@@ -295,7 +296,7 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_successes():
     """Against as many descents one by one: an example's result is that of the first that succeeds, or of the first."""
     center, ball, network = random(40, DIMENSIONS, seed=3), StepSettings("linf", 0.5), Linear(WEIGHT)
     goal, settings = Goal(torch.arange(40)[:, None] % 2), settings_of(2)
-    starts = [ball.sample(center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
+    starts = [sample(ball, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, "sign", 0.1, ball)
     result = descend(network, problem, goal, settings, restarts=starts)
     counted = problem.rendered.clone()

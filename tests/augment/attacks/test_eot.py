@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 import augment
 from augment.attacks import eot
-from augment.attacks.eot import EOTSettings, ExpectationOverTransformations, Rounded, as_jpeg
+from augment.attacks.eot import ExpectationOverTransformations, Rounded, as_jpeg
+from augment.attacks.settings import EOTSettings
 from augment.random_streams import generator
 
 

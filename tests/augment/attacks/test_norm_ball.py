@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
-from augment.attacks.norm_ball import NORMS, STEPS, StepSettings
+from augment.attacks.norm_ball import project, sample, scale_gradient
+from augment.attacks.parameters.settings import NORMS, STEPS, StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import nearest_in_box
 
@@ -37,7 +38,7 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     """p is nearest to v exactly when it lies in the ball and (v - p)·(q - p) ≤ 0 for all of its points q; the largest
     of these products is (v - p)·(c - p) + radius × the dual norm of v - p. Points of the ball stay to the bit."""
     values, center = torch.from_numpy(pair).to(dtype)
-    nearest = StepSettings(name, radius).project(values, center)
+    nearest = project(StepSettings(name, radius), values, center)
     assert nearest.dtype == dtype
     moved, inward = (values - nearest).double(), (center - nearest).double()
     rounding = 16 * torch.finfo(dtype).eps * 200  # of differences of numbers up to 200
@@ -46,8 +47,8 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     assert (products <= rounding * (1 + dual_norm(moved, name))).all()
     inside = norm((values - center).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
     assert torch.equal(nearest[inside], values[inside])
-    assert torch.equal(StepSettings(name, 0.0).project(values, center), center)
-    assert torch.equal(StepSettings(name, None).project(values, center), values)
+    assert torch.equal(project(StepSettings(name, 0.0), values, center), center)
+    assert torch.equal(project(StepSettings(name, None), values, center), values)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -65,7 +66,7 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
     (values, center), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
     low, high = center - down, center + up
     box = partial(nearest_in_box, low=low, high=high)
-    nearest = StepSettings(name, radius).project(values[None], center[None], box)[0]
+    nearest = project(StepSettings(name, radius), values[None], center[None], box)[0]
     rounding = 64 * torch.finfo(dtype).eps
     assert nearest.dtype == dtype and (low <= nearest).all() and (nearest <= high).all()
     offset = (nearest - center).double()[None]
@@ -92,7 +93,7 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     """(norm / radius)^D is uniform in [0, 1], and no direction is preferred: the means vanish and the covariances are
     those of the ball, r²/3 along each axis of a cube and r²/(D + 2) of a sphere, to five standard errors."""
     radius, center = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
-    offset = (StepSettings(name, radius).sample(center, torch.Generator().manual_seed(1)) - center) / radius
+    offset = (sample(StepSettings(name, radius), center, torch.Generator().manual_seed(1)) - center) / radius
     assert norm(offset, name).max() <= 1 + 1e-6  # draws have float32's digits
     assert stats.kstest(norm(offset, name).numpy() ** dimensions, "uniform").pvalue > 0.01
     variance = 1 / 3 if name == "linf" else 1 / (dimensions + 2)
@@ -107,7 +108,7 @@ def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, toleranc
     """1e-40 is subnormal in float32, with five digits left."""
     gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))
     expected = gradient.double() / gradient.double().norm(dim=1, keepdim=True)
-    step = StepSettings(step_size=1.0).along(gradient * scale)
+    step = scale_gradient(StepSettings(step_size=1.0), gradient * scale)
     torch.testing.assert_close(step.double(), expected, rtol=0, atol=4 * tolerance)
 
 
@@ -119,7 +120,7 @@ def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
         "raw": gradient.tolist(),
         "sign": [[1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]],
     }[step]
-    steps = StepSettings(step=step, step_size=1.0).along(gradient)
+    steps = scale_gradient(StepSettings(step=step, step_size=1.0), gradient)
     torch.testing.assert_close(steps, torch.tensor(expected), rtol=0, atol=EPS)
 
 
@@ -131,7 +132,7 @@ def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
         (lambda: StepSettings(step="newton"), "step=newton: choose one of unit, raw, sign"),
         (lambda: StepSettings(step_size=0.0), "step_size=0.0 must be at least"),
         (lambda: StepSettings(step_size=math.nan), "step_size=nan"),
-        (lambda: StepSettings().sample(torch.zeros(1, 2), torch.Generator()), "radius=None has no uniform draw"),
+        (lambda: sample(StepSettings(), torch.zeros(1, 2), torch.Generator()), "radius=None has no uniform draw"),
     ],
 )
 def test_balls_and_draws_that_make_no_sense_are_refused(make, message):

@@ -9,8 +9,8 @@ from torch import Tensor
 
 import augment
 from augment.attacks.search import LIGHT_GRAY, _candidates, find_scene
-from augment.build import SceneSettings
 from augment.random_streams import generator
+from augment.settings import SceneSettings
 
 CHANGED = ("polar", "azimuth", "width", "fov", "light", "exposure")
 ATTACK = augment.AttackSettings(lighting=augment.StepSettings(), allow_negative=True)

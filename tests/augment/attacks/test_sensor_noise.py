@@ -13,7 +13,7 @@ from augment.attacks.attack import AttackResult, fooled_in_views
 from augment.attacks.descent import Goal
 from augment.attacks.eot import NOISE_DRAWS, stored
 from augment.losses import NO_CLASS
-from augment.service import TrainingAttackSettings
+from augment.settings import TrainingAttackSettings
 from renderer.errors import InputError
 
 SIZE = 8

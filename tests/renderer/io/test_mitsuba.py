@@ -11,13 +11,13 @@ import trimesh
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.gloss import Gloss
-from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.transport.operators import build_operators
 from renderer.vectors import unit_vectors
 

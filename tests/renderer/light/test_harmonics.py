@@ -8,7 +8,8 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, spherical_in
 
-from renderer.light.harmonics import DIFFUSE_DEGREE, MAX_DEGREE, basis, lambertian_factors, project, rotate
+from renderer.light.harmonics import DIFFUSE_DEGREE, basis, lambertian_factors, project, rotate
+from renderer.settings import MAX_DEGREE
 from renderer.shading import irradiance
 
 EPS = np.finfo(np.float64).eps

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from renderer import rasterizer as rasterizers
 from renderer.errors import InputError
-from renderer.rasterizer import NAMES, SPAN, Rasterizer, choose, opengl
+from renderer.rasterizer import SPAN, Rasterizer, choose, opengl
+from renderer.settings import RASTERIZERS
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
 needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -292,7 +293,7 @@ def test_numba_is_chosen_where_it_is_installed_and_opengl_only_by_name(monkeypat
         monkeypatch.setitem(sys.modules, "numba", None)
         monkeypatch.delitem(sys.modules, "renderer.rasterizer.numba", raising=False)
         monkeypatch.delattr(rasterizers, "numba", raising=False)
-    if name in NAMES:
+    if name in RASTERIZERS:
         assert choose(asked).name == name
     else:
         with pytest.raises(InputError, match=name):

@@ -14,7 +14,6 @@ from oracles import mesh_of
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import build_fragments
-from renderer.image import ImageSettings
 from renderer.io import mitsuba
 from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
@@ -23,6 +22,7 @@ from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from renderer.mesh import Mesh, concatenate
 from renderer.rasterizer import choose
+from renderer.settings import ImageSettings
 from renderer.transport import lamp_paths as sparse
 from renderer.transport.lamp_paths import local_radiance, unoccluded
 from renderer.transport.operators import TransferOperator, build_operators

@@ -52,7 +52,8 @@ def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, 
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names.split("+"))
-    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={parameters}"])
+    attacked = f"attack=[{parameters.strip('[]')}]"
+    assert config.command == shlex.join(["python", "-m", "scripts.attack", "out=out", *SMALL, attacked])
 
 
 def test_each_mesh_has_a_folder_and_what_was_written_is_attacked_again(run, tmp_path, capsys):
@@ -131,7 +132,7 @@ REFUSED = [
     (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry cannot be transferred"),
     (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels cannot be transferred"),
     (["attack.radius_scales=[0.1,-1]"], "radius_scales=-1.0 must be at least 1e-05"),
-    (["attack=[]"], "attack: name what to change"),
+    (["attack=[]"], "attack: name what to attack"),
     (["attack=lighting+skylight"], "lighting and skylight both set the light: choose one of them"),
     (["attack.verify=blender"], "verify=blender: choose one of reload, mitsuba"),
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),

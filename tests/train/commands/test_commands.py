@@ -20,12 +20,11 @@ from renderer.light.environment import read_panorama, to_map
 from renderer.light.files import save_light
 from renderer.light.harmonics import equirectangular
 from renderer.light.presets import load_light
-from scripts.fit import grab_cut
-from train.attack import AttackExperimentSettings
+from scripts.attack import main as attack_command
 from train.checkpoint import BEST, save
+from train.commands.fit import grab_cut
 from train.networks import WideResNet, describe, load_run
 from train.run_folder import LOCK, sole_writer
-from train.settings import compose, read_settings
 
 USER_ERROR = 2
 CLASSES = ["fig", "lime", "orange"]
@@ -94,7 +93,7 @@ def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_rea
 
 
 WRONG = [
-    ([*EVALUATE, "skip_unreadable=maybe"], "Error merging override skip_unreadable=maybe: Value 'maybe' is not"),
+    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe must be true or false"),
     ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
     ([*EVALUATE, "label=[]"], "label=[] must name a class, or several, each once"),
     ([*EVALUATE, "label=[fig,pear]"], "classifier=run:1.10: 'pear' is not a class of the model"),
@@ -177,7 +176,7 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     assert call(*fit, "mask=mask.png") == 0
     output = capsys.readouterr().out
     command = shlex.split(output.splitlines()[-1])
-    settings = read_settings(AttackExperimentSettings, compose("attack", command[1:]))
+    settings = attack_command.read(command[1:])
     assert not settings.renderer.shadows and settings.label == "orange"  # as it was fitted
     scene, angles = settings.scene, [math.radians(angle) for angle in (settings.scene.polar, settings.scene.azimuth)]
     [found], background = renderer.orbit_cameras(1, scene.width, *angles), read_image(scene.backgrounds[0], 64)

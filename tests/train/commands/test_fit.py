@@ -13,9 +13,10 @@ from PIL import Image
 from torch import Tensor
 
 import renderer
-from augment.objects import ObjectSettings, load_object
+from augment.objects import load_object
+from augment.settings import ObjectSettings
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.image import ImageSettings, decode, encode, to_bytes
+from renderer.image import decode, encode, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_image
 from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
@@ -23,8 +24,8 @@ from renderer.light.environment import read_panorama, to_map, write_map
 from renderer.light.harmonics import equirectangular, project
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh
-from train.attack import AttackExperimentSettings
-from train.settings import compose, read_settings
+from renderer.settings import ImageSettings
+from scripts.attack import main as attack_command
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 MARGIN = 1.6  # the square around the object, in widths of the object
@@ -121,7 +122,7 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
     assert float(to_map(light, 256).min()) >= 0
     found, true = irradiance(mesh, camera, light), irradiance(mesh, camera, project(radiance.double(), 20))
     assert float(((found - true).norm(dim=1) / true.norm(dim=1)).max()) < 0.07
-    scene = read_settings(AttackExperimentSettings, compose("attack", command[1:])).scene
+    scene = attack_command.read(command[1:]).scene
     if determined:
         angles = math.radians(scene.polar), math.radians(scene.azimuth)
         toward = torch.from_numpy(camera.eye()[:3])

@@ -9,16 +9,17 @@ from safetensors import safe_open
 
 from renderer.errors import InputError
 from renderer.io.images import read_square
-from scripts import evaluate
-from scripts.publish import Settings, main
 from train import checkpoint
+from train.commands.evaluate import evaluate
+from train.commands.publish import publish_network
+from train.commands.settings import EvaluateSettings, PublishSettings
 from train.networks import PUBLISHED, load_run, load_selected
 from train.report.summary import summarize
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
     out = tmp_path / "pretrained" / "tiny"
-    main.__wrapped__(Settings(str(finished), str(out)))
+    publish_network(PublishSettings(str(finished), str(out)))
     assert [path.name for path in out.iterdir()] == [PUBLISHED]
     network = load_run(out)
     assert network.classes == ("apple", "orange", "pear") and network.function.head.in_features == 64
@@ -36,12 +37,12 @@ def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_pat
     """The threshold of a rate of 1/2 on four others, tomatoes and apples, is the third of their log-odds."""
     first, second = tmp_path / "first", tmp_path / "second"
     with pytest.raises(InputError, match="together, or neither"):
-        Settings(str(finished), str(first), false_positive_rate=0.5)
-    main.__wrapped__(Settings(str(finished), str(first)))
+        PublishSettings(str(finished), str(first), false_positive_rate=0.5)
+    publish_network(PublishSettings(str(finished), str(first)))
     with pytest.raises(InputError, match="has no operating point"):
         load_run(first).detect(torch.zeros(1, 3, 16, 16))
-    main.__wrapped__(Settings(str(first), str(first), 0.5, str(photos)))
-    main.__wrapped__(Settings(str(first), str(second)))
+    publish_network(PublishSettings(str(first), str(first), 0.5, str(photos)))
+    publish_network(PublishSettings(str(first), str(second)))
     hashes = [checkpoint.content_hash(sorted(load_selected(folder)[1].items())) for folder in (first, second)]
     assert hashes[0] == hashes[1]
     network = load_run(second)
@@ -51,7 +52,7 @@ def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_pat
     (point,) = network.operating_points
     assert point.threshold == pytest.approx(float(odds.sort().values[1]), rel=1e-5)
     assert network.detect(images).sum() == 2
-    evaluate.main.__wrapped__(evaluate.Settings(str(second), photos=str(photos), out=str(tmp_path / "scores")))
+    evaluate(EvaluateSettings(str(photos), str(second), out=str(tmp_path / "scores")))
     summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
     assert summary["operating_point"] == vars(point) | {"in_sample": True}
 
@@ -59,7 +60,7 @@ def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_pat
 def test_each_of_several_labels_has_its_own_threshold(finished, photos, tmp_path):
     labels, both = ["orange", "apple"], tmp_path / "both"
     for name, label in {"both": labels, "orange": "orange", "apple": "apple"}.items():
-        main.__wrapped__(Settings(str(finished), str(tmp_path / name), 0.5, str(photos), label))
+        publish_network(PublishSettings(str(finished), str(tmp_path / name), 0.5, str(photos), label))
     network, images = load_run(both), torch.rand(9, 3, 16, 16)
     for label, point in zip(labels, network.operating_points, strict=True):
         (own,) = load_run(tmp_path / label).operating_points
@@ -67,8 +68,8 @@ def test_each_of_several_labels_has_its_own_threshold(finished, photos, tmp_path
         assert torch.equal(network.detect(images, label), load_run(tmp_path / label).detect(images))
     with pytest.raises(InputError, match="but of orange, apple: give one of these as label"):
         network.detect(images)
-    settings = evaluate.Settings(str(both), photos=str(photos), label=labels[::-1], out=str(tmp_path / "scores"))
-    evaluate.main.__wrapped__(settings)
+    settings = EvaluateSettings(str(photos), str(both), label=labels[::-1], out=str(tmp_path / "scores"))
+    evaluate(settings)
     summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
     assert [point["label"] for point in summary["operating_point"]] == labels[::-1]
 
@@ -78,7 +79,7 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     state = checkpoint.load(run / checkpoint.BEST)
     checkpoint.save(run / checkpoint.BEST, state | {"architecture": state["architecture"] | {"width": "wide"}})
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
-        main.__wrapped__(Settings(str(run), str(tmp_path / "out")))
+        publish_network(PublishSettings(str(run), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 

@@ -21,7 +21,7 @@ from renderer.albedo import changed_albedo
 from renderer.errors import InputError
 from renderer.gloss import Gloss
 from renderer.mesh import Mesh
-from renderer.microfacets import LEAST
+from renderer.settings import MIN_ROUGHNESS
 from renderer.shapes import sphere
 
 ONE = torch.zeros(1, dtype=torch.int64)
@@ -110,7 +110,7 @@ def test_a_material_stays_within_its_norm_ball_and_what_exists(norm, radius):
             reach = offset.norm(dim=1) if norm == "l2" else offset.amax(1)
             assert radius is None or reach.max() <= radius * (1 + 1e-9)
             gloss = problem.conditions(values, torch.arange(2)).gloss
-            assert gloss.amin((0, 1))[0] >= LEAST and gloss.min() >= 0 and gloss.max() <= 1
+            assert gloss.amin((0, 1))[0] >= MIN_ROUGHNESS and gloss.min() >= 0 and gloss.max() <= 1
             assert gloss[0, 0, 1] == 0  # what is no metal becomes none
 
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from augment import reshading
-from augment.attacks.attack import AttackSettings
+from augment.attacks import norm_ball
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import make_parameter, parameter_class
-from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSettings
+from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem
+from augment.attacks.settings import AttackSettings
 from augment.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
@@ -27,7 +27,8 @@ from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
-from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
+from renderer.light.skylight import ZENITH, coefficients
+from renderer.settings import TURBIDITY
 from renderer.transport.operators import build_operators
 
 EPS = torch.finfo(torch.float64).eps
@@ -393,9 +394,9 @@ def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
     stepped = split(problem, problem.take_step(values[chosen], values[chosen], chosen, length))
     for parameter, part, nearest, after in zip(problem.parameters, parts, projected, stepped, strict=True):
         part, center = part[chosen], parameter.start[chosen]
-        assert torch.equal(nearest, parameter.settings.project(part, center))
+        assert torch.equal(nearest, norm_ball.project(parameter.settings, part, center))
         unit = part / part.norm(dim=1, keepdim=True)
-        expected = parameter.settings.project(part - length * parameter.settings.step_size * unit, center)
+        expected = norm_ball.project(parameter.settings, part - length * parameter.settings.step_size * unit, center)
         torch.testing.assert_close(after, expected, rtol=0, atol=64 * EPS)
 
 

@@ -1,0 +1,578 @@
+"""Settings of scenes, their variation and the augmentation service.
+
+This module imports neither torch nor NumPy; see `renderer.settings`. The settings of attacks are
+in `augment.attacks.settings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any
+
+from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.settings import AttackSettings
+from renderer.errors import FACTOR, InputError, describe, is_number, require_choice
+from renderer.settings import (
+    MAX_DEGREE,
+    MAX_SAMPLES,
+    MAX_VERTICES,
+    MAX_VIEWS,
+    MIN_ROUGHNESS,
+    RASTERIZERS,
+    REQUIRED,
+    ImageSettings,
+    Settings,
+    samples_per_side,
+    setting,
+    setting_like,
+    settings_from,
+)
+
+ARMS = {
+    "none": "no renders",
+    "random": "randomized renders",
+    "adversarial": "attacked renders",
+    "folder": "images",
+}
+INITS = ("scene", "random")
+UP_AXES = ("auto", "y", "z")
+MAX_EXAMPLES = 10**6
+MAX_INTERVAL = 10**9  # training images between two regenerations
+MAX_PROP_DISTANCE = 10.0  # position and size of props in world units
+MAX_PROJECTOR_PIXELS = 256  # per side
+MAX_BLUR = 1.5  # pixels
+MIN_FOV, MAX_FOV = 1.0, 45.0  # degrees, of a lens that a normalized mesh is in front of
+UNCHANGED = (1.0, 1.0)  # limits of a factor that changes nothing
+NONE = (0.0, 0.0)  # limits of a strength that is off
+
+
+@dataclass
+class MeshSettings(Settings):
+    """A mesh and its material."""
+
+    mesh: str = setting(REQUIRED, "A mesh file, or a procedural solid as solid:NAME or solid:NAME:SEED.")
+    _: KW_ONLY
+    up: str = setting("auto", "Axis that points up in the file.", choices=UP_AXES)
+    color: list[float] | None = setting(
+        None, "Color of a mesh without colors: red, green and blue in sRGB, from 0 to 1."
+    )
+    gloss: Any = setting(
+        None,
+        "Specular material: [roughness, metallic, strength] or the first of them, from 0 to 1, "
+        "or file for the material of a glTF file. null: none.",
+    )
+
+    def __post_init__(self) -> None:
+        if isinstance(self.mesh, Path):
+            self.mesh = str(self.mesh)
+        super().__post_init__()
+        expected = "give [roughness, metallic, strength] in [0, 1]"
+        if self.gloss == "file" and self.mesh.startswith("solid:"):
+            raise InputError(f"gloss=file: {self.mesh} has none of its own, {expected}", "gloss")
+        if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
+            raise InputError(f"gloss={self.gloss}: {expected}, or file", "gloss")
+        require_color("color", self.color)
+
+
+def _is_gloss(values: object) -> bool:
+    """Tell whether a value is a list of one to three numbers from 0 to 1."""
+    if not isinstance(values, Sequence) or isinstance(values, str):
+        return False
+    return 1 <= len(values) <= 3 and all(is_number(item) and 0 <= item <= 1 for item in values)
+
+
+def require_color(name: str, color: Sequence[float] | None) -> None:
+    """Check that a color has three channels from 0 to 1. None is no color and passes.
+
+    Raises:
+        InputError: If it has not.
+    """
+    if color is None:
+        return
+    if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
+        raise InputError(f"{name}={color} must be red, green and blue from 0 to 1", name)
+
+
+@dataclass
+class PropSettings(MeshSettings):
+    """A mesh beside the object, on the same ground."""
+
+    at: list[float] = setting(
+        REQUIRED,
+        "x and y of its centroid in world units.",
+        minimum=-MAX_PROP_DISTANCE,
+        maximum=MAX_PROP_DISTANCE,
+    )
+    scale: float = setting(
+        1.0,
+        "Its largest coordinate. The largest coordinate of the object is 1.",
+        minimum=1 / MAX_PROP_DISTANCE,
+        maximum=MAX_PROP_DISTANCE,
+    )
+    azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", minimum=-360, maximum=360)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.at) != 2:
+            raise InputError(f"at={self.at} must be x and y", "at")
+
+
+@dataclass
+class ObjectSettings(MeshSettings):
+    """One object of a scene.
+
+    Props are in the image, too, and cast and receive the shadows of the object, but they are
+    never attacked.
+
+    >>> ObjectSettings("solid:orange", label="orange").albedo_scale
+    1.0
+    """
+
+    label: str = setting(REQUIRED, "Name of its class. It may be empty.", may_be_empty=True)
+    albedo_scale: float = setting(1.0, "Factor of its albedo.", minimum=1 / FACTOR, maximum=FACTOR)
+    props: list[Any] = setting([], "Meshes beside the object, as mappings or PropSettings.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for index, prop in enumerate(self.props):
+            if isinstance(prop, Mapping):
+                self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
+            elif not isinstance(prop, PropSettings):
+                expected = "give mappings, or a list of augment.PropSettings"
+                raise InputError(f"props[{index}] is {describe(prop)}: {expected}", "props")
+
+
+@dataclass
+class ProjectorSettings(Settings):
+    """A projector and the pattern with which attacks start."""
+
+    pixels: int = setting(16, "Pixels per side of its pattern.", minimum=1, maximum=MAX_PROJECTOR_PIXELS)
+    polar: float = setting(45.0, "Polar angle of the projector from +z.", "degrees", minimum=0, maximum=180)
+    azimuth: float = setting(45.0, "Azimuth of the projector.", "degrees", minimum=-360, maximum=360)
+    distance: float = setting(4.0, "Distance from the origin in world units.", minimum=2, maximum=FACTOR)
+    fov: float = setting(30.0, "Angle between the sides of its image.", "degrees", minimum=0.1, maximum=170)
+    power: float = setting(1.0, "Largest value of a pixel.", minimum=1 / FACTOR, maximum=FACTOR)
+    pattern: Any = setting(0.0, "Pattern with which attacks start: a gray value in [0, 1] or an image file.")
+
+
+@dataclass
+class LampsSettings(Settings):
+    """Lamps, which are points or, with a radius, discs."""
+
+    positions: list[Any] = setting(
+        [[2.0, 2.0, 2.0], [2.0, -2.0, 2.0], [-2.0, 2.0, 2.0], [-2.0, -2.0, 2.0]],
+        "Positions [x, y, z] of the lamps in world units.",
+    )
+    power: float = setting(10.0, "Largest power of a lamp.", minimum=1 / FACTOR, maximum=FACTOR)
+    radius: float = setting(0.0, "Radius of the discs in world units.", minimum=0, maximum=FACTOR)
+    start: Any = setting(
+        0.0,
+        "Powers with which attacks start: a number, [r, g, b] of each lamp, or the lamps.json of "
+        "an adversary. Its positions, power and radius then replace the others.",
+    )
+
+
+# By the name of the kind of light; see `renderer.light.local_lights`.
+LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
+    "projector": ProjectorSettings,
+    "lamps": LampsSettings,
+}
+
+
+@dataclass
+class SceneSettings(Settings):
+    """Objects, cameras, backgrounds and lighting of a scene."""
+
+    meshes: list[Any] = setting(
+        ["solid:orange:0"],
+        "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
+        "albedo_scale, color, gloss: [roughness, metallic, strength] or file, "
+        "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}.",
+    )
+    backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
+    views: int | None = setting(1, "Number of cameras per mesh, at equal azimuths.", minimum=1, maximum=MAX_VIEWS)
+    polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", minimum=0, maximum=180)
+    azimuth: float = setting(
+        0.0,
+        "Azimuth of the first camera from +x toward +y.",
+        "degrees",
+        minimum=-360,
+        maximum=360,
+    )
+    width: float = setting(2.0, "Width of the image in world units, at the mesh. The mesh spans [-1, 1].")
+    fov: float | None = setting(
+        None,
+        "Angle between the sides of the image. null: orthographic.",
+        "degrees",
+        minimum=0.1,
+        maximum=150,
+    )
+    vertices: int = setting(
+        0,
+        "Subdivide each mesh until it has more vertices than this. The paper attacks shapes with more than 10,000.",
+        minimum=0,
+        maximum=MAX_VERTICES,
+        checks_type=False,  # Python code may give 1e4
+    )
+    light: str = setting(
+        "grace",
+        "Environment lighting: grace, eucalyptus, st_peters, uniform, an environment map "
+        "(.npy, .hdr, .exr) or coefficients (.json).",
+        checks_type=False,  # Python code may give coefficients
+    )
+    degree: int | None = setting(
+        None,
+        "Spherical-harmonic degree of the lighting. "
+        "null: 6, or what the smoothest specular material needs that the run can reach.",
+        minimum=0,
+        maximum=MAX_DEGREE,
+    )
+    exposure: float = setting(1.0, "Factor of the lighting.", minimum=1 / FACTOR, maximum=FACTOR)
+    # OmegaConf cannot set a part of an optional dataclass, so these two are converted below.
+    projector: Any = setting(
+        None,
+        "A projector: {pixels: 16, polar: 45, azimuth: 45, distance: 4, fov: 30, power: 1, "
+        "pattern: 0.0 or FILE}, or some of these keys. null: none.",
+    )
+    lamps: Any = setting(
+        None,
+        "Lamps: {positions: [[2, 2, 2], ...], power: 10, radius: 0.0, start: 0.0 or FILE.json}, "
+        "or some of these keys. null: none.",
+    )
+    ground: list[float] | None = setting(None, "Color of a table under each mesh: [r, g, b] in sRGB. null: no table.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, kind in LOCAL_LIGHT_SETTINGS.items():
+            setattr(self, name, _as_settings(name, getattr(self, name), kind))
+
+
+def _as_settings(name: str, value: object, kind: type[Settings]) -> Settings | None:
+    """Convert a mapping to settings. None and settings stay as they are."""
+    if isinstance(value, Mapping):
+        return settings_from(kind, value, name)
+    if value is None or isinstance(value, kind):
+        return value
+    raise InputError(f"{name} is {describe(value)}: give a mapping or {kind.__name__}(...)", name)
+
+
+@dataclass
+class RendererSettings(Settings):
+    """How images are rendered."""
+
+    rasterizer: str = setting(
+        "auto",
+        "Rasterizer: auto (numba if it is installed, otherwise numpy), opengl, numba or numpy.",
+        checks_type=False,  # Python code may give one that was chosen
+    )
+    samples: int | None = setting(
+        None,
+        "Samples per side of a pixel. With 2, each pixel has 4 samples. null: 2, or 8 with silhouettes.",
+        minimum=1,
+        maximum=MAX_SAMPLES,
+    )
+    encoding: str = setting_like(ImageSettings, "encoding", "linear")
+    normals: str = setting_like(ImageSettings, "normals", "smooth")
+    shadows: bool = setting_like(ImageSettings, "shadows", False)
+    bounces: int = setting_like(ImageSettings, "bounces", 0)
+    silhouettes: bool = setting_like(ImageSettings, "silhouettes", False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not hasattr(self.rasterizer, "rasterize"):
+            require_choice("rasterizer", self.rasterizer, RASTERIZERS)
+
+    def image(self, size: int) -> ImageSettings:
+        """Return the settings of an image of `size` pixels per side."""
+        return ImageSettings(
+            size=size,
+            samples=samples_per_side(self.samples, self.silhouettes),
+            encoding=self.encoding,
+            normals=self.normals,
+            shadows=self.shadows,
+            bounces=self.bounces,
+            silhouettes=self.silhouettes,
+        )
+
+
+@dataclass
+class VarnishSettings(Settings):
+    """A dielectric specular layer on each object, drawn anew for each render."""
+
+    roughness: list[float] = setting(
+        [0.4, 0.8],
+        "Smallest and largest roughness. Below 0.5, the lighting gets a higher degree.",
+        minimum=MIN_ROUGHNESS,
+        maximum=1,
+        is_pair=True,
+    )
+    strength: list[float] = setting(
+        list(NONE),
+        "Smallest and largest strength. [0, 0]: no layer.",
+        minimum=0,
+        maximum=1,
+        is_pair=True,
+    )
+
+
+@dataclass
+class CameraEffectSettings(Settings):
+    """Effects of a camera on each render. Each is uniform from 0 to its value."""
+
+    pattern_fraction: float = setting(0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1)
+    pattern_fill: list[float] = setting(
+        list(NONE),
+        "Smallest and largest factor of the lighting of the scene beneath the pattern.",
+        minimum=0,
+        maximum=1,
+        is_pair=True,
+    )
+    white_balance: float = setting(0.0, "Largest change of each channel.", "stops", minimum=0, maximum=5)
+    blur: float = setting(0.0, "Largest standard deviation of the blur.", "pixels", minimum=0, maximum=MAX_BLUR)
+    noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", minimum=0, maximum=1)
+
+
+@dataclass
+class VariationSettings(Settings):
+    """What is drawn anew for each render in each regeneration.
+
+    By default nothing is drawn, which keeps the grid of the paper. Backgrounds keep the lighting
+    that was drawn, also while an attack changes the lighting of the object.
+
+    >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
+    (True, False)
+    """
+
+    shift: float = setting(
+        0.0,
+        "Largest distance of the mesh from the center of the image, as a fraction of its width.",
+        minimum=0,
+        maximum=1,
+    )
+    scale: list[float] = setting(
+        list(UNCHANGED),
+        "Smallest and largest factor of the size in the image.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+        is_pair=True,
+    )
+    exposure: list[float] = setting(
+        list(UNCHANGED),
+        "Smallest and largest factor of the lighting.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+        is_pair=True,
+    )
+    backgrounds: str | None = setting(None, "Folder of images that replace scene.backgrounds. null: none.")
+    instances: bool = setting(False, "Draw another instance of each solid that is named without a seed.")
+    azimuth: float = setting(
+        0.0,
+        "Largest motion of the camera around the mesh, to either side and up and down.",
+        "degrees",
+        minimum=0,
+        maximum=180,
+    )
+    fov: list[float] = setting(
+        list(NONE),
+        "Smallest and largest angle between the sides of the image, from 1 to 45. [0, 0]: the camera of the scene.",
+        "degrees",
+        minimum=0,
+        maximum=MAX_FOV,
+        is_pair=True,
+    )
+    rotation: float = setting(
+        0.0,
+        "Largest rotation of the mesh about a random axis.",
+        "degrees",
+        minimum=0,
+        maximum=180,
+    )
+    environments: list[str] = setting(
+        [], "Environment lightings that replace scene.light, one of them for each render."
+    )
+    directional_fraction: float = setting(
+        0.0,
+        "Fraction of renders in directional lighting from the side of the camera, up to 70 degrees from it.",
+        minimum=0,
+        maximum=1,
+    )
+    fill_light: list[float] = setting(
+        list(NONE),
+        "Smallest and largest factor of the environment lighting of these renders.",
+        minimum=0,
+        maximum=1,
+        is_pair=True,
+    )
+    lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
+    tables: float = setting(
+        0.0,
+        "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the object.",
+        minimum=0,
+        maximum=1,
+    )
+    background_saturation: float = setting(
+        0.0,
+        "Largest saturation of a random color that multiplies each background.",
+        minimum=0,
+        maximum=1,
+    )
+    gloss: VarnishSettings = setting(
+        VarnishSettings, "A specular layer on each object, which replaces its own material."
+    )
+    camera: CameraEffectSettings = setting(CameraEffectSettings, "Effects of a camera on each render.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if tuple(self.fov) != NONE and self.fov[0] < MIN_FOV:
+            expected = f"give [minimum, maximum], both from {MIN_FOV:g} to {MAX_FOV:g}"
+            raise InputError(f"fov={list(self.fov)}: {expected}", "fov")
+
+    @property
+    def moves(self) -> bool:
+        """Whether views change. They are then rasterized in every regeneration."""
+        new_objects = self.instances or self.rotation > 0 or any(self.gloss.strength)
+        is_scaled = tuple(self.scale) != UNCHANGED
+        moved = self.shift > 0 or is_scaled or any((self.azimuth, *self.fov))
+        return moved or new_objects or self.tables > 0
+
+
+@dataclass
+class RandomLightSettings(Settings):
+    """Random perturbation of the lighting of the scene."""
+
+    amplitude: float = setting(
+        0.5,
+        "Each coefficient changes by a uniform draw between minus and plus this value.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+    )
+    radius: float | None = setting(
+        None,
+        "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: the amplitude applies.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+    )
+
+
+@dataclass
+class TrainingAttackSettings(AttackSettings):
+    """Attack during training.
+
+    Unless parameters are named, this is the attack of the paper's appendix C on all coefficients
+    of the lighting: 30 steps of 0.05 along the gradient's direction, with negative lighting
+    permitted, until the classifier errs on images that are not rounded and have no noise.
+    """
+
+    step: str = setting_like(StepSettings, "step", "unit")
+    step_size: float = setting_like(StepSettings, "step_size", 0.05)
+    allow_negative: bool = True
+    margin: float = 0.0
+    rounded: bool = False
+    sensor_noise: float = 0.0
+    batch_size: int = 128
+
+    @property
+    def parameters(self) -> dict[str, StepSettings]:
+        """The settings of the parameters to change, by name: by default, the lighting."""
+        lighting = StepSettings(step=self.step, step_size=self.step_size)
+        return super().parameters or {"lighting": lighting}
+
+
+@dataclass
+class AugmentationSettings(Settings):
+    """What an augmentation service renders, and when.
+
+    >>> AugmentationSettings(arm="random", random_light=RandomLightSettings(radius=1.5)).renders
+    True
+    """
+
+    arm: str = setting("adversarial", "Kind of renders.", choices=ARMS)
+    folder: str | None = setting(
+        None,
+        "Folder of images for arm=folder: a folder per class, or other_NAME. They replace the renders.",
+    )
+    examples: int | None = setting(
+        100,
+        "Renders per regeneration: meshes × views × backgrounds. null: as many as scene.views "
+        "makes, or all images of the folder.",
+        minimum=0,
+        maximum=MAX_EXAMPLES,
+    )
+    init: str = setting(
+        "scene",
+        "Start of an attack: the lighting of the scene (scene) or a random perturbation (random).",
+        choices=INITS,
+    )
+    warm_start: bool = setting(False, "Start each attack where the attack of the previous regeneration ended.")
+    every: int | None = setting(
+        None,
+        "Training images between two regenerations. null: regenerate once per epoch.",
+        minimum=1,
+        maximum=MAX_INTERVAL,
+    )
+    vary: VariationSettings = setting(VariationSettings, "What is drawn anew for each render in each regeneration.")
+    random_light: RandomLightSettings = setting(
+        RandomLightSettings, "Perturbation of the lighting for arm=random and for init=random."
+    )
+    attack: TrainingAttackSettings = setting(
+        TrainingAttackSettings,
+        "The attack during training.",
+        checks_type=False,  # Python code may give an AttackSettings
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.attack, AttackSettings):
+            raise InputError(f"attack is {describe(self.attack)}: give the settings of an attack", "attack")
+        if not self.attack.parameters:
+            remedy = "give TrainingAttackSettings(), or name a parameter"
+            raise InputError(f"attack changes nothing: {remedy}", "attack")
+        if self.arm == "folder" and not self.folder:
+            given = f"folder is {self.folder}, and arm=folder shows its images"
+            raise InputError(f"{given}: name a folder", "folder")
+        uses_random_draws = "random" in (self.arm, self.init)
+        for name, steps in self.attack.parameters.items():
+            if uses_random_draws and name != "lighting" and steps.radius is None:
+                missing = f"attack.{name}.radius"
+                message = f"{missing} is None, which has no random draw: set a radius"
+                raise InputError(message, missing)
+        if self.warm_start and self.vary.instances:
+            message = "warm_start=True keeps the last attack's shapes: set vary.instances=False"
+            raise InputError(message, "warm_start")
+
+    @property
+    def renders(self) -> bool:
+        """Whether there are any examples at all."""
+        return self.arm != "none" and self.examples != 0
+
+
+def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
+    """Compute the views per mesh, so that meshes × views × backgrounds are the examples.
+
+    Either count is derived from the other if it is None. The 100 examples of the paper are
+    2 meshes × 10 views × 5 backgrounds.
+
+    Args:
+        examples: Number of renders per regeneration.
+        objects: Number of meshes.
+        backgrounds: Number of backgrounds.
+        views: Number of views per mesh.
+
+    Returns:
+        Number of views per mesh.
+
+    Raises:
+        InputError: If there is no such product.
+    """
+    if not objects or not backgrounds:
+        raise InputError("meshes and backgrounds must not be empty: name one of each", "meshes")
+    if examples is None and views is not None:
+        return views
+    derived, rest = divmod(examples or 0, objects * backgrounds)
+    if rest or derived < 1 or views not in (None, derived):
+        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
+        remedy = "change one of them, or derive one from the other by views=null or examples=null"
+        raise InputError(f"examples={examples} is not {product}: {remedy}", "examples")
+    return derived

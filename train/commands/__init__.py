@@ -1,0 +1,1 @@
+"""The commands besides pnb-train: their settings, and what each does."""

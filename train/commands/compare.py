@@ -1,0 +1,17 @@
+"""pnb-compare: tables of finished runs."""
+
+from pathlib import Path
+
+from train.commands.settings import CompareSettings
+from train.report.compare import format_comparison
+from train.report.summary import summarize
+
+
+def print_comparison(settings: CompareSettings) -> None:
+    """Print Markdown tables of finished runs, side by side.
+
+    Raises:
+        InputError: If a folder holds no finished run.
+    """
+    runs = [summarize(Path(run)) for run in settings.runs]
+    print(format_comparison(runs, settings.exclude, settings.photographs, settings.by))

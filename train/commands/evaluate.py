@@ -1,0 +1,56 @@
+"""pnb-evaluate: scores of a network on a folder of photographs."""
+
+from pathlib import Path
+
+from augment.classifiers import Classifier, load_classifier
+from train.commands.settings import EvaluateSettings
+from train.device import MixedPrecision, choose_device, choose_precision
+from train.errors import writable_folder
+from train.networks import load_run
+from train.photographs import scoring
+from train.photographs.folder import require_outside
+from train.photographs.predictions import Predictor
+from train.results import require_replaceable
+from train.run_folder import sole_writer
+from train.settings import label_names, published
+
+
+def evaluate(settings: EvaluateSettings) -> None:
+    """Score a network on photographs, write tables and images, and print a summary.
+
+    Raises:
+        InputError: If the network, a class or the photographs cannot be used.
+    """
+    device = choose_device(settings.device)
+    network = _load_network(settings)
+    labels = label_names(settings.label)
+    for name in labels:
+        network.label(name)  # or InputError that names the network
+    precision = choose_precision(settings.precision, device)
+    model = MixedPrecision(network.to(device), precision)
+    out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
+    points = network.operating_points
+    predictor = Predictor(model, network.classes, network.size, device)
+    with sole_writer("out", out):
+        if settings.calibrate and settings.false_positive_rate:
+            folder = published(Path(settings.calibrate))
+            rate = settings.false_positive_rate
+            skip = settings.skip_unreadable
+            points = scoring.choose_operating_points(predictor, folder, labels, rate, skip)
+        by_label = {point.label: point for point in points}
+        has_all = by_label.keys() >= set(labels)
+        points = [by_label[name] for name in labels] if has_all else []
+        photos = published(Path(settings.photos))
+        require_outside(out, photos)
+        answers = predictor.predict(photos, labels, settings.skip_unreadable)
+        scores = scoring.score(answers, settings.by, points)
+        scoring.write(scores, out)
+    print(f"{scoring.format_scores(scores)}\n\ntable, scores and image: {out}")
+
+
+def _load_network(settings: EvaluateSettings) -> Classifier:
+    """Load the network of a run, or any other classifier."""
+    if settings.run is None:
+        return load_classifier(str(settings.classifier), settings.weights)
+    return load_run(settings.run, settings.weights, settings.model)

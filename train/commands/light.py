@@ -1,0 +1,38 @@
+"""pnb-light: a light as an environment map for other software."""
+
+from pathlib import Path
+
+from renderer.errors import InputError
+from renderer.light.basis import Harmonics
+from renderer.light.environment import to_map, write_map
+from renderer.light.harmonics import degree_of, irradiance_error
+from renderer.light.presets import load_light
+from train.command import keyed
+from train.commands.settings import LightSettings
+from train.results import require_replaceable
+
+
+def export_light(settings: LightSettings) -> None:
+    """Write a light without negative radiance, and print by how much its irradiance differs.
+
+    Raises:
+        InputError: If the light cannot be read, or the file cannot be written.
+    """
+    out = Path(settings.out)
+    if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
+        message = f"out={out} is the light itself, which would be lost: choose another file"
+        raise InputError(message, "out")
+    require_replaceable(out, "out", settings.overwrite)
+    light = load_light(settings.light, degree=None)
+    physical = Harmonics(degree_of(light)).project_nonnegative(light)
+    radiance = to_map(physical, settings.height).clamp(min=0)
+    with keyed("out"):
+        write_map(out, radiance)
+    rows, columns = radiance.shape[:2]
+    darkest = float(radiance.min())
+    brightest = float(radiance.max())
+    error = irradiance_error(physical, light)
+    print(
+        f"{out}: {columns} × {rows} texels, radiance {darkest:.3g} to {brightest:.3g}; "
+        f"without negative radiance, irradiance is off by {error:.2%}"
+    )

@@ -1,0 +1,491 @@
+"""Settings of the commands besides pnb-train.
+
+This module imports neither torch nor NumPy; see `renderer.settings`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from augment.attacks.settings import AttackSettings
+from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
+from renderer.errors import FACTOR, InputError, require_choice
+from renderer.settings import (
+    ENCODINGS,
+    MAX_BOUNCES,
+    MAX_SIZE,
+    MAX_VIEWS,
+    REQUIRED,
+    Settings,
+    setting,
+    setting_like,
+)
+from train.settings import GROUPS, MAX_IMAGES, MAX_SEED, TIME_FOLDER, label_names
+
+RENDERERS = ("reload", "mitsuba")  # of written adversaries
+LAMP_POWER = 2.0  # of the default lamps if only their positions are attacked
+TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
+OTHER_PATTERNS = ("rings", "window", "leaves", "text", "colors")
+SLIDES = "slides"  # pattern of the images that the user names
+PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
+LAB_MESHES = [
+    *(f"solid:orange:{seed}" for seed in range(101, 107)),
+    *("solid:apple:101", "solid:apple:102", "solid:pear:101", "solid:sweet_pepper:101"),
+    *("solid:lemon:101", "solid:lemon:102", "solid:peach:101", "solid:peach:102"),
+    *("solid:ball:101", "solid:ball:103"),
+]
+CLASSIFIERS = (
+    "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, run:FOLDER, squeezenet_caffe or "
+    "python:package.module:function"
+)
+
+
+@dataclass
+class AttackCommandSettings(AttackSettings):
+    """What pnb-attack changes, and how."""
+
+    shared: bool = setting(False, "The views share one lighting, shape or color, and their costs are summed.")
+    force: bool = setting(False, "Also attack images that are misclassified before the attack.")
+    checks: bool = setting(
+        True,
+        "Compare with a random search of as many passes, and with 3 and 10 times as many steps.",
+    )
+    radius_scales: list[float] = setting(
+        [],
+        "Measure success against radius at these factors of each radius, such as "
+        "[0.25, 0.5, 1, 2]. A radius of null counts as 1.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+    )
+    verify: str | None = setting(
+        "reload",
+        "Render the written files again: reload (here), mitsuba, reload+mitsuba or null.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.renderers:
+            require_choice("verify", name, RENDERERS)
+
+    @property
+    def renderers(self) -> list[str]:
+        """The renderers that `verify` names."""
+        return self.verify.split("+") if self.verify else []
+
+
+@dataclass
+class AttackSceneSettings(SceneSettings):
+    """The scene that pnb-attack attacks."""
+
+    views: int = setting_like(SceneSettings, "views", 1)
+    search: int = setting(
+        10,
+        "Number of cameras to try, in several lightings and in front of light gray, for a mesh that is misclassified.",
+        minimum=0,
+        maximum=MAX_VIEWS,
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("meshes", "backgrounds"):
+            if not getattr(self, name):
+                raise InputError(f"{name} must not be empty: name one or more", name)
+        super().__post_init__()
+
+
+@dataclass
+class TransferSettings(Settings):
+    """Where else successful adversaries are shown.
+
+    Another network counts those that it classified correctly before.
+    """
+
+    classifiers: list[Any] = setting([], "Other networks: as `classifier`, or {classifier, weights}.")
+    azimuths: list[float] = setting(
+        [], "Rotations of the camera about the vertical.", "degrees", minimum=-360, maximum=360
+    )
+    meshes: list[Any] = setting([], "Other meshes, as scene.meshes, in the same lighting.")
+
+
+@dataclass
+class AttackExperimentSettings(Settings):
+    """Settings of pnb-attack: one attack on one classifier.
+
+    If a projector or lamps are attacked and the scene has none, it gets them with their
+    defaults. An attack on the pose sets `renderer.silhouettes`.
+    """
+
+    classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
+    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
+    label: str = setting("orange", "Class of the meshes. A mapping {mesh, label} names its own class.")
+    target: Any = setting(
+        None,
+        "Class to reach: null (any misclassification), least_likely, a class, or a list of classes, one per view.",
+        is_text=True,
+    )
+    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
+    reload: str | None = setting(
+        None,
+        "Folder of an adversary. Its predictions are printed or, with attack=..., it is attacked further.",
+    )
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+    attack: AttackCommandSettings = setting(
+        AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
+    )
+    transfer: TransferSettings = setting(TransferSettings, "Where else successful adversaries are shown.")
+    scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
+    renderer: RendererSettings = setting(lambda: RendererSettings(shadows=True), "How images are rendered.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = self.target if isinstance(self.target, list) else [self.target]
+        if any(isinstance(name, dict | list) for name in names):
+            expected = "give a class, least_likely, or a list of classes, one per view"
+            raise InputError(f"target: {expected}", "target")
+        if isinstance(self.target, int | float):  # a class whose name is a number
+            self.target = str(self.target)
+        attacked = self.attack.parameters
+        for name, kind in LOCAL_LIGHT_SETTINGS.items():
+            if name in attacked and getattr(self.scene, name) is None:
+                setattr(self.scene, name, kind())
+        if "pose" in attacked:
+            self.renderer.silhouettes = True
+        if "positions" in attacked and self.scene.lamps is None:
+            self.scene.lamps = LampsSettings(start=LAMP_POWER)
+
+
+@dataclass
+class LabSettings(Settings):
+    """Settings of pnb-lab.
+
+    A mesh is a file, solid:NAME:SEED or a mapping with the fields of ObjectSettings. Its label
+    is a class, or other_NAME if the network lacks the class.
+    """
+
+    out: str = setting(REQUIRED, "A new folder, for photos= of pnb-evaluate.")
+    label: Any = setting(
+        "orange",
+        "Positive class, or several. An object of each and one other object stand in each setup.",
+        is_text=True,
+    )
+    meshes: list[Any] = setting(LAB_MESHES, "The objects: by default, 6 oranges and 10 others.")
+    setups: int = setting(
+        180,
+        "Number of draws of lighting, camera and pose. With one label, each has two renders.",
+        minimum=1,
+        maximum=MAX_IMAGES,
+    )
+    patterns: list[str] = setting(
+        list(TRAINED_PATTERNS),
+        f"Projected patterns, for as many setups each: {', '.join(PATTERNS)}. a+b projects two from two projectors.",
+    )
+    slides: list[str] = setting([], "Image files that the pattern `slides` projects.")
+    environments: list[str] = setting(
+        [], "Environment maps (.npy, .hdr, .exr) instead of patterns, for as many setups each."
+    )
+    brightness: list[float] = setting(
+        [0.2, 2.5],
+        "Smallest and largest radiance of white surfaces that face the light.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+        is_pair=True,
+    )
+    azimuth: list[float] = setting(
+        [-70, 70],
+        "Smallest and largest azimuth of a projector, relative to the camera.",
+        "degrees",
+        minimum=-180,
+        maximum=180,
+        is_pair=True,
+    )
+    elevation: list[float] = setting(
+        [25, 70],
+        "Smallest and largest elevation of a projector above the table.",
+        "degrees",
+        minimum=1,
+        maximum=89,
+        is_pair=True,
+    )
+    ambient: list[float] = setting(
+        [0.01, 0.06],
+        "Smallest and largest radiance of the uniform environment besides the projectors.",
+        minimum=0,
+        maximum=1,
+        is_pair=True,
+    )
+    albedo: list[float] = setting(
+        [0.04, 0.16],
+        "Smallest and largest albedo of table and wall.",
+        minimum=0,
+        maximum=1,
+        is_pair=True,
+    )
+    walls: float = setting(
+        0.0,
+        "Fraction of the setups with a wall behind the object, if no projector stands behind it.",
+        minimum=0,
+        maximum=1,
+    )
+    roughness: list[float] = setting(
+        [0.5, 0.5],
+        "Smallest and largest roughness of the object. 0.1 is glossy, 1 is matte.",
+        minimum=0.05,
+        maximum=1,
+        is_pair=True,
+    )
+    exposure: float = setting(
+        1.0,
+        "Factor of the radiance. With 1, a radiance of 1 is white.",
+        minimum=1 / FACTOR,
+        maximum=FACTOR,
+    )
+    size: int = setting(64, "Pixels per side.", minimum=1, maximum=MAX_SIZE)
+    spp: int = setting(32, "Paths per pixel and light.", minimum=1, maximum=10**5)
+    bounces: int = setting(4, "Largest number of bounces of light.", minimum=1, maximum=1000)
+    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    overwrite: bool = setting(False, "Render into a folder that is not empty. The renders in it are replaced.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        families = {family for pattern in self.patterns for family in pattern.split("+")}
+        for family in sorted(families):
+            require_choice("patterns", family, PATTERNS)
+        if SLIDES in families and not self.slides:
+            raise InputError(f"patterns has {SLIDES}: name image files in slides=", "patterns")
+        sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
+        if not sources or self.setups % len(sources):
+            expected = f"must be a multiple of the {len(sources)} patterns and maps"
+            raise InputError(f"setups={self.setups} {expected}", "setups")
+        if len(set(sources)) < len(sources):
+            expected = "must have different names, which are the renders' sources"
+            raise InputError(f"patterns and environments {expected}")
+
+
+@dataclass
+class AuditSettings(Settings):
+    """Settings of pnb-audit.
+
+    A mesh is a file, solid:NAME:SEED or a mapping with the fields of ObjectSettings.
+    """
+
+    classifier: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
+    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
+    hardened: str | None = setting(None, "Another classifier to show beside it, such as run:runs/harden.")
+    label: str = setting("orange", "Class of the meshes. Each class has an audit of its own.")
+    meshes: list[Any] = setting([], "Meshes of the class.")
+    look_alikes: list[Any] = setting([], "Hard negatives: meshes of other classes, in the same lighting.")
+    photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
+    laboratory: str | None = setting(
+        None, "Such a folder of renders. null: it is made of the meshes if Mitsuba is installed."
+    )
+    environments: list[str] = setting(
+        ["grace", "eucalyptus", "st_peters"], "Environment lightings, or maps (.hdr ...)."
+    )
+    budget: float = setting(
+        1.0,
+        "Factor of the number of views, lightings and renders. "
+        "With 1, EfficientNet-Lite0 takes 18 minutes on one core.",
+        minimum=0.01,
+        maximum=100,
+    )
+    overwrite: bool = setting(False, "Start anew in a folder that holds an audit or other results.")
+    seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+    out: str = setting(
+        f"runs/audits/{TIME_FOLDER}",
+        "Folder of the audit. An audit that was stopped continues in its folder.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("meshes",) if self.laboratory else ("meshes", "look_alikes"):
+            if not getattr(self, name):
+                remedy = f"name one mesh or more, as in {name}=[solid:orange]"
+                raise InputError(f"{name} is empty: {remedy}", name)
+        if self.laboratory and self.look_alikes:
+            instead = f"look_alikes are rendered instead of laboratory={self.laboratory}"
+            raise InputError(f"{instead}: leave one of them out", "look_alikes")
+
+    def scale(self, count: int) -> int:
+        """Multiply a count by the budget. The result is at least 1."""
+        return max(1, round(count * self.budget))
+
+
+@dataclass
+class CompareSettings(Settings):
+    """Settings of pnb-compare."""
+
+    runs: list[str] = setting(REQUIRED, "Folders of finished runs.")
+    exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
+    by: str = setting("source", "Groups of the tables.", choices=GROUPS)
+    photographs: str = setting("photographs", "Sub-folder of the scores to compare: its name in evaluate.photos.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            remedy = "give the folders of one run or more, as in runs=[runs/a,runs/b]"
+            raise InputError(f"runs is empty: {remedy}", "runs")
+        folders = [Path(run).resolve() for run in self.runs]
+        for run, folder in zip(self.runs, folders, strict=True):
+            if folders.count(folder) > 1:
+                fault = f"runs names {run} twice, as if it were another seed"
+                raise InputError(f"{fault}: name each run once", "runs")
+
+
+@dataclass
+class EvaluateSettings(Settings):
+    """Settings of pnb-evaluate."""
+
+    photos: str = setting(
+        REQUIRED,
+        "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory is installed.",
+    )
+    run: str | None = setting(None, "A run folder, or a folder below pretrained/.")
+    model: str | None = setting(None, "python:package.module:function, if such a function made the run's network.")
+    classifier: str | None = setting(None, f"Any other network instead of run: {CLASSIFIERS}.")
+    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
+    label: Any = setting(
+        "orange",
+        "Positive class, whose recall and false positives count, or several. "
+        "It is the class of a folder without sub-folders.",
+        is_text=True,
+    )
+    out: str = setting(f"runs/photographs/{TIME_FOLDER}", "Folder of the scores.")
+    false_positive_rate: float | None = setting(
+        None,
+        "Rate for which a threshold on the log-odds of `label` is chosen on calibrate.",
+        minimum=1e-6,
+        maximum=1 - 1e-6,
+    )
+    calibrate: str | None = setting(
+        None, "A folder like photos. null: the threshold that a published network carries, if any."
+    )
+    by: str = setting("source", "Groups of the tables: columns of photos.csv.", choices=GROUPS)
+    skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+    precision: str = setting("auto", "auto (bfloat16 if the hardware computes in it), bfloat16 or float32.")
+    device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_calibration(self.false_positive_rate, self.calibrate)
+        label_names(self.label)
+        if (self.run is None) == (self.classifier is None):
+            raise InputError("give one network: run=FOLDER, or classifier=NAME")
+        if self.classifier and self.model:
+            remedy = "leave it out, since a classifier has its own"
+            raise InputError(f"model={self.model} is for run=FOLDER: {remedy}", "model")
+
+
+def require_calibration(rate: float | None, calibrate: str | None) -> None:
+    """Check that a false-positive rate and a folder to calibrate on are given together.
+
+    Raises:
+        InputError: If only one is given.
+    """
+    if (rate is None) != (calibrate is None):
+        raise InputError("give false_positive_rate=RATE and calibrate=FOLDER together, or neither")
+
+
+@dataclass
+class FitSettings(Settings):
+    """Settings of pnb-fit."""
+
+    photograph: str = setting(REQUIRED, "An image file.")
+    mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
+    mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
+    box: list[int] = setting([], "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut.")
+    fov: float | None = setting(
+        None,
+        "Angle across a square that is 1.6 times as wide as the object. null: orthographic.",
+        "degrees",
+        minimum=0.1,
+        maximum=120,
+    )
+    albedo_scale: float = setting(
+        1.0,
+        "Factor of the albedo of the mesh. Twice as much halves the lighting.",
+        minimum=1e-3,
+        maximum=1e3,
+    )
+    encoding: str = setting(
+        "srgb",
+        "Encoding of the photograph, the colors of the mesh and the images of the printed attack.",
+        choices=ENCODINGS,
+    )
+    bounces: int = setting(
+        3,
+        "Number of bounces of light between the surfaces of the mesh. 0: also without shadows.",
+        minimum=0,
+        maximum=MAX_BOUNCES,
+    )
+    label: str = setting("orange", "Class of the printed attack.")
+    size: int = setting(64, "Pixels per side that are compared.", minimum=16, maximum=512)
+    out: str = setting("runs/fit", "Folder of background.png, mask.png, light.json and comparison.png.")
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if bool(self.mask) == bool(self.box):
+            raise InputError("give mask=FILE or box=[left,top,right,bottom], one of them")
+
+
+@dataclass
+class LightSettings(Settings):
+    """Settings of pnb-light."""
+
+    light: str = setting(
+        REQUIRED,
+        "grace, eucalyptus, st_peters, uniform, a map (.npy, .hdr, .exr) or coefficients (.json).",
+    )
+    out: str = setting(
+        REQUIRED,
+        "File of the map: .hdr, .exr or .npy. It has no negative radiance and the same mean.",
+    )
+    height: int = setting(
+        256,
+        "Number of rows. There are twice as many columns.",
+        minimum=1,
+        maximum=8192,  # a map of this height takes 3 GB
+    )
+    overwrite: bool = setting(False, "Replace a file that exists.")
+
+
+@dataclass
+class PublishSettings(Settings):
+    """Settings of pnb-publish."""
+
+    run: str = setting(REQUIRED, "A finished run folder, or a published network.")
+    out: str = setting(REQUIRED, "Folder of the weights.")
+    false_positive_rate: float | None = setting_like(EvaluateSettings, "false_positive_rate", None)
+    calibrate: str | None = setting(
+        None,
+        "Folder of photographs as for pnb-evaluate. null: the threshold that it has, if any.",
+    )
+    label: Any = setting("orange", "Class of the threshold, or several, each with its own.", is_text=True)
+    model: str | None = setting_like(EvaluateSettings, "model", None)
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_calibration(self.false_positive_rate, self.calibrate)
+
+
+@dataclass
+class ReportSettings(Settings):
+    """Settings of pnb-report."""
+
+    runs: list[str] = setting(REQUIRED, "Folders of runs, sweeps and attacks. Folders below them count, too.")
+    out: str | None = setting(
+        None,
+        "Folder of the page and its images. null: the common parent of the runs, whose page is replaced.",
+    )
+    overwrite: bool = setting(False, "Replace results in the folder `out`.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            raise InputError("runs is empty: give the folders of runs, sweeps or attacks", "runs")
