@@ -7,15 +7,15 @@ __getattr__, __dir__, __all__ = attach(
     {
         "attacks.adversary": ["Adversary", "reload"],
         "attacks.attack": ["AttackResult", "attack"],
-        "attacks.evaluate": ["check", "success_by_radius", "transfer"],
-        "attacks.files": ["save"],
+        "attacks.checks": ["check", "success_by_radius", "transfer"],
+        "attacks.attack_files": ["save"],
         "attacks.settings": ["AttackSettings"],
         "attacks.parameters.settings": [
             *("MaterialSettings", "PoseSettings", "SkylightSettings", "StepSettings"),
         ],
-        "build": ["build_scene"],
+        "scene.build": ["build_scene"],
         "classifiers": ["Classifier", "load_classifier"],
-        "scene": ["Scene"],
+        "scene.scene": ["Scene"],
         "service": ["AugmentationService"],
         "settings": [
             *("AugmentationSettings", "CameraEffectSettings", "LampsSettings", "ObjectSettings"),

@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu --out gpu.jsonl
 
-The command checks first (tests/train/test_gpu.py), then measures. A question that fails has a line with its error, and
+The command checks first (tests/train/system/test_gpu.py), then measures. A question that fails has a line with its error, and
 the next one is asked. Meshes, data and networks are the project's own. Where there are several GPUs, `training` runs on
 one and on all of them. --device cpu rehearses what needs no CUDA. A machine without an index of packages installs what
 `pip download -d wheels ".[test]"` brings elsewhere: pip install --no-index --find-links wheels ".[test]"
@@ -29,9 +29,9 @@ from augment import AugmentationService, AugmentationSettings, StepSettings
 from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch
-from renderer.rasterizer import choose
-from train.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
+from renderer.visibility.rasterizers import choose
 from train.networks import load_run
+from train.system.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
 
 NETWORK, MESHES, VIEWS, STEPS, ROUNDS, SAMPLES = "pretrained/none", 2, 10, 10, 5, (64, 512, 2048)
 SHAPE = {"geometry": StepSettings("linf", 0.002, "sign", 0.001)}
@@ -61,7 +61,7 @@ def solids(device: str, steps: int, margin: float = 1e3, **attack: StepSettings)
 
 def tests(device: str) -> Iterator[Row]:
     """The tests that are skipped without a GPU."""
-    file = Path(__file__).parents[1] / "tests" / "train" / "test_gpu.py"
+    file = Path(__file__).parents[1] / "tests" / "train" / "system" / "test_gpu.py"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(file)]
     done = subprocess.run(command, cwd=file.parents[2], capture_output=True, text=True, check=False)
     printed = (done.stdout + done.stderr)[-2000:]

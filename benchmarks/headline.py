@@ -18,11 +18,11 @@ from matplotlib.patches import FancyBboxPatch
 from PIL import Image
 
 import augment
-from augment.scene import Conditions
+from augment.scene.scene import Conditions
 from renderer.image import to_bytes, to_unit
 from renderer.io.images import read_image
 from renderer.light.basis import parts_of
-from train.photographs.metrics import RANKED, metric_title, read_metric
+from train.evaluation.scores.metrics import RANKED, metric_title, read_metric
 
 BEFORE, PATTERN, AFTER = "before.png", "pattern.png", "after.png"
 PIXELS, INK, GRAY, BLUE, GREEN, RED = 16, "#1f2328", "#6e7781", "#0072B2", "#1a7f37", "#b42318"

@@ -33,18 +33,18 @@ from torch import Tensor
 
 from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
+from renderer.geometry.mesh import Mesh, concatenate, normalize, subdivide
+from renderer.geometry.shapes import solid
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
-from renderer.mesh import Mesh, concatenate, normalize, subdivide
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
-from renderer.shapes import solid
 from renderer.transport import precomputed, rays
 from renderer.transport.operators import TransferOperator, build_operators
+from renderer.visibility.rasterizers import choose
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 VIEWS, SEEDS = 20, 8  # SEEDS: Mitsuba's images, whose spread tells its noise

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from benchmarks import reference
 from renderer.camera import Camera
-from renderer.mesh import Mesh
-from renderer.rasterizer import Rasterizer
+from renderer.geometry.mesh import Mesh
+from renderer.visibility.rasterizers import Rasterizer
 
 
 class Peer:

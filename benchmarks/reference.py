@@ -1,4 +1,4 @@
-"""The slow, readable shading beside `renderer.shading`: plain torch operations, which autograd differentiates.
+"""The slow, readable shading beside `renderer.surface.shading`: plain torch operations, which autograd differentiates.
 
 Computed in the dtype of its inputs, with the harmonics by the Legendre recurrences of the paper's appendix B.1. The
 fast paths are compared with it and timed against it.

@@ -33,17 +33,18 @@ from benchmarks import reference, scene
 from benchmarks.common import Row, machine, medians, quartiles_of_ratio, times_in_turn, write_csv
 from benchmarks.peer import Peer
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
-from renderer import rendering, shading
+from renderer import rendering
 from renderer.camera import orbit_cameras
-from renderer.fragments import Fragments
-from renderer.gloss import Gloss
+from renderer.geometry.mesh import Mesh
 from renderer.image import tonemap
 from renderer.light.basis import COEFFICIENTS, DEGREE
-from renderer.mesh import Mesh
-from renderer.rasterizer import Rasterizer, choose
 from renderer.settings import RASTERIZERS, ImageSettings
+from renderer.surface import shading
+from renderer.surface.gloss import Gloss
+from renderer.transport.operator_stacks import TransferOperators
 from renderer.transport.operators import TransferOperator, build_operators
-from renderer.views import TransferOperators
+from renderer.visibility.fragments import Fragments
+from renderer.visibility.rasterizers import Rasterizer, choose
 
 BACKGROUND = 0.5
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}

@@ -15,18 +15,18 @@ from torch import Tensor
 
 from benchmarks import reference
 from benchmarks.common import Row, relative_error
-from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
-from renderer.fragments import Fragments, build_fragments
+from renderer.geometry.mesh import Mesh
 from renderer.io.mitsuba import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import DEGREE, Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import probe
-from renderer.mesh import Mesh
-from renderer.rasterizer import Rasterizer
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import surface_albedo
 from renderer.transport.operators import TransferOperator, build_operators
+from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.rasterizers import Rasterizer
 
 SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel
 ALBEDO = (0.8, 0.5, 0.3)

@@ -32,19 +32,19 @@ from PIL import Image
 from augment.classifiers import Classifier, build_classifier, load_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
-from train.checkpoint import content_hash
 from train.commands.settings import LabSettings
-from train.data import held_out_rows, load_npz
-from train.device import MixedPrecision, choose_precision
-from train.lab.laboratory import write_laboratory
-from train.loop import evaluate
+from train.data.photographs import TABLE
+from train.data.sets import held_out_rows, load_npz
+from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.scores.metrics import METRICS, Pooled, metric_title
+from train.evaluation.scores.predictions import PREDICTIONS, Prediction, Predictor, write_predictions
+from train.evaluation.tables import Estimate, Table, format_interval
 from train.networks import is_classifier, load_run
-from train.photographs.folder import TABLE
-from train.photographs.metrics import METRICS, Pooled, metric_title
-from train.photographs.predictions import PREDICTIONS, Prediction, Predictor, write_predictions
-from train.report.compare import ALL, Evaluation, difference, mean_metric, pools_of
+from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary, summarize
-from train.tables import Estimate, Table, format_interval
+from train.runs.checkpoint import content_hash
+from train.system.device import MixedPrecision, choose_precision
+from train.training.loop import evaluate
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
 LABEL, VALIDATION = "orange", 0.02

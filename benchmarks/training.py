@@ -36,15 +36,15 @@ from torch.utils.data import DataLoader
 from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
-from augment.build import build_scene
 from augment.random_streams import generator
+from augment.scene.build import build_scene
+from augment.scene.variation import vary
 from augment.settings import TrainingAttackSettings
-from augment.variation import vary
 from benchmarks.common import Row, record, with_median
-from train import checkpoint
 from train.__main__ import main as train_command
-from train.device import MixedPrecision
 from train.networks import Dropout, WideResNet
+from train.runs import checkpoint
+from train.system.device import MixedPrecision
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
 BACKGROUNDS = 5  # of each view

@@ -26,13 +26,13 @@ from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.shapes import sphere
 from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.light.harmonics import bands, basis
-from renderer.mesh import Mesh
 from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
-from renderer.shapes import sphere
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8

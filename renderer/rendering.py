@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, describe, require_bounded, require_choice, require_range
-from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss
+from renderer.geometry.mesh import Mesh, require_mesh
+from renderer.geometry.shapes import sphere
 from renderer.image import as_background, composite
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
-from renderer.mesh import Mesh, require_mesh
-from renderer.rasterizer import choose
 from renderer.settings import DEFAULT_SAMPLES, RASTERIZERS, ImageSettings, samples_per_side
-from renderer.shaded_view import ShadedView
-from renderer.shapes import sphere
+from renderer.surface.albedo import face_albedo, surface_albedo
+from renderer.surface.gloss import Gloss
+from renderer.surface.shaded_view import ShadedView
+from renderer.transport.operator_stacks import TransferOperators
 from renderer.transport.operators import build_operators
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_list, as_tensor, require_kind, require_number
-from renderer.views import TransferOperators
+from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.rasterizers import choose
 
 if TYPE_CHECKING:
     from jaxtyping import Float

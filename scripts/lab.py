@@ -7,7 +7,7 @@ from train.help import HelpText
 main = Command(
     name="lab",
     settings=LabSettings,
-    body="train.lab.laboratory:render_laboratory",
+    body="train.evaluation.laboratory.laboratory:render_laboratory",
     help=HelpText(
         about="Path-trace renders of oranges and hard negatives under a projector.",
         examples=[

@@ -12,7 +12,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_limits
 
-from renderer.rasterizer import Rasterizer
+from renderer.visibility.rasterizers import Rasterizer
 
 
 @pytest.fixture(autouse=True, scope="session")

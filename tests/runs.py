@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from train.data import DataSet
-from train.initial import load_initial
-from train.load_data import load_data
-from train.run import Run
+from train.data.load import load_data
+from train.data.sets import DataSet
 from train.settings import ExperimentSettings
+from train.training.initial import load_initial
+from train.training.run import Run
 
 
 def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:

@@ -36,7 +36,7 @@ from torch import Tensor, nn
 import augment
 import renderer
 from augment.attacks.settings import EOTSettings
-from augment.scene import Conditions
+from augment.scene.scene import Conditions
 from renderer.light.presets import directional
 from renderer.light.skylight import coefficients as skylight
 
@@ -238,7 +238,7 @@ def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_pa
 def trained(call, monkeypatch, tmp_path_factory) -> Callable[[str], Path]:
     """The folder of one of RUNS, which is made when a first test asks for it."""
 
-    monkeypatch.setattr("train.report.page.report_of", lambda folders, out: "no report")
+    monkeypatch.setattr("train.report.report_page.report_of", lambda folders, out: "no report")
 
     def run(name: str) -> Path:
         if name not in FOLDERS:

@@ -34,7 +34,7 @@ def test_only_one_module_imports_opengl():
         for path in (ROOT / package).rglob("*.py")
         if "moderngl" in imported_packages(path)
     ]
-    assert users == ["renderer/rasterizer/opengl.py"]
+    assert users == ["renderer/visibility/rasterizers/opengl.py"]
 
 
 def test_no_import_within_the_renderer_leads_back_also_inside_functions():
@@ -48,7 +48,7 @@ def test_no_import_within_the_renderer_leads_back_also_inside_functions():
         members = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
         imported[name] = (members | {node.module for node in nodes}) & names.keys()
     order = list(TopologicalSorter(imported).static_order())  # CycleError names the circle
-    assert order.index("renderer.normals") < order.index("renderer.mesh") < order.index("renderer.io.meshes")
+    assert order.index("renderer.geometry.normals") < order.index("renderer.geometry.mesh") < order.index("renderer.io.meshes")
 
 
 def test_settings_need_neither_torch_nor_numpy():

@@ -17,15 +17,15 @@ import augment
 import renderer
 from augment.attacks.attack import AttackResult
 from augment.progress import Phases
-from augment.scene import Conditions
+from augment.scene.scene import Conditions
 from augment.settings import RandomLightSettings
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from train import load_run
-from train.photographs.predictions import Predictor
-from train.photographs.scoring import evaluate_photographs, score
+from train.evaluation.scores.predictions import Predictor
+from train.evaluation.scores.scoring import evaluate_photographs, score
 
 NAN = math.nan
 SIZE = 8

@@ -8,9 +8,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from renderer.errors import InputError
-from train import run_names  # noqa: F401  (conf/train.yaml names the folders of a sweep by it)
 from train.command import SWEEP_FLAGS, Command, import_function, read_settings
 from train.help import HelpText
+from train.runs import run_names  # noqa: F401  (conf/train.yaml names the folders of a sweep by it)
 from train.settings import ExperimentSettings
 
 
@@ -26,17 +26,17 @@ class TrainCommand(Command):
                 advice = "start a sweep with pnb-train --multirun"
                 raise InputError(f"torchrun trains one run in several processes: {advice}")
             words = self.words(sys.argv[1:])
-            import_function("train.sweep:sweep")(super().__call__, words)
+            import_function("train.commands.sweep:sweep")(super().__call__, words)
 
     def work(self, config: DictConfig) -> None:
         job = HydraConfig.get()
         if job.mode == RunMode.MULTIRUN:
             config.run = job.runtime.output_dir
-            import_function("train.sweep:run_in_sweep")(config)
+            import_function("train.commands.sweep:run_in_sweep")(config)
             return
         if not config.train.resume:
             read_settings(self.settings, config)  # finds mistakes before the imports
-        import_function("train.experiment:train")(config, list(job.overrides.task))
+        import_function("train.commands.experiment:train")(config, list(job.overrides.task))
 
 
 def name_model(words: list[str]) -> list[str]:
@@ -50,7 +50,7 @@ def name_model(words: list[str]) -> list[str]:
 main = TrainCommand(
     name="train",
     settings=ExperimentSettings,
-    body="train.experiment:train",
+    body="train.commands.experiment:train",
     help=HelpText(
         about="Train a network with and without renders, and score it.",
         examples=[

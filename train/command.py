@@ -3,7 +3,7 @@
     main = Command(
         name="compare",
         settings=CompareSettings,
-        body="train.report.compare:print_comparison",
+        body="train.report.comparison:print_comparison",
         help=HelpText("Print Markdown tables of finished runs.", ["pnb-compare runs=[a,b]"]),
     )
 
@@ -44,8 +44,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from renderer.errors import InputError
 from renderer.settings import Settings
-from train.errors import one_sentence
 from train.help import CONF, HelpText, types_below, without_none
+from train.system.user_errors import one_sentence
 
 USER_ERROR = 2  # exit status
 INTERRUPTED = "ended by SIGINT"

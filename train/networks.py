@@ -16,14 +16,14 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.batches import eval_mode
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier
 from augment.classifiers.adapter import Normalized, call_python
-from augment.classifiers.imagenet import require_architecture
+from augment.classifiers.sources import require_architecture
+from augment.model_passes import eval_mode
 from renderer.errors import InputError, in_one_line
 from renderer.io.files import write_whole
 from renderer.validation import as_path, require_kind
-from train.checkpoint import BEST, VERSION, checked, load
+from train.runs.checkpoint import BEST, VERSION, checked, load
 from train.settings import WIDERESNET, published
 
 TORCHVISION, PYTHON = "torchvision:", "python:"

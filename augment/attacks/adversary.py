@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.objects import SceneObject
-from augment.scene import Conditions, Example, Scene
+from augment.scene.objects import SceneObject
+from augment.scene.scene import Conditions, Example, Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
     FACTOR,
@@ -23,7 +23,6 @@ from renderer.errors import (
     require_file,
     require_range,
 )
-from renderer.gloss import Gloss
 from renderer.image import to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.files import write_whole
@@ -32,12 +31,13 @@ from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
-from renderer.light.files import read_light, save_light
+from renderer.light.light_files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
-from renderer.rasterizer import Rasterizer, choose
 from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss
 from renderer.validation import as_folder
+from renderer.visibility.rasterizers import Rasterizer, choose
 
 DESCRIPTION = "adversary.json"
 MESH = "mesh.glb"

@@ -15,17 +15,17 @@ from torch import Tensor, nn
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import preprocessed_model, stored
-from augment.attacks.parameters.light import environment_light
+from augment.attacks.losses import logit_gap
+from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.parameters.settings import StepSettings
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.attacks.settings import AttackSettings
-from augment.batches import BatchSize
 from augment.classifiers.adapter import Classifier, class_index, require_classifier
-from augment.degree import NOTICED, with_needed_degree
-from augment.losses import logit_gap
+from augment.model_passes import BatchSize
 from augment.progress import Phases, progress
 from augment.random_streams import generator
-from augment.scene import Conditions, Scene
+from augment.scene.degree import NOTICED, with_needed_degree
+from augment.scene.scene import Conditions, Scene
 from renderer.errors import InputError, is_whole
 from renderer.light.harmonics import irradiance_error
 from renderer.validation import as_list, require_flag, require_kind, require_seed

@@ -38,8 +38,8 @@ import torch
 from torch import Tensor, nn
 
 from augment.attacks.eot import ExpectationOverTransformations, stored
-from augment.batches import BatchSize, as_found
-from augment.losses import NO_CLASS, adversarial_cost, logit_gap
+from augment.attacks.losses import NO_CLASS, adversarial_cost, logit_gap
+from augment.model_passes import BatchSize, as_found
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 

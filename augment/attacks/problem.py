@@ -11,7 +11,7 @@ from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.settings import AttackSettings
 from augment.progress import progress
-from augment.scene import Conditions, Scene
+from augment.scene.scene import Conditions, Scene
 
 
 class AttackProblem:

@@ -14,7 +14,7 @@ from augment.attacks.problem import build_problem
 from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.progress import progress
-from augment.scene import Scene
+from augment.scene.scene import Scene
 from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light

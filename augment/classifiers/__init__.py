@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
-from augment.classifiers.imagenet import (
+from augment.classifiers.sources import (
     SQUEEZENET_CAFFE,
     build_efficientnet_lite,
     build_squeezenet_caffe,

@@ -19,12 +19,12 @@ from torch import Tensor
 import train.networks  # noqa: F401 (whose networks are classifiers, too: run:FOLDER)
 from augment import AttackSettings, Classifier, Scene, StepSettings, load_classifier
 from augment.attacks.attack import logits_of
-from augment.objects import SceneObject, load_object
-from augment.scene import Example
+from augment.scene.objects import SceneObject, load_object
+from augment.scene.scene import Example
 from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
-from renderer.rasterizer import choose
+from renderer.visibility.rasterizers import choose
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 WIDTHS = (2.0, 3.0)  # of the image in world units (the paper's appendix on rendering quality)

@@ -11,8 +11,8 @@ import torch
 
 from augment import Classifier
 from augment.attacks.attack import logits_of
-from augment.objects import SceneObject
 from augment.random_streams import generator
+from augment.scene.objects import SceneObject
 from benchmarks.common import Row
 from benchmarks.paper import common
 from renderer import InputError, OrthographicCamera

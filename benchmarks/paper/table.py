@@ -17,7 +17,7 @@ from scipy.stats import bootstrap
 
 from benchmarks.common import Row
 from benchmarks.paper.common import last_run
-from train import tables
+from train.evaluation import tables
 
 Rows = Sequence[Row]
 Table = Iterator[Sequence[object]]  # the header first

@@ -16,8 +16,8 @@ from torch import Tensor
 from augment import AttackSettings, Classifier, load_classifier
 from augment.attacks.descent import Goal, descend
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.objects import SceneObject
 from augment.random_streams import generator
+from augment.scene.objects import SceneObject
 from benchmarks.paper import common
 from renderer.errors import FACTOR
 

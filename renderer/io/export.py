@@ -11,10 +11,10 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_choice, require_range
+from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
+from renderer.geometry.normals import corner_normals
 from renderer.image import decode
 from renderer.io.files import write_whole
-from renderer.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
-from renderer.normals import corner_normals
 from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 

@@ -23,10 +23,10 @@ from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import LARGEST, InputError, in_one_line, require_choice, require_file
+from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.image import encode
 from renderer.io.images import eight_bits
 from renderer.io.skins import skinned, with_skins_as_attributes
-from renderer.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.validation import as_path, require_flag
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: the names in them cannot be checked first

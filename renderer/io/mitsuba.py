@@ -24,6 +24,8 @@ from PIL import Image
 
 from renderer.camera import Camera
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.normals import corner_normals
 from renderer.image import decode, encode, to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
@@ -32,10 +34,8 @@ from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
-from renderer.mesh import Mesh
-from renderer.microfacets import coat_mean
-from renderer.normals import corner_normals
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
+from renderer.surface.microfacets import coat_mean
 
 SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255

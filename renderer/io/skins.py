@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from renderer.mesh import Mesh, transformed
-from renderer.skin import Skin
+from renderer.geometry.mesh import Mesh, transformed
+from renderer.geometry.skin import Skin
 
 BIND, JOINTS, WEIGHTS = "_BIND", "_JOINTS_", "_WEIGHTS_"
 TOLERANCE = 0.01  # of the sum of a vertex's weights, which may be of 8 bits

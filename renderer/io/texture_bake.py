@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.albedo import changed_albedo
+from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
-from renderer.mesh import Mesh
+from renderer.surface.albedo import changed_albedo
 
 MOST_TEXELS = 2**26  # of a painted texture; where more are needed, charts have a coarser grid
 BLOCK = 2**20  # texels at a time

@@ -177,7 +177,7 @@ class LocalBasis(Basis):
         """Create the light that settings describe.
 
         Args:
-            settings: The settings of this kind of light in `augment.build`, with
+            settings: The settings of this kind of light in `augment.settings`, with
                 angles in degrees.
 
         Returns:

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import InputError, require_bounded
+from renderer.geometry.mesh import Y_UP_TO_Z_UP
 from renderer.light.basis import COEFFICIENTS, DEGREE, Harmonics
 from renderer.light.environment import SUFFIXES, read_panorama
-from renderer.light.files import read_light
 from renderer.light.harmonics import (
     basis,
     degree_of,
@@ -23,8 +23,8 @@ from renderer.light.harmonics import (
     require_degree,
     rotate,
 )
-from renderer.mesh import Y_UP_TO_Z_UP
-from renderer.microfacets import window_without_ringing
+from renderer.light.light_files import read_light
+from renderer.surface.microfacets import window_without_ringing
 from renderer.validation import as_path
 
 # Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
@@ -57,7 +57,7 @@ def load_light(light: str | Path, degree: int | None = DEGREE, roughness: float 
             .hdr, .exr); or a file of coefficients (.json, as `renderer.save_light` writes it).
         degree: Degree of the result. None for that of a file of coefficients, and else 6.
         roughness: Roughness in [0, 1] of the smoothest surface that the light shines on. If it is given, a map is cut
-            off by `renderer.microfacets.window_without_ringing`, which changes maps whose highlights would ring.
+            off by `renderer.surface.microfacets.window_without_ringing`, which changes maps whose highlights would ring.
 
     Returns:
         Coefficients ((degree + 1)², 3), float32.

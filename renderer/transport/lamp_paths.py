@@ -8,13 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from renderer.fragments import Fragments
-from renderer.gloss import Gloss, at_samples
+from renderer.geometry.mesh import Mesh
 from renderer.light.basis import LightPaths, LocalBasis
-from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss, at_samples
 from renderer.transport.rays import Rays, Surface
 from renderer.vectors import unit, unit_vectors
+from renderer.visibility.fragments import Fragments
 
 SPARSE = 1 / 16  # fraction of nonzero entries below which multiplying them one by one takes less time,
 SMALL = 2**16  # unless the dense matrix has no more entries than this

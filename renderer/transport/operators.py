@@ -2,7 +2,7 @@
 
 Before clamping, every pixel is linear in the lighting coefficients U (the paper's appendix B.2):
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do gloss
-(`renderer.gloss`), shadows and bounces (package `renderer.transport`).
+(`renderer.surface.gloss`), shadows and bounces (package `renderer.transport`).
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
-from renderer.albedo import shared_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.errors import LARGEST, InputError, as_device, require_bounded
-from renderer.fragments import Fragments, build_fragments
-from renderer.gloss import Gloss, SampleGloss, at_samples
+from renderer.geometry.mesh import Mesh
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
-from renderer.mesh import Mesh
-from renderer.rasterizer import Rasterizer
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import shared_albedo, surface_albedo
+from renderer.surface.gloss import Gloss, SampleGloss, at_samples
 from renderer.transport.lamp_paths import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_tensor
+from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.rasterizers import Rasterizer
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

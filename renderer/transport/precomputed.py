@@ -23,15 +23,15 @@ import torch
 from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
-from renderer.albedo import surface_albedo
 from renderer.errors import InputError
-from renderer.fragments import Fragments
-from renderer.gloss import SampleGloss, at_samples
+from renderer.geometry.mesh import Mesh, refine
 from renderer.light.basis import Basis, Harmonics
-from renderer.mesh import Mesh, refine
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import surface_albedo
+from renderer.surface.gloss import SampleGloss, at_samples
 from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
+from renderer.visibility.fragments import Fragments
 
 PATCH_DIRECTIONS = 2**9  # over the whole sphere, in which a patch looks
 PATCHES = 2**11  # the mesh's area over that is about the area of a patch

@@ -17,14 +17,14 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.fragments import Fragments
-from renderer.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.normals import face_normals
 from renderer.light.harmonics import per_degree
-from renderer.mesh import Mesh
-from renderer.normals import face_normals
 from renderer.settings import ImageSettings
-from renderer.shading import normals_in_sight, smooth_normals
+from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
+from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit
+from renderer.visibility.fragments import Fragments
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32

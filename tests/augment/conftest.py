@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 import augment
-from augment.objects import SceneObject
-from augment.scene import Example, Scene
+from augment.scene.objects import SceneObject
+from augment.scene.scene import Example, Scene
 from renderer.camera import OrthographicCamera
+from renderer.geometry.mesh import Mesh
 from renderer.light.presets import ambient
-from renderer.mesh import Mesh
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
+from renderer.visibility.rasterizers import choose
 
 SIZE = 6
 FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ((0.9, 0.3), (1.3, 1.9), (1.1, 3.5)))

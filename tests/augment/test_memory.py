@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from augment import AugmentationService, AugmentationSettings, memory, scene
-from augment.build import build_scene
+from augment import AugmentationService, AugmentationSettings, memory
 from augment.memory import require_memory
+from augment.scene import scene
+from augment.scene.build import build_scene
 from augment.settings import CameraEffectSettings, TrainingAttackSettings
 from renderer.errors import InputError
 from renderer.image import to_bytes

@@ -7,16 +7,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
+from augment.attacks.losses import complementary_label
 from augment.attacks.parameters.settings import StepSettings
-from augment.build import build_scene
-from augment.losses import complementary_label
 from augment.progress import Phases
-from augment.scene import Conditions, Scene
+from augment.scene.build import build_scene
+from augment.scene.scene import Conditions, Scene
 from augment.service import AugmentationService, Renders
 from augment.settings import AugmentationSettings, RandomLightSettings, TrainingAttackSettings, VariationSettings
 from renderer.errors import InputError
+from renderer.geometry.shapes import solid
 from renderer.light.presets import probe
-from renderer.shapes import solid
 
 EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from benchmarks import common, gpu, lights, renderer, scene, training
-from renderer.rasterizer import choose
 from renderer.transport import precomputed
+from renderer.visibility.rasterizers import choose
 
 
 def read(path: Path) -> list[dict[str, str]]:

@@ -11,11 +11,11 @@ import trimesh
 
 from augment import Classifier, attack
 from augment.attacks.problem import build_problem
-from augment.objects import SceneObject
 from augment.random_streams import generator
+from augment.scene.objects import SceneObject
 from benchmarks.paper import common, light_change, norm_balls, rendering_quality, run_time, survival, table, transfer
 from renderer import orbit_cameras
-from renderer.mesh import Mesh
+from renderer.geometry.mesh import Mesh
 
 RECORDS = Path(__file__).parents[2] / "docs" / "paper"
 SIZE = 12

@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from benchmarks import sides
-from train.lab import patterns
+from train.evaluation.laboratory import lab_patterns as patterns
 
 TRAINING = {"stripes", "checkers", "spots", "half", "solid", "grace", "eucalyptus", "st_peters", *sides.TRAINED}
 SETUPS = {"choosing": 12, "reporting": 10}

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from renderer.mesh import Mesh, concatenate
-from renderer.rasterizer import Rasterizer
+from renderer.geometry.mesh import Mesh, concatenate
+from renderer.visibility.rasterizers import Rasterizer
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.special import sph_harm_y_all
 
+from renderer.geometry.mesh import Mesh
 from renderer.light.harmonics import lambertian_factors
-from renderer.mesh import Mesh
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:

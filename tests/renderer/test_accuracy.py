@@ -23,19 +23,19 @@ from extended_precision import exact, extended
 from oracles import scipy_basis
 from torch import Tensor
 
-from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
-from renderer.fragments import Fragments, build_fragments
+from renderer.geometry.mesh import Mesh, normalize
 from renderer.light.basis import Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import ambient
-from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import Rasterizer, choose
 from renderer.settings import ImageSettings
-from renderer.shading import radiance
+from renderer.surface.albedo import surface_albedo
+from renderer.surface.shading import radiance
 from renderer.transport import rays
 from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface
+from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.rasterizers import Rasterizer, choose
 
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, width=2.2)
 TOWARDS = CAMERA.axes()[2]
@@ -274,7 +274,7 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarr
 
 
 def by_geometry(setup: Setup) -> Errors:
-    """Image and its gradient by the vertices, through `renderer.shading`."""
+    """Image and its gradient by the vertices, through `renderer.surface.shading`."""
     view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
     fragments, upstream = setup.fragments(), random_upstream(len(view.pixels))
     image = radiance(fragments, vertices, light, surface_albedo(setup.mesh, fragments, "linear"))

@@ -12,11 +12,11 @@ import trimesh
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.fragments import build_fragments
-from renderer.mesh import Mesh
-from renderer.rasterizer import choose
+from renderer.geometry.mesh import Mesh
 from renderer.settings import ImageSettings
 from renderer.transport.rays import Surface
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizers import choose
 
 EPS = np.finfo(np.float64).eps
 CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)

@@ -6,18 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
-from renderer.fragments import build_fragments
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.normals import face_normals, vertex_normals
 from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
-from renderer.mesh import Mesh
-from renderer.normals import face_normals, vertex_normals
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
-from renderer.shading import irradiance, normals_in_sight, radiance
+from renderer.surface.albedo import face_albedo, surface_albedo
+from renderer.surface.shading import irradiance, normals_in_sight, radiance
 from renderer.transport.operators import build_operators
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizers import choose
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
 CAMERA, SETTINGS, RASTERIZER = OrthographicCamera(0, 0, 2.0), ImageSettings(2, 2), choose("numpy")

@@ -17,14 +17,14 @@ import trimesh
 from oracles import mesh_of
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
+from renderer.geometry.mesh import Mesh, normalize
+from renderer.geometry.shapes import solid
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.environment import write_map
-from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
-from renderer.shapes import solid
 from renderer.transport import rays
 from renderer.transport.operators import build_operators
+from renderer.visibility.rasterizers import choose
 
 pytest.importorskip("mitsuba")
 

@@ -14,10 +14,10 @@ from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 from renderer.light.projector import Projector
-from renderer.rasterizer import choose
 from renderer.rendering import light_sphere
 from renderer.settings import ENCODINGS, NORMALS, ImageSettings
 from renderer.transport.operators import build_operators
+from renderer.visibility.rasterizers import choose
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 CAMERAS = renderer.orbit_cameras(3, 2.4)

@@ -90,7 +90,7 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
     module = "train.__main__" if name == "train" else f"scripts.{name}"
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [f"{name}.py", *arguments])
-        patch.setattr("train.experiment.report_of", lambda folders, out: "no report")
+        patch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
         try:
             import_module(module).main()
         except SystemExit as stop:

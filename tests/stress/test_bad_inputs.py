@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 
 from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
-from train import checkpoint
-from train.data import load_folder, load_npz
+from train.data.sets import load_folder, load_npz
+from train.runs import checkpoint
 
 from .conftest import PATIENCE, RENDERER, TRAINING, run_here
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from train import checkpoint
-from train.run_folder import METRICS, read_metrics
+from train.runs import checkpoint
+from train.runs.run_folder import METRICS, read_metrics
 
 from .conftest import PATIENCE, TRAINING, Process, end, run_here, start_command
 

@@ -15,13 +15,15 @@ import torch
 import yaml
 
 from renderer.errors import InputError
-from train import checkpoint, command, errors
-from train.checkpoint import LAST
+from train import command
 from train.command import USER_ERROR, Command
 from train.commands.settings import LightSettings
-from train.errors import one_sentence, writable_folder
 from train.help import HelpText
-from train.run_folder import locked
+from train.runs import checkpoint
+from train.runs.checkpoint import LAST
+from train.runs.run_folder import locked
+from train.system import user_errors as errors
+from train.system.user_errors import one_sentence, writable_folder
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -35,7 +37,7 @@ SMALL = [
 @pytest.fixture
 def no_report(monkeypatch) -> None:
     """Several trainings of a test write no pages, whose plots take longer."""
-    monkeypatch.setattr("train.experiment.report_of", lambda folders, out: "no report")
+    monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
 
 
 def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_path, tiny_npz, photos):

@@ -10,9 +10,9 @@ from torchvision.models import resnet18
 
 from augment.classifiers import load_classifier
 from renderer.errors import InputError
-from train.checkpoint import BEST, save
-from train.initial import Initial
 from train.networks import PUBLISHED, Dropout, WideResNet, build_network, describe, load_run, load_selected, publish
+from train.runs.checkpoint import BEST, save
+from train.training.initial import Initial
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
 CLASSES = ("apple", "orange", "pear")

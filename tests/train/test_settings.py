@@ -12,8 +12,8 @@ from scripts.attack import main as attack_command
 from scripts.evaluate import main as evaluate_command
 from tests.runs import loaded_run
 from train.__main__ import main as train_command
-from train.batches import rounds_of_epoch
 from train.command import Command, as_override, quoted
+from train.data.batches import rounds_of_epoch
 from train.settings import OTHER
 
 

@@ -10,26 +10,26 @@ from pathlib import Path
 from typing import Any
 
 from augment.classifiers import load_classifier
-from augment.objects import load_object
+from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.io.files import write_whole
 from renderer.io.mitsuba import mitsuba
 from renderer.light.presets import UNIFORM, load_light
 from train import console
-from train.audit import page
+from train.audit import audit_page as page
 from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers
 from train.command import command_line
 from train.commands.settings import AuditSettings, LabSettings
-from train.device import choose_device
-from train.errors import writable_folder
-from train.lab.laboratory import write_laboratory
-from train.photographs.folder import FOREIGN, find_photographs
-from train.photographs.predictions import Predictor
-from train.photographs.scoring import evaluate_photographs
-from train.results import RESULTS, require_replaceable
-from train.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
+from train.data.photographs import FOREIGN, find_photographs
+from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.scores.predictions import Predictor
+from train.evaluation.scores.scoring import evaluate_photographs
+from train.runs.results import RESULTS, require_replaceable
+from train.runs.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
 from train.settings import published, read_objects, solid_name
+from train.system.device import choose_device
+from train.system.user_errors import writable_folder
 
 VIEWS, LIGHTS, ATTACKED, SETUPS = 24, 8, 12, 6  # views, random lights, attacked views, and setups of each pattern
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")  # that training does not throw

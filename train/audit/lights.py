@@ -16,20 +16,20 @@ from PIL import Image
 from torch import Tensor
 
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
+from augment.attacks.checks import success_by_radius
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.evaluate import success_by_radius
 from augment.attacks.parameters.settings import SkylightSettings, StepSettings
 from augment.attacks.problem import build_problem
 from augment.attacks.settings import NOISE_MARGIN, AttackSettings
-from augment.build import build_local_light
 from augment.classifiers import Classifier
-from augment.objects import SceneObject
 from augment.progress import progress
 from augment.random_streams import generator
-from augment.scene import Conditions, Scene
+from augment.scene.build import build_local_light
+from augment.scene.objects import SceneObject
+from augment.scene.scene import Conditions, Scene
+from augment.scene.variation import vary
 from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
-from augment.variation import vary
 from renderer.camera import orbit_cameras
 from renderer.errors import FACTOR
 from renderer.image import to_bytes
@@ -37,8 +37,8 @@ from renderer.io.files import write_whole
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
+from renderer.visibility.rasterizers import choose
 
 BATCH = 16  # images per pass
 LIGHT = "grace"  # in which all attacks but that of the sky begin

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from train.commands.settings import CompareSettings
-from train.report.compare import format_comparison
+from train.report.comparison import format_comparison
 from train.report.summary import summarize
 
 

@@ -4,15 +4,15 @@ from pathlib import Path
 
 from augment.classifiers import Classifier, load_classifier
 from train.commands.settings import EvaluateSettings
-from train.device import MixedPrecision, choose_device, choose_precision
-from train.errors import writable_folder
+from train.data.photographs import require_outside
+from train.evaluation.scores import scoring
+from train.evaluation.scores.predictions import Predictor
 from train.networks import load_run
-from train.photographs import scoring
-from train.photographs.folder import require_outside
-from train.photographs.predictions import Predictor
-from train.results import require_replaceable
-from train.run_folder import sole_writer
+from train.runs.results import require_replaceable
+from train.runs.run_folder import sole_writer
 from train.settings import label_names, published
+from train.system.device import MixedPrecision, choose_device, choose_precision
+from train.system.user_errors import writable_folder
 
 
 def evaluate(settings: EvaluateSettings) -> None:

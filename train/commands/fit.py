@@ -10,19 +10,19 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.objects import load_object
+from augment.scene.objects import load_object
 from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fitting import fit_photograph
 from renderer.image import decode, encode, to_bytes
 from renderer.io.images import read_image, read_rgb, write_image
-from renderer.light.files import save_light
-from train.attack import build_attacked
+from renderer.light.light_files import save_light
+from train.commands.attack_meshes import build_attacked
 from train.commands.settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
-from train.errors import writable_folder
-from train.results import require_replaceable
+from train.runs.results import require_replaceable
 from train.settings import read_object
+from train.system.user_errors import writable_folder
 
 DETAIL = 448  # pixels per side of the background that is written
 ATTACKED = 224  # pixels per side of the images that the printed attack renders, for its default classifier

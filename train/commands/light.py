@@ -9,7 +9,7 @@ from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.presets import load_light
 from train.command import keyed
 from train.commands.settings import LightSettings
-from train.results import require_replaceable
+from train.runs.results import require_replaceable
 
 
 def export_light(settings: LightSettings) -> None:

@@ -4,13 +4,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from train.commands.settings import PublishSettings
-from train.errors import writable_folder
+from train.evaluation.scores import scoring
+from train.evaluation.scores.predictions import Predictor
 from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish
-from train.photographs import scoring
-from train.photographs.predictions import Predictor
 from train.report.summary import summarize
-from train.results import require_replaceable
+from train.runs.results import require_replaceable
 from train.settings import mapped, published
+from train.system.user_errors import writable_folder
 
 
 def publish_network(settings: PublishSettings) -> None:

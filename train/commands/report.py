@@ -4,9 +4,9 @@ import os
 from pathlib import Path
 
 from train.commands.settings import ReportSettings
-from train.errors import writable_folder
-from train.report.page import write_report
-from train.results import OF_AUDIT, RESULTS, require_replaceable
+from train.report.report_page import write_report
+from train.runs.results import OF_AUDIT, RESULTS, require_replaceable
+from train.system.user_errors import writable_folder
 
 
 def report(settings: ReportSettings) -> None:

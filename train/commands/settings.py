@@ -113,7 +113,7 @@ class AttackExperimentSettings(Settings):
     """Settings of pnb-attack: one attack on one classifier.
 
     If a projector or lamps are attacked and the scene has none, it gets them with their
-    defaults. An attack on the pose sets `renderer.silhouettes`.
+    defaults. An attack on the pose sets `renderer.visibility.silhouettes`.
     """
 
     classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")

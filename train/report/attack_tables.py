@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from augment.attacks.attack import AttackResult
-from augment.attacks.evaluate import warnings
+from augment.attacks.checks import warnings
 from renderer.io.files import write_whole
+from train.evaluation.tables import Proportion, Table, format_fraction, fraction
 from train.report.plots import COLORS, LINES, MARKERS
-from train.tables import Proportion, Table, format_fraction, fraction
 
 TRANSFERS = "transfer.jsonl"
 TABLE = "sweep.csv"

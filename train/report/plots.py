@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from train.photographs.metrics import auc_and_recalls
-from train.photographs.sheet import Pair, draw_roc
+from train.evaluation.scores.metrics import auc_and_recalls
+from train.evaluation.scores.sheet import Pair, draw_roc
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

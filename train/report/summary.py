@@ -11,22 +11,16 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from augment.attacks.files import LINES
+from augment.attacks.attack_files import LINES
 from augment.settings import ARMS
 from renderer.errors import InputError, in_one_line
-from train import checkpoint, run_folder
+from train.evaluation.scores.metrics import METRICS, AreaUnderCurve, Thresholds, metric_title, read_metric
+from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
+from train.evaluation.tables import Estimate, Table, format_interval
 from train.networks import PUBLISHED, load_selected
-from train.photographs.metrics import (
-    METRICS,
-    AreaUnderCurve,
-    Thresholds,
-    metric_title,
-    read_metric,
-)
-from train.photographs.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
-from train.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
+from train.runs import checkpoint, run_folder
+from train.runs.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
 from train.settings import label_names, published
-from train.tables import Estimate, Table, format_interval
 
 # Number of arms up to which they are named by their settings.
 MOST_NAMED = 30

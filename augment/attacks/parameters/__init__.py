@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from augment.attacks.parameters.parameter import Parameter
     from augment.attacks.parameters.settings import StepSettings
-    from augment.scene import Scene
+    from augment.scene.scene import Scene
 
 
 def parameter_class(name: str) -> type[Parameter]:

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.attacks.parameters.mesh import MeshParameter
+from augment.attacks.parameters.mesh_parameter import MeshParameter
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Conditions, Scene
+from augment.scene.scene import Conditions, Scene
 
 
 class Geometry(MeshParameter):

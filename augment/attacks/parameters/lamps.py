@@ -1,8 +1,8 @@
 """Attacks on the intensity of lamps."""
 
-from augment.attacks.parameters.light import LightParameter, find_light
+from augment.attacks.parameters.light_parameter import LightParameter, find_light
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Scene
+from augment.scene.scene import Scene
 
 
 class Lamps(LightParameter):

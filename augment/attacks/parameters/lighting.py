@@ -1,8 +1,8 @@
 """Attacks on the environment lighting."""
 
-from augment.attacks.parameters.light import LightParameter, environment_light
+from augment.attacks.parameters.light_parameter import LightParameter, environment_light
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Scene
+from augment.scene.scene import Scene
 
 
 class Lighting(LightParameter):

@@ -12,8 +12,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import MaterialSettings
-from augment.objects import SceneObject
-from augment.scene import Conditions, Scene
+from augment.scene.objects import SceneObject
+from augment.scene.scene import Conditions, Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Conditions, Scene
+from augment.scene.scene import Conditions, Scene
 
 
 class Pixels(Parameter):

@@ -13,12 +13,12 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import PoseSettings
-from augment.objects import SceneObject
-from augment.scene import Conditions, Scene
+from augment.scene.objects import SceneObject
+from augment.scene.scene import Conditions, Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
+from renderer.geometry.skin import Skin
 from renderer.light.ball import Ball, nearest_in_box
-from renderer.skin import Skin
 from renderer.vectors import rotation_matrices
 
 # Positions among the attack values of an example: the rotation vector of the

@@ -5,10 +5,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment.attacks.parameters.light import find_light
+from augment.attacks.parameters.light_parameter import find_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Conditions, Scene
+from augment.scene.scene import Conditions, Scene
 from renderer.light.lamps import Lamps
 
 

@@ -1,8 +1,8 @@
 """Attacks on the pattern of a projector."""
 
-from augment.attacks.parameters.light import LightParameter, find_light
+from augment.attacks.parameters.light_parameter import LightParameter, find_light
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene import Scene
+from augment.scene.scene import Scene
 
 
 class Projector(LightParameter):

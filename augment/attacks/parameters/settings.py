@@ -15,7 +15,7 @@ from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.settings import TURBIDITY, Settings, setting
 
 if TYPE_CHECKING:
-    from augment.objects import SceneObject
+    from augment.scene.objects import SceneObject
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")

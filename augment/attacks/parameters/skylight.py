@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.attacks.parameters.light import environment_light, replace_light
+from augment.attacks.parameters.light_parameter import environment_light, replace_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import SkylightSettings
-from augment.scene import Conditions, Scene
+from augment.scene.scene import Conditions, Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import ZENITH

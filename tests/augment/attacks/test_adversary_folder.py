@@ -13,13 +13,13 @@ import torch
 import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
 from augment.attacks.parameters.settings import PARAMETER_NAMES
-from augment.objects import SceneObject, on_ground, with_props
-from augment.scene import Example, Scene
+from augment.scene.objects import SceneObject, on_ground, with_props
+from augment.scene.scene import Example, Scene
 from renderer.errors import InputError
-from renderer.gloss import Gloss
-from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import choose
-from renderer.shapes import solid
+from renderer.geometry.mesh import Mesh, normalize
+from renderer.geometry.shapes import solid
+from renderer.surface.gloss import Gloss
+from renderer.visibility.rasterizers import choose
 
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # each has a test of its own
 PAINTED = {"material", "albedo"}  # change textures

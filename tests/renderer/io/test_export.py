@@ -17,10 +17,10 @@ from trimesh.visual.texture import TextureVisuals
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.shapes import solid
 from renderer.io.export import export_mesh
 from renderer.io.meshes import load_mesh
-from renderer.mesh import Mesh
-from renderer.shapes import solid
 
 EPS32 = np.finfo(np.float32).eps
 

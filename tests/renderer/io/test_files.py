@@ -19,7 +19,7 @@ from renderer.io.files import TEMPORARY, remove_unfinished, replacing, write_who
 from renderer.io.images import write_image, write_numbers
 from renderer.light.environment import write_map
 from renderer.light.projector import Projector
-from train import checkpoint
+from train.runs import checkpoint
 
 LIGHT = 0.1 * torch.rand(49, 3, generator=torch.Generator().manual_seed(0))
 PATTERN = torch.rand(64 * 64, 3, generator=torch.Generator().manual_seed(0))

@@ -10,16 +10,16 @@ import torch
 import trimesh
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
-from renderer.gloss import Gloss
+from renderer.geometry.mesh import Mesh, normalize
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
-from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
+from renderer.surface.gloss import Gloss
 from renderer.transport.operators import build_operators
 from renderer.vectors import unit_vectors
+from renderer.visibility.rasterizers import choose
 
 pytest.importorskip("mitsuba")
 drjit = pytest.importorskip("drjit")

@@ -7,14 +7,14 @@ import torch
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.shapes import sphere
 from renderer.io.mitsuba import SCENE, write_mitsuba_scene
 from renderer.light.basis import Harmonics, SumBasis, parts_of, split_light
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
-from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
-from renderer.shapes import sphere
 
 LAMPS = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0)))
 SKY = Harmonics(2)

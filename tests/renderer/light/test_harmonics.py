@@ -10,7 +10,7 @@ from scipy.special import eval_legendre, spherical_in
 
 from renderer.light.harmonics import DIFFUSE_DEGREE, basis, lambertian_factors, project, rotate
 from renderer.settings import MAX_DEGREE
-from renderer.shading import irradiance
+from renderer.surface.shading import irradiance
 
 EPS = np.finfo(np.float64).eps
 every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])

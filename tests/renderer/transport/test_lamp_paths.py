@@ -11,22 +11,22 @@ import torch
 import trimesh
 from oracles import mesh_of
 
-from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
-from renderer.fragments import build_fragments
+from renderer.geometry.mesh import Mesh, concatenate
 from renderer.io import mitsuba
 from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
-from renderer.mesh import Mesh, concatenate
-from renderer.rasterizer import choose
 from renderer.settings import ImageSettings
+from renderer.surface.albedo import surface_albedo
 from renderer.transport import lamp_paths as sparse
 from renderer.transport.lamp_paths import local_radiance, unoccluded
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.rays import Rays, Surface
+from renderer.visibility.fragments import build_fragments
+from renderer.visibility.rasterizers import choose
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
 PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, fov=math.radians(35))

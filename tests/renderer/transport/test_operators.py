@@ -9,12 +9,12 @@ from oracles import draw, mesh_of, patchwork
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode
 from renderer.light.harmonics import nonzero_coefficients
-from renderer.mesh import Mesh
-from renderer.rasterizer import choose
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.transport.operators import build_operators
+from renderer.visibility.rasterizers import choose
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")

@@ -14,14 +14,14 @@ from oracles import mesh_of, scipy_basis
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
+from renderer.geometry.mesh import Mesh
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.light.presets import ambient, load_light
-from renderer.mesh import Mesh
-from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import ImageSettings
 from renderer.transport import precomputed, rays
 from renderer.transport.operators import TransferOperator, build_operators
+from renderer.visibility.rasterizers import choose
 
 RASTERIZER = choose("numpy")
 ABOVE = OrthographicCamera(0, 0, 2.0)

@@ -17,14 +17,14 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.images import read_image
 from renderer.light.environment import read_panorama, to_map
-from renderer.light.files import save_light
 from renderer.light.harmonics import equirectangular
+from renderer.light.light_files import save_light
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
-from train.checkpoint import BEST, save
 from train.commands.fit import grab_cut
 from train.networks import WideResNet, describe, load_run
-from train.run_folder import LOCK, sole_writer
+from train.runs.checkpoint import BEST, save
+from train.runs.run_folder import LOCK, sole_writer
 
 USER_ERROR = 2
 CLASSES = ["fig", "lime", "orange"]

@@ -9,12 +9,12 @@ from safetensors import safe_open
 
 from renderer.errors import InputError
 from renderer.io.images import read_square
-from train import checkpoint
 from train.commands.evaluate import evaluate
 from train.commands.publish import publish_network
 from train.commands.settings import EvaluateSettings, PublishSettings
 from train.networks import PUBLISHED, load_run, load_selected
 from train.report.summary import summarize
+from train.runs import checkpoint
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):

@@ -3,9 +3,9 @@ from dataclasses import asdict
 import pytest
 
 from renderer.errors import InputError
-from train.report.compare import format_table
+from train.evaluation.tables import format_interval, fraction
+from train.report.comparison import format_table
 from train.report.summary import summarize
-from train.tables import format_interval, fraction
 
 
 @pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n', '{"epoch": 1}\n{"test/accuracy": 1'])

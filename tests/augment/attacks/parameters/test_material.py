@@ -11,18 +11,18 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
-from augment.attacks.files import render_again
+from augment.attacks.attack_files import render_again
 from augment.attacks.parameters.material import Material
 from augment.attacks.parameters.settings import MATERIAL
 from augment.attacks.problem import AttackProblem
-from augment.objects import SceneObject, on_ground
-from augment.scene import Scene
-from renderer.albedo import changed_albedo
+from augment.scene.objects import SceneObject, on_ground
+from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.gloss import Gloss
-from renderer.mesh import Mesh
+from renderer.geometry.mesh import Mesh
+from renderer.geometry.shapes import sphere
 from renderer.settings import MIN_ROUGHNESS
-from renderer.shapes import sphere
+from renderer.surface.albedo import changed_albedo
+from renderer.surface.gloss import Gloss
 
 ONE = torch.zeros(1, dtype=torch.int64)
 UNITS = torch.tensor([0.3, 0.2, 0.5, np.deg2rad(40)])

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from augment import reshading
 from augment.attacks import norm_ball
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem
 from augment.attacks.settings import AttackSettings
-from augment.scene import Conditions, Scene
+from augment.scene import reshading
+from augment.scene.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.basis import DEGREE

@@ -15,7 +15,7 @@ import renderer
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.parameters.settings import POSE
 from augment.attacks.problem import AttackProblem
-from augment.scene import Scene
+from augment.scene.scene import Scene
 from renderer.errors import InputError
 
 ONLY = dict.fromkeys(POSE, 0.0)

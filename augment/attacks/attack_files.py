@@ -1,0 +1,321 @@
+"""Files of an attack: a figure and a folder for each example, and all numbers as JSON lines."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
+from augment.attacks.attack import (
+    AttackResult,
+    fooled_in_views,
+    logits_of,
+    predictions,
+    require_result,
+)
+from augment.attacks.checks import CHECKED, warnings
+from augment.attacks.eot import as_jpeg
+from augment.progress import progress
+from renderer.errors import InputError, require_choice
+from renderer.image import background_term, clamp, encode, to_bytes, to_unit
+from renderer.io.files import write_whole
+from renderer.io.images import write_image
+from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
+from renderer.io.tiles import Tile, draw_grid, tiles_of
+from renderer.rendering import light_sphere
+from renderer.validation import as_folder, as_list, require_kind
+from renderer.visibility.rasterizers import Rasterizer
+
+# A line for each example, and a last one with the checks.
+LINES = "attack.jsonl"
+JPEG_QUALITY = 90
+RENDERERS = ("reload", MITSUBA)
+
+# Pixels: smaller images of a figure are enlarged by a whole factor to at least
+# this width.
+SIDE = 192
+
+
+def save(
+    result: AttackResult,
+    folder: str | Path,
+    checks: dict[str, Any] | None = None,
+    verify: Sequence[str] = ("reload",),
+) -> list[dict[str, Any]]:
+    """Write a figure and a folder with the whole adversary of each example, and attack.jsonl.
+
+    `augment.reload` reads such a folder.
+
+    Args:
+        result: The result of `augment.attack`.
+        folder: The folder to write.
+        checks: The result of `augment.check`, for the last line of
+            attack.jsonl.
+        verify: Renderers that render the adversaries again from the folders:
+            "reload", "mitsuba" or both. The illumination of Mitsuba is direct,
+            and concave meshes shade themselves in it.
+
+    Returns:
+        The line of each example. Its "versions" are the predictions of the
+        images as floats, with 8 bits, as JPEG and as rendered again, and the
+        differences of pixel values. "success" is with the noise of a sensor,
+        also of the versions, and "success_without_noise" by the images as they
+        are.
+
+    Raises:
+        InputError: If an argument is of another type, or a renderer is unknown
+            or not installed.
+
+    Example:
+        >>> [line] = augment.save(result, "adversaries")
+        >>> sorted(path.name for path in Path("adversaries").iterdir())
+        ['attack.jsonl', 'example_000', 'example_000.png']
+        >>> [*line["versions"]]
+        ['float', '8 bits', 'JPEG 90', 'reload']
+    """
+    require_result(result)
+    folder = as_folder("folder", folder)
+    if checks is not None:
+        require_kind("checks", checks, Mapping, "the result of augment.check")
+        if missing := CHECKED - checks.keys():
+            names = ", ".join(sorted(missing))
+            raise InputError(f"checks lacks {names}: give the result of augment.check")
+    verify = [verify] if isinstance(verify, str) else verify
+    verify = as_list("verify", verify, str, "a list of renderers")
+    require_renderers(verify)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"example_{example:03d}" for example in range(len(result.images))]
+
+    lines = _write_examples(result, paths)
+    versions = _versions(result, paths, verify)
+    for example, line in enumerate(lines):
+        line["versions"] = {name: numbers[example] for name, numbers in versions.items()}
+
+    all_lines = list(lines)
+    if checks is not None:
+        all_lines.append({"checks": checks, "warnings": warnings(checks)})
+    write_whole(folder / LINES, "".join(json.dumps(line) + "\n" for line in all_lines))
+    return lines
+
+
+def require_renderers(names: Sequence[str]) -> None:
+    """Check that renderers are known and installed.
+
+    Args:
+        names: Names of renderers.
+
+    Raises:
+        InputError: If one is not.
+    """
+    for name in names:
+        require_choice("verify", name, RENDERERS)
+    if MITSUBA in names:
+        with mitsuba():
+            pass
+
+
+def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Write the figure and the folder of each example, and return its numbers."""
+    problem = result.problem
+    scene = problem.scene
+    conditions_before = problem.conditions(problem.start, problem.everything)
+    conditions_after = result.conditions
+    lines = []
+    for example, path in enumerate(progress(paths, "saving")):
+        write_image(path.with_suffix(".png"), figure(result, example))
+        images = result.images_before[example], result.images[example]
+        adversary = Adversary.of(scene, example, conditions_after, *images)
+        light_numbers = write_adversary(adversary, path)
+        exposure = scene.examples[example].exposure
+        light_before = conditions_before.light[example].cpu() * exposure
+        save_lights(path, light_before, scene.basis_under(conditions_before, example), "_before")
+        lines.append({"example": example, **_numbers(result, example), **light_numbers})
+    return lines
+
+
+def _numbers(result: AttackResult, example: int) -> dict[str, object]:
+    """Return what is told of an example, for JSON."""
+    descent = result.descent
+    classes = result.classifier.classes
+    before = predictions(result.logits_before[example], classes)
+    change = descent.values[[example]] - result.problem.start[[example]]
+    changes = result.problem.by_parameter(change)
+    largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
+    return {
+        "clean_correct": bool(result.clean_correct[example]),
+        "success_before": bool(result.success_before[example]),
+        "success": bool(result.success[example]),
+        "success_without_noise": bool(result.success_without_noise[example]),
+        "success_with_margin": bool(result.success_with_margin[example]),
+        "success_in_views": result.success_in_views[example].tolist(),
+        "steps": int(result.steps[example]),
+        "cost_before": float(descent.cost_before[example]),
+        "cost": float(descent.cost[example]),
+        "label": [classes[index] for index in result.goal.source[example].tolist()],
+        "predicted_before": before["predicted"],
+        "confidence_before": before["confidence"],
+        **predictions(result.logits[example], classes),
+        "largest_change": largest_change,
+    }
+
+
+def _versions(
+    result: AttackResult,
+    paths: Sequence[Path],
+    renderers: Sequence[str],
+) -> dict[str, list[dict[str, Any]]]:
+    """Return the numbers of each example by version of its images after the attack.
+
+    Args:
+        result: The attack.
+        paths: Folder of each example.
+        renderers: Renderers that render the examples again from these folders.
+    """
+    images = result.images.cpu()
+    versions = {
+        "float": images,
+        "8 bits": to_unit(to_bytes(images)),
+        f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
+    }
+    to_verify = progress(paths if renderers else [], "rendering the saved files")
+    rasterizer = result.problem.scene.rasterizer
+    again = [render_again(path, renderers, rasterizer) for path in to_verify]
+    for name in renderers:
+        versions[name] = torch.stack([images_by_renderer[name] for images_by_renderer in again])
+    numbers = {}
+    for name, version in versions.items():
+        numbers[name] = _numbers_of_version(result, version.to(result.images))
+    return numbers
+
+
+def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
+    """Return the numbers of each example for a version of its images (E, V, 3, size, size)."""
+    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    predicted = logits.argmax(2)
+    success_in_views = fooled_in_views(
+        result.preprocessed_model,
+        images,
+        predicted,
+        result.problem.everything,
+        result.goal,
+        result.settings,
+        result.seed,
+    )
+    success = success_in_views.all(1)
+    without_noise = result.goal.reached(predicted)
+    differences = (images - result.images).abs().flatten(1)
+    numbers = []
+    for example, difference in enumerate(differences):
+        numbers.append(
+            {
+                "success": bool(success[example]),
+                "success_without_noise": bool(without_noise[example]),
+                **predictions(logits[example], result.classifier.classes),
+                "largest_difference": float(difference.max()),
+                "mean_difference": float(difference.mean()),
+            }
+        )
+    return numbers
+
+
+def render_again(
+    folder: Path,
+    renderers: Sequence[str],
+    rasterizer: Rasterizer,
+) -> dict[str, Tensor]:
+    """Render the images of an example from its files alone.
+
+    Args:
+        folder: Folder of the example.
+        renderers: "reload", "mitsuba" or both.
+        rasterizer: Rasterizer of "reload".
+
+    Returns:
+        Images in [0, 1] by renderer, shape (V, 3, size, size).
+    """
+    adversary = reload(folder)
+    images = {}
+    if "reload" in renderers:
+        images["reload"] = adversary.render(rasterizer)
+    if MITSUBA in renderers:
+        encoding = adversary.settings.encoding
+        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
+        behind = background_term(rgba[:, 3:], adversary.background, encoding)
+        rendered = encode(clamp(rgba[:, :3] + behind), encoding)
+        if adversary.pixels is not None:
+            rendered = clamp(rendered + adversary.pixels)
+        images[MITSUBA] = rendered
+    return images
+
+
+def figure(result: AttackResult, example: int) -> Image.Image:
+    """Draw an example before the attack and after it, with a row for each view.
+
+    The columns are the images with their predictions, their difference and, if
+    the light changed, the light. A difference is gray where there is none. All
+    differences are scaled alike, so that the largest reaches black or white.
+
+    Args:
+        result: The result of an attack.
+        example: The number of the example.
+
+    Returns:
+        The figure.
+    """
+    before = result.images_before[example]
+    after = result.images[example]
+    differences = after - before
+    largest = differences.abs().amax((1, 2, 3)).tolist()
+    # Differences of less than a step of 8 bits stay as small as they are.
+    scale = 1 / max(1 / 255, *largest)
+    told = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
+    columns = {
+        "initial": tiles_of(before, _captions(result, result.logits_before, example), SIDE),
+        "adversarial": tiles_of(after, _captions(result, result.logits, example), SIDE),
+        "difference": tiles_of((1 + scale * differences) / 2, told, SIDE),
+        **_columns_of_light(result, example),
+    }
+    return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))
+
+
+def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile]]:
+    """Return tiles of the light before and after an attack; none if it did not change."""
+    problem = result.problem
+    scene = problem.scene
+    row = problem.everything[[example]]
+    conditions_before = problem.conditions(problem.start[row], row)
+    conditions_after = problem.conditions(result.descent.values[row], row)
+    basis_before = scene.basis_under(conditions_before, 0)
+    basis_after = scene.basis_under(conditions_after, 0)
+    is_same_light = torch.equal(conditions_before.light, conditions_after.light)
+    if is_same_light and basis_before == basis_after:
+        return {}
+    light_before = conditions_before.light[0]
+    light_after = conditions_after.light[0]
+    spheres_before = []
+    spheres_after = []
+    for camera in scene.cameras[example]:
+        spheres_before.append(light_sphere(light_before, SIDE, camera, basis_before))
+        spheres_after.append(light_sphere(light_after, SIDE, camera, basis_after))
+    return {
+        "initial light": tiles_of(spheres_before),
+        "adversarial light": tiles_of(spheres_after),
+    }
+
+
+def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[str, ...]]:
+    """Return the predicted class of each view and its confidence.
+
+    If the class is wrong, the right class and its confidence follow.
+    """
+    classes = result.classifier.classes
+    labels = result.goal.source[example].tolist()
+    captions = []
+    for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
+        shown = dict.fromkeys([int(probabilities.argmax()), label])
+        captions.append(tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown))
+    return captions

@@ -1,0 +1,575 @@
+"""The worth of an attack's result: random search, more steps, success by radius, and transfer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from augment.attacks.adversary import Adversary
+from augment.attacks.attack import (
+    AttackResult,
+    final_images,
+    fooled_in_views,
+    logits_of,
+    predictions,
+    require_result,
+)
+from augment.attacks.descent import Goal, descend
+from augment.attacks.eot import preprocessed_model
+from augment.attacks.parameters import parameter_class
+from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.problem import AttackProblem, build_problem
+from augment.classifiers import Classifier
+from augment.progress import progress
+from augment.random_streams import generator
+from augment.scene.objects import SceneObject
+from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.validation import as_list, require_number
+
+# `check` also takes so many times as many steps as the attack.
+GROWTH = (3, 10)
+
+# Results of `check` that `warnings` reads.
+CHECKED = {
+    "success",
+    "success_without_noise",
+    "random_search",
+    "cost_fell",
+    "zero_gradient",
+}
+
+
+def check(result: AttackResult) -> dict[str, Any]:
+    """Compare an attack with random draws and with longer descents.
+
+    There are as many draws as the attack has steps. They are as far from the
+    start as the attack may go (uniform in the norm-balls) or, without a radius,
+    went. The longer descents have 3 and 10 times as many steps. A success
+    counts as in the result, with the noise of a sensor.
+
+    Args:
+        result: The result of `augment.attack`.
+
+    Returns:
+        Fractions of examples, and mean costs. "cost_fell" is a fraction of the
+        examples without success before the attack, and "zero_gradient" one of
+        all examples. "success", "success_with_margin", "random_search",
+        "success_by_steps" (by number of steps), and the same names with
+        "_without_noise", are fractions of the clean-correct examples.
+
+    Raises:
+        InputError: If `result` is no result of an attack.
+
+    Example:
+        >>> checks = augment.check(result)
+        >>> checks["success"], checks["cost"] < checks["cost_before"]
+        (1.0, True)
+    """
+    require_result(result)
+    descent = result.descent
+    is_clean = result.clean_correct
+    is_open = ~result.success_before
+    cost_fell = (descent.cost < descent.cost_before) | result.success_without_noise
+
+    draws = generator(result.seed, "random search")
+    draw = partial(result.problem.sample, draws, descent.values)
+    random = _success_by_draws(result, Successes.before(result), draw)
+    counted_by_steps = {}
+    without_noise_by_steps = {}
+    for steps, found in _success_by_steps(result).items():
+        counted_by_steps[steps] = _fraction(found.counted[is_clean])
+        without_noise_by_steps[steps] = _fraction(found.without_noise[is_clean])
+    return {
+        "cost_before": float(descent.cost_before.mean()),
+        "cost": float(descent.cost.mean()),
+        "cost_fell": _fraction(cost_fell[is_open]) if is_open.any() else 1.0,
+        "zero_gradient": _fraction(descent.zero_gradient),
+        "success": _fraction(result.success[is_clean]),
+        "success_without_noise": _fraction(result.success_without_noise[is_clean]),
+        "success_with_margin": _fraction(result.success_with_margin[is_clean]),
+        "random_search": _fraction(random.counted[is_clean]),
+        "random_search_without_noise": _fraction(random.without_noise[is_clean]),
+        "success_by_steps": counted_by_steps,
+        "success_by_steps_without_noise": without_noise_by_steps,
+    }
+
+
+def warnings(checks: Mapping[str, Any]) -> list[str]:
+    """Return reasons to doubt an attack.
+
+    Args:
+        checks: The result of `check`.
+
+    Returns:
+        A sentence for each reason.
+    """
+    success = checks["success"]
+    lost_to_noise = checks["success_without_noise"] - success
+    reasons = []
+    if lost_to_noise > success:
+        reasons.append(
+            "most successes do not survive a sensor's noise, a larger attack.margin helps",
+        )
+    if 0 < success <= checks["random_search"]:
+        reasons.append("random search does as well or better")
+    if checks["cost_fell"] < 1:
+        reasons.append("the cost rose in some examples")
+    if checks["zero_gradient"] > 0:
+        reasons.append("some first gradients are exactly zero")
+    return reasons
+
+
+def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
+    """Search norm-balls around the start of an attack, from the smallest to the largest.
+
+    Each ball is searched by descent and at random. A success at one radius
+    counts at all larger radii. Only the other examples are attacked again, from
+    where they ended at the radius before, for `max_steps` more steps, and get
+    as many uniform draws.
+
+    Args:
+        result: The result of `augment.attack`.
+        scales: Factors of radii and steps or, for parameters without a radius,
+            the radii.
+
+    Returns:
+        A dict for each scale, in ascending order. "radii" are by parameter.
+        "adversarial" and "random", (N,) bool, tell of each of the N
+        clean-correct examples whether a descent or a random search succeeds. A
+        success counts as in the result, with the noise of a sensor.
+        "adversarial_without_noise" and "random_without_noise" are without it.
+
+    Raises:
+        InputError: If `result` is no result of an attack, or `scales` are not
+            positive numbers.
+
+    Example:
+        >>> small, large = augment.success_by_radius(result, [0.001, 1])
+        >>> small["radii"], small["adversarial"], large["adversarial"]
+        ({'lighting': 0.001}, tensor([False]), tensor([True]))
+    """
+    require_result(result)
+    scales = _as_scales(scales)
+    draws = generator(result.seed, "sweep")
+    values = result.problem.start.clone()
+    adversarial = Successes.before(result)
+    random = adversarial.clone()
+    rows = []
+    for scale in progress(sorted(set(scales)), "radii"):
+        parameters = result.settings.parameters.items()
+        balls = {name: _scaled(settings, scale) for name, settings in parameters}
+        scaled_settings = replace(result.settings, **balls)  # type: ignore[arg-type]
+        problem = build_problem(scaled_settings, result.problem.scene)
+        _descend_further(result, problem, values, adversarial)
+        random = _success_by_draws(result, random, partial(problem.sample, draws))
+        rows.append(
+            {
+                "radii": {name: ball.radius for name, ball in balls.items()},
+                **_of_clean_examples("adversarial", adversarial, result),
+                **_of_clean_examples("random", random, result),
+            }
+        )
+    return rows
+
+
+def transfer(
+    result: AttackResult,
+    classifiers: Sequence[Classifier] = (),
+    azimuths: Sequence[float] = (),
+    objects: Sequence[SceneObject] = (),
+) -> list[dict[str, Any]]:
+    """Show adversaries to other classifiers, from other sides and on other objects.
+
+    The A adversaries are the clean-correct examples with success. Added pixels
+    and the background are resized for another classifier.
+
+    Args:
+        result: The result of `augment.attack`.
+        classifiers: Other classifiers, for each of which the adversaries are
+            rendered at its size.
+        azimuths: Degrees by which all cameras are turned around the vertical.
+        objects: Objects that take the place of the attacked ones.
+
+    Returns:
+        A dict for each, for JSON. "network", "azimuth" or "mesh" tells which.
+        "clean_correct" and "success", A values each, tell whether every view is
+        classified correctly before the attack, and whether every view reaches
+        the goal after it, which counts as in the result, with the noise of a
+        sensor. "success_without_noise" is by the images as they are.
+        "predicted_before", "confidence_before", "predicted" and "confidence"
+        have A × V values.
+
+    Raises:
+        InputError: As `require_transferable` says, or if a classifier lacks a
+            class.
+
+    Example:
+        >>> function = result.classifier.function
+        >>> larger = augment.Classifier(function, size=12, classes=["orange", "other"])
+        >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])
+        >>> network["predicted"], turned["azimuth"]
+        ([['other']], '+20°')
+    """
+    require_result(result)
+    classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
+    objects = as_list(
+        "objects",
+        objects,
+        SceneObject,
+        "a list of scene objects, such as scene.objects",
+    )
+    azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
+    for azimuth in azimuths:
+        require_number("azimuths", azimuth)
+        require_range("azimuths", azimuth, -LARGEST, LARGEST)
+    names = [parameter.name for parameter in result.problem.parameters]
+    require_transferable(names, azimuths, objects)
+
+    adversaries = _Adversaries.of(result)
+    rows = []
+    for classifier in classifiers:
+        resized = adversaries.changed(partial(_resized, size=classifier.size))
+        rows.append({"network": classifier.name, **resized.shown_to(classifier)})
+    for azimuth in azimuths:
+        turned = adversaries.changed(partial(_turned, angle=math.radians(azimuth)))
+        rows.append({"azimuth": f"{azimuth:+g}°", **turned.shown_to(result.classifier)})
+    for item in objects:
+        exchanged = adversaries.changed(partial(replace, shown=item))
+        rows.append({"mesh": Path(item.name).name, **exchanged.shown_to(result.classifier)})
+    return rows
+
+
+def require_transferable(
+    parameters: Collection[str],
+    azimuths: Collection[float],
+    objects: Collection[Any],
+) -> None:
+    """Check that what an attack changed can be shown in other views and on other meshes.
+
+    Args:
+        parameters: Names of the attacked parameters.
+        azimuths: Degrees by which cameras are turned.
+        objects: Other meshes.
+
+    Raises:
+        InputError: If a parameter belongs to its view or its mesh alone.
+    """
+    kinds = [parameter_class(name) for name in parameters]
+    of_view = [kind.name for kind in kinds if not kind.fits_other_views]
+    of_mesh = [kind.name for kind in kinds if not kind.fits_other_meshes]
+    for argument, elsewhere, bound in (
+        ("azimuths", azimuths, of_view),
+        ("meshes", objects, of_mesh),
+    ):
+        if elsewhere and bound:
+            problem = f"attacked {bound[0]} cannot be transferred to others"
+            raise InputError(f"{argument}: {problem}, leave one of them out")
+
+
+@dataclass(frozen=True)
+class Successes:
+    """Which of E examples are a success. More successes are added in place.
+
+    Attributes:
+        counted: With the noise of a sensor, as `fooled_in_views` counts,
+            shape (E,), bool.
+        without_noise: By the images as they are, shape (E,), bool.
+    """
+
+    counted: Tensor
+    without_noise: Tensor
+
+    @staticmethod
+    def before(result: AttackResult) -> Successes:
+        """Return the successes before any step, with which nothing goes on.
+
+        Args:
+            result: The result of an attack.
+        """
+        return Successes(result.success_before.clone(), result.success_before.clone())
+
+    def clone(self) -> Successes:
+        """Return a copy, which changes on its own."""
+        return Successes(self.counted.clone(), self.without_noise.clone())
+
+    @property
+    def left(self) -> Tensor:
+        """Indices of the examples that are not counted, shape (A,)."""
+        return torch.nonzero(~self.counted).squeeze(1)
+
+    def add(
+        self,
+        result: AttackResult,
+        problem: AttackProblem,
+        values: Tensor,
+        examples: Tensor,
+        images: Tensor,
+    ) -> None:
+        """Count the examples that are a success under some values.
+
+        Where the images of the problem show a success, the final images decide
+        (see `final_images`).
+
+        Args:
+            result: The attack, with its goal and classifier.
+            problem: What the values are of.
+            values: Values of the A examples, shape (A, D).
+            examples: Indices of the examples, shape (A,).
+            images: Images that the problem rendered of them,
+                shape (A, V, 3, H, W).
+        """
+        is_reached = result.goal.of(examples).reached(_predicted(result, images))
+        rows = torch.nonzero(is_reached).squeeze(1)
+        if not len(rows):
+            return
+        chosen = examples[rows]
+        goal = result.goal.of(chosen)
+        final = final_images(problem, values[rows], chosen, images[rows])
+        predicted = _predicted(result, final)
+        fooled = fooled_in_views(
+            result.preprocessed_model,
+            final,
+            predicted,
+            chosen,
+            goal,
+            result.settings,
+            result.seed,
+        )
+        self.without_noise[chosen] |= goal.reached(predicted)
+        self.counted[chosen] |= fooled.all(1)
+
+
+def _predicted(result: AttackResult, images: Tensor) -> Tensor:
+    """Return the classes (A, V) that the attacked classifier sees in images (A, V, 3, H, W)."""
+    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    return logits.argmax(2)
+
+
+def _success_by_draws(
+    result: AttackResult,
+    found: Successes,
+    draw: Callable[[], Tensor],
+) -> Successes:
+    """Return what was found, and what as many draws (E, D) as the attack had steps add to it."""
+    found = found.clone()
+    for _ in progress(range(result.settings.max_steps), "random search"):
+        left = found.left
+        if not len(left):
+            break
+        values = draw()[left]
+        with torch.no_grad():
+            images = result.problem.render(values, left)
+        found.add(result, result.problem, values, left, images)
+    return found
+
+
+def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
+    """Return the successes of the attack and of longer ones from its start, by number of steps.
+
+    Examples that a shorter descent counts already are not attacked again.
+    """
+    settings = result.settings
+    found = Successes(result.success, result.success_without_noise)
+    by_steps = {settings.max_steps: found}
+    for factor in GROWTH:
+        longer = replace(settings, max_steps=factor * settings.max_steps)
+        found = found.clone()
+        left = found.left
+        if len(left):
+            end = descend(
+                result.preprocessed_model,
+                result.problem,
+                result.goal.of(left),
+                longer,
+                examples=left,
+                seed=result.seed,
+            )
+            found.add(result, result.problem, end.values, left, end.images)
+        by_steps[longer.max_steps] = found
+    return by_steps
+
+
+def _fraction(values: Tensor) -> float:
+    """Return the mean of values (N,), which is 0 of none."""
+    return float(values.double().mean()) if len(values) else 0.0
+
+
+def _as_scales(scales: Sequence[float]) -> list[float]:
+    """Return factors of radii as a list, and refuse everything else."""
+    listed = as_list("scales", scales, object, "a list of factors of the radii")
+    if not listed:
+        raise InputError("scales is empty: give factors of the radii")
+    for scale in listed:
+        require_number("scales", scale)
+        require_range("scales", scale, 1 / FACTOR, FACTOR)
+    return listed
+
+
+def _scaled(settings: StepSettings, scale: float) -> StepSettings:
+    """Return settings with a scaled norm-ball and steps, or with the scale as their radius."""
+    if settings.radius is None:
+        return replace(settings, radius=scale)
+    return replace(settings, radius=scale * settings.radius, step_size=scale * settings.step_size)
+
+
+def _descend_further(
+    result: AttackResult,
+    problem: AttackProblem,
+    values: Tensor,
+    found: Successes,
+) -> None:
+    """Attack the examples that are left from their values (E, D), which change, as does `found`."""
+    left = found.left
+    if not len(left):
+        return
+    end = descend(
+        result.preprocessed_model,
+        problem,
+        result.goal.of(left),
+        result.settings,
+        examples=left,
+        start=values[left],
+        seed=result.seed,
+    )
+    values[left] = end.values
+    found.add(result, problem, end.values, left, end.images)
+
+
+def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
+    """Return which clean-correct examples a method of search found, with noise and without."""
+    is_clean = result.clean_correct
+    return {
+        method: found.counted[is_clean].cpu(),
+        f"{method}_without_noise": found.without_noise[is_clean].cpu(),
+    }
+
+
+@dataclass(frozen=True)
+class _Adversaries:
+    """Adversaries of an attack, with what they were before it.
+
+    Attributes:
+        result: The attack.
+        examples: Number of each of the A adversaries among the examples.
+        before: What they were before the attack.
+        after: What they are after it.
+    """
+
+    result: AttackResult
+    examples: list[int]
+    before: list[Adversary]
+    after: list[Adversary]
+
+    @staticmethod
+    def of(result: AttackResult) -> _Adversaries:
+        """Return the clean-correct examples with success."""
+        problem = result.problem
+        chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
+        conditions_before = problem.conditions(problem.start, problem.everything)
+        conditions_after = result.conditions
+        before = []
+        after = []
+        for example in chosen:
+            images = result.images_before[example], result.images[example]
+            before.append(Adversary.of(problem.scene, example, conditions_before, *images))
+            after.append(Adversary.of(problem.scene, example, conditions_after, *images))
+        return _Adversaries(result, chosen, before, after)
+
+    def changed(self, change: Callable[[Adversary], Adversary]) -> _Adversaries:
+        """Return the same adversaries after a change of where they are shown."""
+        before = [change(adversary) for adversary in self.before]
+        after = [change(adversary) for adversary in self.after]
+        return replace(self, before=before, after=after)
+
+    def shown_to(self, classifier: Classifier) -> dict[str, Any]:
+        """Return what a classifier predicts for the adversaries; see `transfer`."""
+        settings = self.result.settings
+        goal = self._goal(classifier)
+        logits_before = self._logits(self._rendered(self.before, classifier), classifier)
+        images = self._rendered(self.after, classifier)
+        logits = self._logits(images, classifier)
+        predicted_before = predictions(logits_before, classifier.classes)
+        success_in_views = fooled_in_views(
+            preprocessed_model(settings, classifier),
+            images,
+            logits.argmax(2),
+            torch.tensor(self.examples, dtype=torch.long),
+            goal,
+            settings,
+            self.result.seed,
+        )
+        return {
+            "clean_correct": (logits_before.argmax(2) == goal.source).all(1).tolist(),
+            "success": success_in_views.all(1).tolist(),
+            "success_without_noise": goal.reached(logits.argmax(2)).tolist(),
+            "predicted_before": predicted_before["predicted"],
+            "confidence_before": predicted_before["confidence"],
+            **predictions(logits, classifier.classes),
+        }
+
+    def _goal(self, classifier: Classifier) -> Goal:
+        """Return the goal of the adversaries in the classes of a classifier."""
+        view_count = self.result.problem.scene.views
+        sources = [[adversary.shown.label] * view_count for adversary in self.after]
+        source = self._labels(sources, classifier)
+        if self.result.goal.target is None:
+            return Goal(source)
+        attacked_classes = self.result.classifier.classes
+        targets = [
+            [attacked_classes[index] for index in self.result.goal.target[example].tolist()]
+            for example in self.examples
+        ]
+        return Goal(source, self._labels(targets, classifier))
+
+    def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
+        """Return the classes (A, V) of names of classes, A lists of V."""
+        indices = [classifier.label(name) for views in names for name in views]
+        return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
+
+    def _rendered(self, adversaries: list[Adversary], classifier: Classifier) -> Tensor:
+        """Render adversaries at the size of a classifier, (A, V, 3, size, size)."""
+        scene = self.result.problem.scene
+        size = classifier.size
+        if not adversaries:
+            return self.result.images.new_empty(0, scene.views, 3, size, size)
+        images = []
+        for adversary in progress(adversaries, "transfer"):
+            images.append(adversary.render(scene.rasterizer))
+        return torch.stack(images).to(self.result.images)
+
+    def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
+        """Return the logits (A, V, C) of images (A, V, 3, size, size), on the CPU."""
+        settings = self.result.settings
+        if not len(images):
+            return torch.empty(0, images.shape[1], len(classifier.classes))
+        model = preprocessed_model(settings, classifier)
+        return logits_of(model, images, settings.batch_size).cpu()
+
+
+def _resized(adversary: Adversary, size: int) -> Adversary:
+    """Return an adversary whose images have another size in pixels."""
+    if adversary.settings.size == size:
+        return adversary
+    background = _with_size(adversary.background[None], size)[0].clamp(0, 1)
+    pixels = None if adversary.pixels is None else _with_size(adversary.pixels, size)
+    settings = replace(adversary.settings, size=size)
+    return replace(adversary, settings=settings, background=background, pixels=pixels)
+
+
+def _with_size(images: Tensor, size: int) -> Tensor:
+    """Return images (N, C, H, W) in another size in pixels."""
+    return F.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
+
+
+def _turned(adversary: Adversary, angle: float) -> Adversary:
+    """Return an adversary seen by cameras that are turned around the vertical, in radians."""
+    cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
+    return replace(adversary, cameras=tuple(cameras))

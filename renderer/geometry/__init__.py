@@ -1,0 +1,1 @@
+"""The shape of objects: meshes, normals, generated solids and skins."""

@@ -1,0 +1,1 @@
+"""How a surface reflects light: albedo, diffuse shading and gloss."""

@@ -1,0 +1,1 @@
+"""What a camera sees: rasterizers, the samples of each face, and the edges of what is seen."""

@@ -1,0 +1,211 @@
+import logging
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from renderer.errors import InputError
+from train.data.photographs import Photograph, find_photographs, left_out, load_photographs
+
+CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
+
+
+def save(path: Path, pixels: np.ndarray | Image.Image, **options) -> Path:
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    image.save(path, **options)
+    return path
+
+
+def plain(color=(255, 128, 0)) -> Image.Image:
+    return Image.new("RGB", (32, 32), color)
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def load_one(path: Path) -> np.ndarray:
+    """The image as (32, 32, 3) integers."""
+    _, images, _ = load_photographs(path.parent, [Photograph(PurePosixPath(path.name), "orange", None)])
+    return images[0].permute(1, 2, 0).numpy().astype(int)
+
+
+def find(folder: Path, label: str = "orange") -> list[tuple[str, str]]:
+    found = find_photographs(folder, CLASSES, label)
+    assert {photograph.source for photograph in found} == {None}
+    return [(str(photograph.path), photograph.label) for photograph in found]
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        pytest.param(
+            ("pear/b.PNG", "orange/2026/may/c.jpeg", "other_tomato/d.TIF"),
+            [("orange/2026/may/c.jpeg", "orange"), ("other_tomato/d.TIF", "other_tomato"), ("pear/b.PNG", "pear")],
+            id="class folders at any depth",
+        ),
+        pytest.param(("b.jpg", "a.gif"), [("a.gif", "orange"), ("b.jpg", "orange")], id="flat"),
+        pytest.param(
+            ("orange/a.JFIF", "orange/._a.jpg", "orange/.cache/b.jpg", ".git/c.jpg", "__MACOSX/a.jpg", "x.txt"),
+            [("orange/a.JFIF", "orange")],
+            id="hidden files",
+        ),
+    ],
+)
+def test_images_are_found_with_their_class_in_sorted_order(tmp_path, files, expected):
+    assert find(touch(tmp_path, *files)) == expected
+
+
+def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
+    touch(tmp_path, "elsewhere/deep/a.jpg", "elsewhere/b.jpg", "photos/pear/c.jpg")
+    photos = tmp_path / "photos"
+    (photos / "orange").symlink_to(tmp_path / "elsewhere")
+    (photos / "pear" / "d.jpg").symlink_to(tmp_path / "elsewhere" / "b.jpg")
+    for circle, target in [("pear/all", photos), ("pear/self", photos / "pear"), ("pear/root", tmp_path)]:
+        (photos / circle).symlink_to(target)
+    assert [path for path, _ in find(photos)] == ["orange/b.jpg", "orange/deep/a.jpg", "pear/c.jpg", "pear/d.jpg"]
+
+
+def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "notes.txt", "lab.json")
+    (tmp_path / "orange" / "folder.jpg").mkdir()
+    (tmp_path / "photos.csv").write_text("path,source_tag\n")
+    assert find(tmp_path) == [("orange/a.jpg", "orange")]
+    assert [*map(str, left_out(tmp_path))] == ["notes.txt", "orange/b.HEIC", "orange/c.avif"]
+
+
+@pytest.mark.parametrize(
+    ("files", "folder", "label", "message"),
+    [
+        (("a.jpg",), "a.jpg", "orange", r"a\.jpg is not a folder"),
+        (("orange/notes.txt",), ".", "orange", "holds no photographs"),
+        (("Oranges/a.jpg",), ".", "orange", "Oranges is not .*such as orange, .* other_Oranges"),
+        (("pear/a.jpg", "blood_oranges/b.jpg"), ".", "orange", "blood_oranges is not .* other_blood_oranges if"),
+        (("lion/a.jpg", "bee/b.jpg"), ".", "orange", "bee is not named after a class"),
+        (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
+        (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
+        (("a.jpg",), ".", ["orange", "pear"], "has no class folders, and label names several classes"),
+    ],
+)
+def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, message):
+    touch(tmp_path, *files)
+    with pytest.raises(InputError, match=message):
+        find_photographs(tmp_path / folder, CLASSES, label)
+
+
+def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tmp_path, caplog):
+    found = find(touch(tmp_path, "orange/a.jpg", "lion/b.jpg", "other_bee/c.jpg"))
+    assert found == [("lion/b.jpg", "lion"), ("orange/a.jpg", "orange"), ("other_bee/c.jpg", "other_bee")]
+    assert "1 of 3 folders" in caplog.text and "count as other things: lion" in caplog.text
+
+
+def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns(tmp_path, caplog):
+    touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "pear/d.jpg")
+    rows = [
+        "class,hard_negatives,path,source_tag", "orange,lab; web,orange/a.jpg,sun", "orange,,orange/b.jpg,web",
+        "lemon,;,other_lemon\\c.jpg,lab", "pear,,pear/d.jpg,", "fig,,fig/gone.jpg,web", "",
+    ]  # fmt: skip
+    (tmp_path / "photos.csv").write_text("\ufeff" + "\n".join(rows), encoding="utf-8")
+    with caplog.at_level(logging.WARNING):
+        found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [photograph.source for photograph in found] == ["sun", "web", "lab", None]
+    assert [photograph.hard_negatives for photograph in found] == [("lab", "web"), (), (), ()]
+    assert "photos.csv has 1 of 5 rows for no file of the folder, like fig/gone.jpg" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (b"path;source_tag\na.jpg;web\n", "make it UTF-8 with the columns path and source_tag, separated by commas"),
+        (b"path,source_tag\nb/a.jpg,web\n", "1 of 1 rows for no file of the folder, .*; give paths such as a.jpg$"),
+        (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
+        (
+            b"path,source_tag,hard_negatives\na.jpg,web,lib\n",
+            "names hard_negatives of source 'lib', which has no image$",
+        ),
+    ],
+)
+def test_a_photos_csv_that_cannot_be_used_is_refused_by_name(tmp_path, table, message):
+    (touch(tmp_path, "a.jpg") / "photos.csv").write_bytes(table)
+    with pytest.raises(InputError, match=rf"photos\.csv .*{message}"):
+        find(tmp_path)
+
+
+# EXIF 2.3, tag 274: how the stored pixels are made of the upright image.
+STORED = {
+    1: lambda pixels: pixels,
+    2: np.fliplr,
+    3: lambda pixels: np.rot90(pixels, 2),
+    4: np.flipud,
+    5: lambda pixels: pixels.transpose(1, 0, 2),
+    6: np.rot90,
+    7: lambda pixels: np.rot90(pixels, 2).transpose(1, 0, 2),
+    8: lambda pixels: np.rot90(pixels, -1),
+}
+
+
+@pytest.mark.parametrize("orientation", STORED)
+def test_every_exif_orientation_is_undone(tmp_path, orientation):
+    upright = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[274] = orientation
+    path = save(tmp_path / "a.png", np.ascontiguousarray(STORED[orientation](upright)), exif=exif)
+    np.testing.assert_array_equal(load_one(path), upright)
+
+
+def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_path):
+    thirds = [np.broadcast_to(np.uint8(color), (32, 32, 3)) for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
+    for axis in (0, 1):
+        path = save(tmp_path / "thirds.png", np.concatenate(thirds, axis=axis))
+        np.testing.assert_array_equal(load_one(path), thirds[1])
+
+
+def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
+    coarse = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8))
+    path = save(tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90)
+    with Image.open(path) as image:
+        whole = save(tmp_path / "a.bmp", image.convert("RGB"))
+    difference = np.abs(load_one(path) - load_one(whole))
+    # Halving an odd side rounds it up, which moves the center by 1/100 of a final pixel.
+    assert difference.max() <= 8 and difference.mean() <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "options", "expected"),
+    [
+        ("gray.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
+        ("color-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
+        ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
+        ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
+        ("sixteen.png", Image.fromarray(np.full((40, 40), 0x80C0, np.uint16)), {}, (128, 128, 128)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expected):
+    loaded = load_one(save(tmp_path / name, image, **options))
+    assert np.abs(loaded - expected).max() <= (2 if name.endswith("jpg") else 0)
+
+
+def test_unreadable_images_are_named_or_skipped(tmp_path):
+    cut = save(tmp_path / "cut.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8))
+    cut.write_bytes(cut.read_bytes()[:2000])
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    (tmp_path / "text.png").write_text("not an image")
+    broken = sorted(path.name for path in tmp_path.iterdir())
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    for skip_unreadable in (False, True):  # nothing is left when all of them are skipped
+        with pytest.raises(InputError, match=r"3 of 3 .*cut\.jpg .*replace them$"):
+            load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
+
+    save(tmp_path / "good.png", plain())
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=true"):
+        load_photographs(tmp_path, found)
+    loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
+    assert [str(photograph.path) for photograph in loaded] == ["good.png"]
+    assert (images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])).all() and unreadable == broken

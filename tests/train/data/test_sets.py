@@ -1,0 +1,156 @@
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from renderer.errors import InputError
+from train.data.sets import Split, channel_statistics, held_out_rows, load_cifar100, load_folder, load_npz
+
+
+def arrays(**changes) -> dict[str, np.ndarray]:
+    """What an .npz file of two classes holds, some of it changed; None leaves an array out."""
+    rng = np.random.default_rng(0)
+    good = {
+        "train_images": rng.integers(0, 256, (5, 3, 8, 8), dtype=np.uint8),
+        "train_labels": np.array([0, 1, 1, 0, 1]),
+        "test_images": rng.integers(0, 256, (2, 3, 8, 8), dtype=np.uint8),
+        "test_labels": np.array([1, 0]),
+        "classes": np.array(["lime", "fig"]),
+    }
+    return {name: array for name, array in (good | changes).items() if array is not None}
+
+
+def numbered(count: int, classes: int = 1) -> Split:
+    """Images (N, 3, 1, 1) that show their row's number, with labels in turn."""
+    rows = torch.arange(count)
+    return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
+
+
+def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (value, value, value)).save(path)
+
+
+def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
+    np.savez(tmp_path / "data.npz", **arrays())
+    data = load_npz(str(tmp_path / "data.npz"))
+    assert data.classes == ("lime", "fig") and data.size == 8
+    for name in ("train", "test"):
+        split = getattr(data, name)
+        assert split.images.dtype == torch.uint8 and split.labels.dtype == torch.int64
+        np.testing.assert_array_equal(split.images, arrays()[f"{name}_images"])
+        np.testing.assert_array_equal(split.labels, arrays()[f"{name}_labels"])
+
+
+@pytest.mark.parametrize(
+    "changes, fault",
+    [
+        ({"test_labels": None}, "test_labels is not a file in the archive"),
+        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"images are uint8 of shape \(5, 8, 8, 3\)"),
+        ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
+        ({"train_labels": np.zeros(4, int)}, r"labels are int64 of shape \(4,\); they must be integers \(5,\)"),
+        ({"test_labels": np.array([0, 2])}, "labels must be 0 to 1"),
+        ({"test_labels": np.array([0, 2**64 - 1], np.uint64)}, "labels must be 0 to 1"),
+        ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
+        ({"classes": np.array(["lime", "fig"], dtype=object)}, "allow_pickle=False"),
+    ],
+)
+def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):
+    path = tmp_path / "data.npz"
+    np.savez(path, **arrays(**changes))
+    with pytest.raises(InputError, match=f"data.path={re.escape(str(path))}.*{fault}"):
+        load_npz(str(path))
+
+
+def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
+    for label, name in enumerate(["lime", "fig"]):
+        for number in range(10):
+            save_image(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
+    (tmp_path / ".thumbnails").mkdir()
+    data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
+    assert data.classes == ("fig", "lime")
+    assert data.train.images.shape == (16, 3, 8, 8) and data.test.images.shape == (4, 3, 8, 8)
+    shown = {}
+    for split in (data.train, data.test):
+        for image, label in zip(split.images, split.labels, strict=True):
+            assert len(image.unique()) == 1
+            shown[int(image[0, 0, 0])] = data.classes[label]
+    assert shown == {100 * label + n: name for label, name in enumerate(["lime", "fig"]) for n in range(10)}
+
+
+def test_train_and_test_folders_are_the_splits(tmp_path):
+    for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
+        save_image(tmp_path / part / name / "a.png", value)
+    data = load_folder(str(tmp_path), size=8, test_fraction=0.1)
+    assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
+    assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    "images, fault",
+    [
+        ([], "is not a folder"),
+        (["fig/a.png"], "holds 1 class folders: it needs two or more"),
+        (["fig/a.png", "lime/.a.png"], "data/lime holds no image: put some there or remove the folder"),
+        (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], "holds test, train, val: divide it"),
+        (["fig/a.png", "lime/a.png"], "data.test_fraction=0.1 of class 0, 1 images, is all or nothing"),
+    ],
+)
+def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
+    for name in images:
+        save_image(tmp_path / "data" / name, 0)
+    with pytest.raises(InputError, match=fault):
+        load_folder(str(tmp_path / "data"), 8, 0.1)
+
+
+def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(tmp_path, caplog):
+    for number in range(4):
+        save_image(tmp_path / "fig" / f"{number}.png", 0)
+        save_image(tmp_path / "lime" / f"{number}.png", 0)
+        (tmp_path / "fig" / f"{number}.heic").touch()
+    with caplog.at_level("WARNING", "train"):
+        load_folder(str(tmp_path), 8, 0.25)
+    assert f"4 files in {tmp_path} are not images: fig/0.heic, fig/1.heic" in caplog.text
+    (tmp_path / "fig" / "b.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"1 of 9 photographs cannot be read, .*fig/b\.png"):
+        load_folder(str(tmp_path), 8, 0.25)
+
+
+def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
+    pixels = np.random.default_rng(0).integers(0, 256, (2, 10, 32, 32, 3), dtype=np.uint8)
+
+    def cifar100(path, train, download):
+        return SimpleNamespace(data=pixels[int(train)], targets=[3] * 10, classes=["fig", "lime"])
+
+    monkeypatch.setattr("torchvision.datasets.CIFAR100", cifar100)
+    data = load_cifar100("here")
+    assert data.classes == ("fig", "lime") and data.train.labels.tolist() == [3] * 10
+    np.testing.assert_array_equal(data.train.images, pixels[1].transpose(0, 3, 1, 2))
+    np.testing.assert_array_equal(data.test.images, pixels[0].transpose(0, 3, 1, 2))
+
+
+def test_the_fraction_of_every_class_is_held_out_as_a_function_of_the_seed():
+    torch.manual_seed(1)
+    split = numbered(200, classes=4)
+    rows, again, other = (held_out_rows(split, 0.1, seed) for seed in (0, 0, 1))
+    assert rows.shape == (200,) and split[rows].labels.bincount().tolist() == [5] * 4
+    assert torch.equal(rows, again) and not torch.equal(rows, other)
+
+
+@pytest.mark.parametrize("fraction", [0, float("nan"), 0.001, 0.999])
+def test_a_fraction_that_leaves_a_split_empty_is_an_error(fraction):
+    with pytest.raises(InputError, match=f"data.validation={fraction} "):
+        held_out_rows(numbered(200, classes=4), fraction, seed=0)
+
+
+def test_channel_statistics_are_those_of_float64():
+    images = np.random.default_rng(0).beta(0.5, 2, (40, 3, 9, 9)) * [[[[250]], [[255]], [[20]]]]
+    images = images.astype(np.uint8)
+    means, deviations = channel_statistics(torch.from_numpy(images))
+    # the sums differ in order alone
+    np.testing.assert_allclose(means, (images / 255).mean((0, 2, 3)), rtol=1e-12)
+    np.testing.assert_allclose(deviations, (images / 255).std((0, 2, 3)), rtol=1e-12)

@@ -1,0 +1,92 @@
+import errno
+import os
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from renderer.errors import InputError
+from train.runs.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
+
+STATE = {
+    "model": {"weight": torch.arange(6.0).reshape(2, 3), "steps": torch.tensor(3)},
+    "architecture": {"classes": ["fig", "lime"]},
+    "epoch": 3,
+    "history": [{"epoch": 1, "train/loss": 0.25}],
+    "random": [torch.arange(500)],
+}
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.mkdir, ("harm",)
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(tmp_path, monkeypatch, function):
+    save(tmp_path / LAST, STATE)
+    before = (tmp_path / LAST).read_bytes()
+
+    def fail(*arguments):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"renderer.io.files.os.{function}", fail)
+        with pytest.raises(OSError, match="No space left on device") as full:
+            save(tmp_path / LAST, STATE | {"epoch": 4}, tmp_path / PREVIOUS)
+    assert full.value.errno == errno.ENOSPC and full.value.filename == str(tmp_path / LAST)
+    assert os.listdir(tmp_path) == [LAST] and (tmp_path / LAST).read_bytes() == before
+    again = STATE | {"epoch": 4}
+    save(tmp_path / LAST, again)
+    assert content_hash(load(tmp_path / LAST)) == content_hash(again)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(Path.unlink, id="missing"),
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:2000]), id="truncated"),
+        pytest.param(lambda path: torch.save(Harmful(), path), id="code"),
+        pytest.param(lambda path: save(path, {"model": {}}), id="no architecture"),
+        pytest.param(lambda path: save(path, STATE | {"model": {"weight": torch.tensor(torch.nan)}}), id="NaN"),
+        pytest.param(lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"),
+    ],
+)
+def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, spoil):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / BEST
+    save(path, STATE)
+    spoil(path)
+    with pytest.raises(InputError, match=rf"^(checkpoint )?{re.escape(str(path))} [^\n]+$"):
+        load(path)
+    assert not Path("harm").exists()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"a": [[1], 2], "b": torch.zeros(3)},
+        {"a": [1, 2], "b": torch.zeros(3, dtype=torch.float64)},
+        {"a": [1, 2], "b": torch.zeros(3, 1)},
+        {"a": [1, 2], "b": -torch.zeros(3)},
+    ],
+)
+def test_different_contents_have_different_hashes_whatever_their_layout_in_memory(other):
+    assert content_hash(other) != content_hash({"a": [1, 2], "b": torch.zeros(3)})
+    images = torch.rand(2, 3, 4, 4)
+    assert content_hash(images) == content_hash(images.contiguous(memory_format=torch.channels_last))
+
+
+def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_reported(tmp_path):
+    for epoch in (1, 2):
+        save(tmp_path / LAST, STATE | {"epoch": epoch}, tmp_path / PREVIOUS)
+    state, fault = load_newest(tmp_path)
+    assert (state["epoch"], fault) == (2, None)
+    for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-100]), Path.unlink):
+        spoil(tmp_path / LAST)
+        state, fault = load_newest(tmp_path)
+        assert state["epoch"] == 1 and str(tmp_path / LAST) in fault
+    (tmp_path / PREVIOUS).unlink()
+    with pytest.raises(InputError, match=r"last.pt does not exist"):
+        load_newest(tmp_path)

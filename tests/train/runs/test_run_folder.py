@@ -1,0 +1,188 @@
+"""A run's folder, also where others write to it or have damaged its files."""
+
+import hashlib
+import io
+import itertools
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from augment.service import AttackExamples
+from renderer.errors import InputError
+from renderer.light.basis import HARMONICS
+from train.command import read_settings
+from train.runs.run_folder import (
+    CONFIG,
+    METRICS,
+    RunLog,
+    decisive_settings,
+    read_config,
+    read_metrics,
+    require_same,
+    require_same_run,
+    write_config,
+)
+from train.settings import ExperimentSettings
+
+
+def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
+    settings = tiny("train.learning_rate=3e-7", "label=pear", "scene.lamps={power: 3}")
+    write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
+    config = read_config(tmp_path / CONFIG)
+    assert "command" not in config  # which would be refused, as every interpolation is
+    assert config.pop("precision") == "bfloat16" and config.pop("working_folder") == os.getcwd()
+    assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {settings.data.path}
+    assert read_settings(ExperimentSettings, config) == settings
+
+
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]\n" for n in range(9))
+
+
+@pytest.mark.parametrize(
+    "file, content",
+    [
+        (CONFIG, "- 1"),
+        (CONFIG, BOMB),
+        (CONFIG, "!!python/object/apply:os.system [touch hacked]"),
+        (CONFIG, "a: ${oc.env:HOME}"),
+        (METRICS, "{\n"),
+        (METRICS, '{"test/accuracy": "high"}\n'),
+    ],
+    ids=["list", "bomb", "code", "variable", "cut", "text"],
+)
+def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
+    (tmp_path / file).write_text(content)
+    with pytest.raises(InputError, match=rf"^{tmp_path / file} is damaged [^\n]*$"):
+        read_config(tmp_path / file) if file == CONFIG else read_metrics(tmp_path)
+
+
+def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
+    here, there = (
+        decisive_settings(tiny("evaluate.photos=${run}/images", *overrides))
+        for overrides in (["run=here"], ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"])
+    )
+    assert here == there and here["evaluate.photos"] == "<run>/images" and here["augment.attack.max_steps"] == 3
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "scene.meshes=[{}]",
+        "scene.hard_negatives=[{{mesh: {}, label: apple}}]",
+        "scene.meshes=[{{mesh: solid:orange, props: [{{mesh: {}, at: [1, 1]}}]}}]",
+        "scene.light={}",
+        "scene.backgrounds=[0.5,{}]",
+        "augment.vary.environments=[{}]",
+        "train.init_from={}",
+        "train.init_from={0.parent}",
+        "data.path={}",
+        "data.path={0.parent}",
+    ],
+)
+def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
+    file, folder = tmp_path / "inputs" / "best.pt", tmp_path / "run"
+    file.parent.mkdir()
+    file.write_bytes(b"one")
+    settings = tiny(override.format(file), "augment.examples=null", "scene.views=1")
+    write_config(folder, settings)
+    require_same_run(folder, settings)
+    file.write_bytes(b"another")
+    with pytest.raises(InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"):
+        require_same_run(folder, settings)
+
+
+def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(tiny, tmp_path, monkeypatch):
+    file, reads = tmp_path / "data.npz", []
+    file.write_bytes(b"data")
+    settings, digest = tiny(f"data.path={file}"), hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda opened, name: reads.append(opened.name) or digest(opened, name))
+    write_config(tmp_path / "run", settings)
+    require_same_run(tmp_path / "run", settings)
+    require_same_run(tmp_path / "run", settings)
+    assert reads == [str(file)]
+
+
+def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):
+    assert read_metrics(tmp_path) == []  # without a file
+    (tmp_path / METRICS).write_text('{"epoch": 1}\n{"epo')
+    assert read_metrics(tmp_path) == [{"epoch": 1}]
+
+
+def write_epochs(folder: Path, epochs: range, history=()) -> None:
+    log = RunLog(folder, history)
+    for epoch in epochs:
+        log.scalars({"train/loss": 1 / epoch, "validation/accuracy": 0.25}, epoch)
+
+
+@pytest.mark.parametrize("done", [0, 2, 3])
+def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(tmp_path, done, monkeypatch):
+    """Later lines are written again, final scores too; a line cut short and lines that were lost come back."""
+    monkeypatch.setattr(time, "time", itertools.count(1e9).__next__)  # TensorBoard orders the files by their seconds
+    write_epochs(tmp_path, range(1, 4))
+    epochs = read_metrics(tmp_path)
+    (tmp_path / METRICS).write_text('{"epoch": 3, "train/lo')
+    write_epochs(tmp_path, range(done + 1, 4), epochs[:done])
+    assert read_metrics(tmp_path) == epochs
+    for accuracy in (0.5, 0.25):  # as when a finished run is scored again
+        RunLog(tmp_path, epochs).scalars({"test/accuracy": accuracy})
+    assert read_metrics(tmp_path) == [*epochs, {"test/accuracy": 0.25}]
+    board = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.step for event in board.Scalars("train/loss")] == [1, 2, 3]
+    assert [(event.step, event.value) for event in board.Scalars("test/accuracy")] == [(4, 0.25)]
+
+
+def test_tensorboard_shows_the_renders(tmp_path):
+    renders = torch.rand(5, 3, 16, 16)
+    log = RunLog(tmp_path)
+    log.renders(renders, epoch=2)
+    log.scalars({"train/loss": 0.25}, epoch=2)
+    (image,) = EventAccumulator(str(tmp_path)).Reload().Images("renders")
+    with Image.open(tmp_path / "renders" / "epoch_002.png") as grid:
+        pixels = np.asarray(grid)
+    assert image.step == 2 and np.array_equal(Image.open(io.BytesIO(image.encoded_image_string)), pixels)
+    assert pixels.shape == (18, 5 * 17 + 1, 3)
+    for number, render in enumerate(renders):
+        tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
+        np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("side", [16, 512])
+def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_path, side):
+    images = torch.rand(2, 3, 3, side, side)
+    predictions = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, 3, 2)
+    lights = torch.rand(2, 3, HARMONICS.size, 3)
+    examples = AttackExamples(images, lights, predictions, torch.tensor([0, 1, -1]))
+    RunLog(tmp_path).attack_examples(examples, ["apple", "orange"], epoch=2)
+    sheet = np.asarray(Image.open(tmp_path / "renders" / "attacks_002.png")).astype(int)
+    for image in images.flatten(0, 1):
+        shown = image.numpy().transpose(1, 2, 0)
+        shown = shown.reshape(128, 4, 128, 4, 3).mean((1, 3)) if side > 128 else shown.repeat(8, 0).repeat(8, 1)
+        corners = np.argwhere((abs(sheet - 255 * shown[0, 0]) < 1).all(2))
+        windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
+        windows = [window for window in windows if window.shape == shown.shape]
+        assert any((abs(window - 255 * shown) < 1).all() for window in windows)
+
+
+def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes(tmp_path):
+    @dataclass
+    class Settings:
+        photos: str | None = None
+        meshes: list[str] = field(default_factory=list)
+
+    mesh = tmp_path / "a.obj"
+    mesh.write_text("v 0 0 0")
+    write_config(tmp_path, Settings(meshes=[str(mesh)]))
+    settings = Settings("photos", [str(mesh)])
+    require_same(tmp_path, settings, "out=", lambda *change: change == ("photos", None, "photos"))
+    with pytest.raises(InputError, match="was made with photos=None, not photos: give its setting"):
+        require_same(tmp_path, settings, "out=", lambda *change: False)
+    mesh.write_text("v 0 0 1")
+    with pytest.raises(InputError, match=r"a\.obj has changed since .* began: .* another folder with out="):
+        require_same(tmp_path, Settings(meshes=[str(mesh)]), "out=", lambda *change: False)

@@ -1,0 +1,53 @@
+"""What only a GPU can show; skipped without one."""
+
+import pytest
+import torch
+
+from tests.runs import completed_run
+from train.runs import checkpoint
+from train.runs.run_folder import read_metrics
+from train.training.loop import Trainer
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+def weights_of(config, folder) -> dict[str, torch.Tensor]:
+    completed_run(config, folder)
+    return checkpoint.load(folder / checkpoint.LAST)["model"]
+
+
+@pytest.mark.parametrize("compile", ["auto", "never"])
+def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
+    """At a learning rate so low that rounding does not grow; without dropout, whose draws differ."""
+    overrides = ("train.learning_rate=0.001", "model.dropout=0.0", "train.epochs=2")
+    expected = weights_of(tiny(*overrides), tmp_path / "cpu")
+    found = weights_of(tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu")
+    torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3)  # convolutions in TF32
+    lines = [read_metrics(tmp_path / name) for name in ("cpu", "gpu")]
+    assert lines[1][0]["augment/steps"] == pytest.approx(lines[0][0]["augment/steps"], abs=0.5)
+
+
+def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, tmp_path):
+    overrides = ("train.device=cuda", "train.deterministic=true", "train.precision=bfloat16")
+    whole = weights_of(tiny(*overrides), tmp_path / "whole")
+    again = weights_of(tiny(*overrides), tmp_path / "parts")
+    (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
+    parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
+    assert all(torch.equal(value, again[name]) and torch.equal(value, parts[name]) for name, value in whole.items())
+
+
+@pytest.mark.parametrize("ema_decay", [0.0, 0.9])
+def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
+    """Steps that synchronize raise an error; phases and the ends of epochs may."""
+    step = Trainer._step
+
+    def asynchronous(self, *batch):
+        torch.cuda.set_sync_debug_mode("error" if self._under_way.step > 3 else "default")  # after what is compiled
+        try:
+            return step(self, *batch)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+    monkeypatch.setattr(Trainer, "_step", asynchronous)
+    few = ("augment=none", "train.epochs=1", "train.batch_size=4")
+    weights_of(tiny("train.device=cuda", *few, f"train.ema_decay={ema_decay}"), tmp_path)

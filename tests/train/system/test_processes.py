@@ -1,0 +1,206 @@
+"""Two processes against one, over gloo on a CPU; and the signals that end a run."""
+
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.multiprocessing as multiprocessing
+from omegaconf import OmegaConf
+from PIL import Image
+
+from augment import AugmentationService, AugmentationSettings, distributed
+from augment.progress import Phases
+from augment.scene.scene import Scene
+from tests.runs import completed_run
+from train.command import read_settings
+from train.runs import checkpoint
+from train.runs.run_folder import read_metrics
+from train.settings import ExperimentSettings
+from train.system.processes import Interrupted, Interruption, process_group
+from train.training import loop
+
+ROOT = Path(__file__).parents[3]
+EPOCHS = 2
+
+
+def group_norms(patch: pytest.MonkeyPatch) -> None:
+    """In place of batch norms, whose statistics on a CPU are those of a process's own part."""
+    patch.setattr(torch.nn, "BatchNorm2d", lambda channels: torch.nn.GroupNorm(1, channels))
+
+
+def one_of_two(index: int, port: int, folder: Path) -> None:
+    """All that the tests ask of two processes, in one of them."""
+    os.environ |= {"WORLD_SIZE": "2", "RANK": str(index), "LOCAL_RANK": str(index)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    with pytest.MonkeyPatch.context() as patch, process_group():
+        group_norms(patch)
+        run_from_file(folder / "config.yaml", folder / "two")
+        random_arm(folder / f"random_{index}.pt")
+        folder_arm(folder / f"folder_{index}.pt")
+        run_until_a_signal(folder / "config.yaml", folder / "mixed")
+
+
+def run_from_file(config: Path, folder: Path) -> None:
+    settings = read_settings(ExperimentSettings, OmegaConf.load(config))
+    completed_run(settings, folder)
+
+
+def random_arm(file: Path) -> None:
+    """Write the images, the diagnostics and how many images this process renders beside those that it shows."""
+    meshes, count = [("solid:table", 0), ("solid:plate", 1)], []
+    with pytest.MonkeyPatch.context() as patch:
+        render = Scene.render
+        patch.setattr(Scene, "render", lambda self, *args: (count.append(len(args[1])), render(self, *args))[1])
+        settings = AugmentationSettings(arm="random")
+        service = AugmentationService.from_meshes(meshes, 8, settings, views=3, samples=1, rasterizer="numpy")
+        service.rank, service.world_size = distributed.rank(), distributed.world_size()
+        torch.manual_seed(0)
+        made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0)
+    torch.save((made.images, made.diagnostics, count[0]), file)
+
+
+def folder_arm(file: Path) -> None:
+    torch.manual_seed(0)
+    images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
+    settings = AugmentationSettings(arm="folder", folder="unread", examples=5)
+    process = (), distributed.rank(), distributed.world_size()
+    service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
+    made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
+    torch.save((made.images, made.labels, torch.tensor(made.diagnostics["attack_success"])), file)
+
+
+def run_until_a_signal(config: Path, folder: Path) -> None:
+    """The second process alone gets it, in the second step of the second epoch, and both stop after the third."""
+    training_batches = loop.training_batches
+
+    def signalled(split, batch_size, seed, now, *rest):
+        for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
+            if (now.epoch, count, distributed.rank()) == (1, 2, 1):
+                signal.raise_signal(signal.SIGTERM)
+            yield batch
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "training_batches", signalled)
+        with pytest.raises(Interrupted):
+            run_from_file(config, folder)
+
+
+@pytest.fixture(scope="module")
+def runs(tiny, tmp_path_factory) -> Path:
+    """An adversarial run by one process, by two, and by two until a signal and then by one; at a learning rate so low
+    that rounding does not grow."""
+    folder = tmp_path_factory.mktemp("distributed")
+    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
+        settings = tiny("train.learning_rate=0.001", f"train.epochs={EPOCHS}", *overrides)
+        OmegaConf.save(OmegaConf.structured(settings), folder / f"{name}.yaml")
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    once_for_both = [__name__, "torch._dynamo", "torch.utils.tensorboard", "torchvision.utils"]
+    multiprocessing.set_forkserver_preload(once_for_both)
+    multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
+    state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
+    assert (state["epoch"], state["under_way"]["step"]) == (1, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        group_norms(patch)
+        run_from_file(folder / "config.yaml", folder / "one")
+        run_from_file(folder / "resume.yaml", folder / "mixed")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["two", "mixed"])
+def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
+    first, other = (checkpoint.load(runs / folder / checkpoint.LAST) for folder in ("one", name))
+    torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32
+    torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
+    for epoch in range(1, EPOCHS + 1):
+        grids = [np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png")) for folder in ("one", name)]
+        np.testing.assert_allclose(*(grid.astype(int) for grid in grids), atol=1)  # of 255, where rounding decides
+    expected, lines = (read_metrics(runs / folder) for folder in ("one", name))
+    assert [line.get("epoch") for line in lines] == [*range(1, EPOCHS + 1), None]
+    for one, line in zip(expected, lines, strict=True):
+        for key in (key for key in one if not key.startswith("seconds/")):
+            assert line[key] == pytest.approx(one[key], rel=1e-3), key
+    assert all(line["augment/light_change"] > 0 for line in expected[:-1])
+    files = [
+        {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name} for folder in ("one", name)
+    ]
+    assert files[0] == files[1]
+    assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
+
+
+def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one_as_of_a_folder(runs):
+    random_arm(runs / "random.pt")
+    images, diagnostics, count = torch.load(runs / "random.pt")
+    assert count == len(images) == 30
+    for index in range(2):
+        shared, described, part = torch.load(runs / f"random_{index}.pt")
+        torch.testing.assert_close(shared, images, rtol=0, atol=1e-6)
+        assert part == 15 and described == pytest.approx(diagnostics, rel=1e-5)
+    folder_arm(runs / "folder.pt")
+    whole = torch.load(runs / "folder.pt")
+    for index in range(2):
+        assert all(map(torch.equal, torch.load(runs / f"folder_{index}.pt"), whole))
+
+
+@pytest.mark.slow
+def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
+    """The command of the README; the second call goes on where SIGTERM stopped the first."""
+    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]
+    data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
+    overrides = [*small, *data, "train.device=cpu", "train.epochs=20", "train.checkpoint_every=1000"]
+    start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen([*start, *overrides], cwd=tmp_path, env=environment, **pipes) as first:
+        for line in first.stdout:
+            if line.startswith("epoch 1/"):
+                first.terminate()
+                break
+        (advice,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
+    assert first.returncode != 0
+    command = shlex.split(advice.partition("to go on: ")[2])
+    assert command[:6] == start and len(command) == 8
+    (folder,) = (tmp_path / "runs").glob("*/*")
+    epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]
+    assert 1 <= epochs < 20
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"after epoch {epochs}" in done.stdout and done.stdout.count("| adversarial") == 1
+    assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, 21), None]
+
+
+@pytest.mark.parametrize(
+    "ended, expected", [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)]
+)
+def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
+    """It ends the run where it is asked for, or else where the block ends; the handlers are those of before."""
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    with pytest.raises(expected) as stopped, Interruption() as interruption:
+        assert not interruption.requested()
+        signal.raise_signal(signal.SIGINT)
+        if ended == "by an error":
+            raise ZeroDivisionError
+        if ended == "asked":
+            assert interruption.requested()
+            interruption.stop()
+    assert ended != "asked" or stopped.value.code == 128 + signal.SIGINT
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)] == before
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as interruption:
+            signal.raise_signal(signal.SIGINT)
+            assert not interruption.requested()
+    finally:
+        signal.signal(signal.SIGINT, before)

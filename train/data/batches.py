@@ -1,0 +1,276 @@
+"""The training batches of an epoch.
+
+An epoch has one or more rounds. A round shows some of the data and all of its renders, shuffled,
+shifted and flipped.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from augment import distributed
+from augment.random_streams import generator
+from train.data.images import ImageFiles
+from train.data.sets import Split
+
+# Images of up to 64 pixels per side are shifted by up to this many pixels. Larger images are
+# shifted by up to a sixteenth of their side.
+PADDING = 4
+# The bytes of the batches that are shifted and flipped at a time.
+CHUNK_BYTES = 2**24
+
+# Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
+Batch = tuple[Tensor, Tensor, Tensor]
+
+
+class TrainingImages(NamedTuple):
+    """The images that a round draws from. It numbers the data first, and the renders after them.
+
+    Attributes:
+        split: The images, of which no copy is made.
+        rows: The rows of the split that are trained on, shape (N,).
+        renders: The renders.
+    """
+
+    split: Split
+    rows: Tensor
+    renders: Split
+
+
+class Round(NamedTuple):
+    """The training between two regenerations of the renders: an epoch, or a part of one.
+
+    Attributes:
+        number: The number of the round in the run, from 0.
+        epoch: The number of its epoch, from 0.
+        rows: The numbers of the images that it shows, ascending, int64, shape (N,).
+    """
+
+    number: int
+    epoch: int
+    rows: Tensor
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What is drawn for the images of a round. The draws are the same on every device.
+
+    The last dimensions are the batches and the images of a batch, or the images of all batches.
+
+    Attributes:
+        order: The number of each image.
+        shifts: The rows and columns by which it is shifted; the first dimension has both.
+        flips: Whether it is flipped.
+        seeds: The seed of its random crop, if the images are read from files.
+    """
+
+    order: Tensor
+    shifts: Tensor
+    flips: Tensor
+    seeds: Tensor | None = None
+
+    def of_columns(self, first: int, columns: slice) -> "Draws":
+        """Return the draws of some columns of all batches from the first one on."""
+        return Draws(
+            self.order[first:, columns],
+            self.shifts[:, first:, columns],
+            self.flips[first:, columns],
+            None if self.seeds is None else self.seeds[first:, columns],
+        )
+
+
+def rounds_of_epoch(
+    images: int,
+    renders: int,
+    seed: int,
+    epoch: int,
+    images_per_epoch: int | None,
+    every: int | None,
+) -> list[Round]:
+    """Divide an epoch into rounds. Each round shows all renders.
+
+    Args:
+        images: The number of training images.
+        renders: The number of renders.
+        seed: The seed of the run.
+        epoch: The epoch, from 0.
+        images_per_epoch: The number of images that an epoch shows. They are drawn anew for each
+            epoch. None shows all.
+        every: The number of images that a round shows. None makes one round.
+
+    Returns:
+        The rounds.
+    """
+    draws = generator(seed, epoch, "rounds")
+    drawn = torch.randperm(images, generator=draws)[:images_per_epoch]
+    numbers_of_renders = torch.arange(images, images + renders)
+    parts = drawn.split(every or len(drawn))
+    rounds = []
+    for index, part in enumerate(parts):
+        rows = torch.cat([part.sort().values, numbers_of_renders])
+        rounds.append(Round(epoch * len(parts) + index, epoch, rows))
+    return rounds
+
+
+def training_batches(
+    images: TrainingImages,
+    batch_size: int,
+    seed: int,
+    now: Round,
+    flips: str = "random",
+    first: int = 0,
+) -> Iterator[Batch]:
+    """Give this process's part of each batch of a round.
+
+    All batches have one size. The last one is filled up with the first images of the round. All
+    draws are made on the CPU. They are the same for every device and number of processes.
+
+    Args:
+        images: The data and the renders.
+        batch_size: The number of images of a batch, in all processes.
+        seed: The seed of the run.
+        now: The round.
+        flips: "random" flips half of the images. "alternating" flips each image in every other
+            epoch.
+        first: The batch to begin with.
+
+    Yields:
+        The images, uint8, shape (B, 3, H, W), their labels (B,), and which are renders (B,).
+    """
+    draws = _draw(images, batch_size, seed, now, flips)
+    share = batch_size // distributed.world_size()
+    begin = distributed.rank() * share
+    draws = draws.of_columns(first, slice(begin, begin + share))
+    if isinstance(images.split.images, ImageFiles):
+        return _batches_from_files(images, images.split.images, draws)
+    return _batches_in_memory(images, share, draws)
+
+
+def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips: str) -> Draws:
+    """Draw the order, the shifts, the flips and the crops of a round, a row for each batch."""
+    shown = len(now.rows)
+    batches = math.ceil(shown / batch_size)
+    shuffled = now.rows[torch.randperm(shown, generator=generator(seed, now.number, "batches"))]
+    filled_up = torch.arange(batches * batch_size) % shown
+    order = shuffled[filled_up].view(-1, batch_size)
+
+    most = max(PADDING, images.split.images.shape[-1] // 16)
+    draws = generator(seed, now.number, "shifts")
+    shifts = torch.randint(-most, most + 1, (2, *order.shape), generator=draws)
+    if flips == "random":
+        draws = generator(seed, now.number, "flips")
+        is_flipped = torch.randint(0, 2, order.shape, generator=draws, dtype=torch.bool)
+    else:
+        count = len(images.rows) + len(images.renders)
+        draws = generator(seed, "flips")
+        by_image = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
+        is_flipped = by_image[order] ^ bool(now.epoch % 2)
+    seeds = None
+    if isinstance(images.split.images, ImageFiles):
+        seeds = torch.randint(2**62, order.shape, generator=generator(seed, now.number, "crops"))
+    return Draws(order, shifts, is_flipped, seeds)
+
+
+def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iterator[Batch]:
+    """Give the batches of images that lie in memory. Several batches are made at a time."""
+    split, rows, renders = images
+    pixels = cast(Tensor, split.images)
+    device = pixels.device
+    at_once = share * max(1, CHUNK_BYTES // (share * pixels[0].numel()))
+
+    # Everything is sent to the device at once, so that no batch waits for it.
+    order = draws.order.flatten()
+    is_render_on_cpu = order >= len(rows)
+    parts = [slice(begin, begin + at_once) for begin in range(0, len(order), at_once)]
+    places_of_renders = [is_render_on_cpu[part].nonzero().squeeze(1).to(device) for part in parts]
+    row_of_image = rows[order.clamp(max=len(rows) - 1)].to(device)
+    render_of_image = (order - len(rows)).to(device)
+    shifts = draws.shifts.flatten(1).to(device)
+    flips = draws.flips.flatten().to(device)
+    is_render = is_render_on_cpu.to(device)
+
+    for part, places in zip(parts, places_of_renders, strict=True):
+        chosen = row_of_image[part]
+        shown = crop_and_flip(pixels, chosen, shifts[:, part], flips[part])
+        labels = split.labels[chosen]
+        if len(places):
+            number = render_of_image[part][places]
+            shown[places] = crop_and_flip(
+                cast(Tensor, renders.images),
+                number,
+                shifts[:, part][:, places],
+                flips[part][places],
+            )
+            labels[places] = renders.labels[number]
+        yield from zip(shown.split(share), labels.split(share), is_render[part].split(share), strict=True)
+
+
+def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
+    """Give the batches of images that are read from files, in random crops.
+
+    The crops are flipped at random when they are read. Renders are shifted and flipped here.
+    """
+    split, rows, renders = images
+    device = split.labels.device
+    seeds = cast(Tensor, draws.seeds)
+    is_render_in_batch = [order >= len(rows) for order in draws.order]
+    rows_of_batch = []
+    seeds_of_batch = []
+    for order, is_render, seed in zip(draws.order, is_render_in_batch, seeds, strict=True):
+        rows_of_batch.append(rows[order[~is_render]])
+        seeds_of_batch.append(seed[~is_render])
+
+    crops_of_batch = files.crops(rows_of_batch, seeds_of_batch)
+    for index, crops in enumerate(crops_of_batch):
+        order = draws.order[index]
+        is_render = is_render_in_batch[index]
+        pixels = torch.empty(len(order), *files.shape[1:], dtype=torch.uint8, device=device)
+        labels = torch.empty(len(order), dtype=torch.int64, device=device)
+        pixels[~is_render] = crops.to(device)
+        labels[~is_render] = split.labels[rows_of_batch[index].to(device)]
+        if is_render.any():
+            number = (order[is_render] - len(rows)).to(device)
+            pixels[is_render] = crop_and_flip(
+                cast(Tensor, renders.images),
+                number,
+                draws.shifts[:, index, is_render].to(device),
+                draws.flips[index, is_render].to(device),
+            )
+            labels[is_render] = renders.labels[number]
+        yield pixels, labels, is_render.to(device)
+
+
+def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
+    """Shift some images, mirrored at the border, and flip some of these.
+
+    Args:
+        images: The images, shape (N, 3, H, W).
+        chosen: The rows of the images to take, shape (B,).
+        shifts: The pixels by which each is shifted, rows and columns, shape (2, B).
+        flips: Whether each is flipped left to right, bool, shape (B,).
+
+    Returns:
+        The images, shape (B, 3, H, W).
+    """
+    height, width = images.shape[2:]
+    device = images.device
+    rows = _reflect(torch.arange(height, device=device) + shifts[0, :, None], height)
+    columns = torch.arange(width, device=device).expand(len(chosen), -1)
+    columns = torch.where(flips[:, None], columns.flip(1), columns)
+    columns = _reflect(columns + shifts[1, :, None], width)
+    channels = torch.arange(3, device=device)
+    return images[
+        chosen[:, None, None, None],
+        channels[:, None, None],
+        rows[:, None, :, None],
+        columns[:, None, None, :],
+    ]
+
+
+def _reflect(index: Tensor, size: int) -> Tensor:
+    """Mirror indices outside 0 to size - 1 at the border pixel, as torch's "reflect" does."""
+    return (size - 1) - ((size - 1) - index.abs()).abs()

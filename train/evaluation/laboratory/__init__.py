@@ -1,0 +1,1 @@
+"""Path-traced photographs of objects in light that no training shows."""

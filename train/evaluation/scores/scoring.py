@@ -1,0 +1,421 @@
+"""Scores of a model on a folder of photographs, in files and as text.
+
+`evaluate_photographs` goes through the three steps: `Predictor.predict`,
+`score` and `write`.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from augment.classifiers.adapter import Label, OperatingPoint
+from augment.progress import progress
+from renderer.errors import InputError, require_choice
+from renderer.io.files import remove_unfinished, write_whole
+from renderer.io.images import write_image
+from renderer.validation import as_folder
+from train.data.photographs import TABLE, require_outside
+from train.evaluation.scores.metrics import AT_THRESHOLD, RANKED, Metrics, Pool, Pooled, metric_title, thresholds
+from train.evaluation.scores.predictions import PREDICTIONS, FolderPredictions, Prediction, Predictor, write_predictions
+from train.evaluation.scores.sheet import contact_sheet, write_roc
+from train.evaluation.tables import Proportion, Table, format_fraction, format_interval, fraction
+from train.settings import GROUPS
+
+SUMMARY = "summary.json"
+CONTACT_SHEET = "contact_sheet.png"
+# Number of wrong classes that are named for each class, the most common ones.
+WRONG_CLASSES = 5
+# Names of the metrics that are fractions of images, as the first table shows
+# them.
+COUNTED = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
+# Words after the number of other things, if there are several labels.
+COUNTED_EACH = ", once for each of these classes"
+
+
+@dataclass(frozen=True)
+class ClassScores:
+    """Scores of the photographs of one class, in the order of summary.json.
+
+    Attributes:
+        n: Number of photographs.
+        recall: Fraction of them that are predicted as their class. It is
+            unknown if the model lacks the class.
+        top5: Fraction whose class is among the five most probable classes.
+        predicted_label: Fraction that is predicted as a class under study.
+        most_common_wrong: Number of photographs by the wrong class that they
+            are predicted as, for the most common of these classes.
+    """
+
+    n: int
+    recall: Proportion
+    top5: Proportion
+    predicted_label: Proportion
+    most_common_wrong: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of a model on a folder of photographs.
+
+    Attributes:
+        answers: Predictions that are scored.
+        pooled: Pools of these predictions.
+        points: Operating point of each label, or none.
+        overall: Metrics of all photographs. With several labels, a photograph
+            counts once for each of them.
+        by_label: Metrics of each label. Empty with a single label.
+        by_source: Metrics of each source.
+        by_mesh: Metrics of each mesh. None if they were not asked for.
+        by_class: Scores of the photographs of each class.
+    """
+
+    answers: FolderPredictions
+    pooled: Pooled
+    points: Sequence[OperatingPoint]
+    overall: Metrics
+    by_label: Mapping[str, Metrics]
+    by_source: Mapping[str, Metrics]
+    by_mesh: Mapping[str, Metrics] | None
+    by_class: Mapping[str, ClassScores]
+
+    @property
+    def label(self) -> str:
+        """Classes under study, such as "orange" or "orange or lemon"."""
+        return " or ".join(self.answers.labels)
+
+    @property
+    def point_entries(self) -> list[dict[str, Any]]:
+        """Operating points as summary.json has them.
+
+        Each says whether it was chosen on the very images that are scored.
+        """
+        images_hash = self.answers.images_hash
+        return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
+
+    def to_summary(self) -> dict[str, Any]:
+        """Convert the scores to the content of summary.json.
+
+        Returns:
+            Dictionary with these keys:
+            - label, size, images: classes under study, pixels per side, and
+              hash of the photographs;
+            - n: numbers of photographs, positives, negatives, unreadable files
+              and files that were left out;
+            - the fields of `Metrics` for all photographs;
+            - operating_point: the operating point, if there is one. It is a
+              list if there are several labels;
+            - by_label, by_source, by_mesh: fields of `Metrics` by name. The
+              first is there with several labels, the last if it was asked for;
+            - by_class: fields of `ClassScores` by class;
+            - unreadable, left_out: paths of these files.
+        """
+        answers = self.answers
+        has_several = len(answers.labels) > 1
+        summary: dict[str, Any] = {
+            "label": answers.labels if has_several else answers.labels[0],
+            "size": answers.size,
+            "images": answers.images_hash,
+        }
+        summary |= self.overall.to_summary()
+        summary["n"] = {
+            "photographs": len(answers.photographs),
+            "positives": len(self.pooled.all.positives),
+            "negatives": len(self.pooled.all.negatives),
+            "unreadable": len(answers.unreadable),
+            "left_out": len(answers.left_out),
+        }
+        if self.points:
+            entries = self.point_entries
+            summary["operating_point"] = entries if has_several else entries[0]
+        if has_several:
+            summary["by_label"] = _entries(self.by_label)
+        summary["by_source"] = _entries(self.by_source)
+        if self.by_mesh is not None:
+            summary["by_mesh"] = _entries(self.by_mesh)
+        summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
+        summary["unreadable"] = answers.unreadable
+        summary["left_out"] = answers.left_out
+        return summary
+
+
+def _entries(metrics_by_name: Mapping[str, Metrics]) -> dict[str, dict[str, Any]]:
+    """Convert metrics by name to entries of summary.json."""
+    return {name: metrics.to_summary() for name, metrics in metrics_by_name.items()}
+
+
+def evaluate_photographs(
+    predictor: Predictor,
+    folder: Path,
+    label: Label,
+    out: Path,
+    skip_unreadable: bool = False,
+) -> Scores:
+    """Score a model on every photograph of a folder, and write the scores.
+
+    Args:
+        predictor: Model that is scored.
+        folder: Folder of photographs, as `find_photographs` takes it.
+        label: Class under study, or several.
+        out: Folder that `write` writes to. It must lie outside `folder`.
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+            Otherwise they are an error.
+
+    Returns:
+        Scores, with intervals.
+
+    Raises:
+        InputError: As of `Predictor.predict`, and if `out` is inside `folder`.
+    """
+    folder = as_folder("folder", folder)
+    out = as_folder("out", out)
+    require_outside(out, folder)
+    answers = predictor.predict(folder, label, skip_unreadable)
+    scores = score(answers)
+    write(scores, out)
+    return scores
+
+
+def score(
+    answers: FolderPredictions, by: str = "source", points: Sequence[OperatingPoint] = ()
+) -> Scores:
+    """Score predictions for photographs.
+
+    Fractions have 95% Wilson intervals. The AUC and the recall at a
+    false-positive rate have bootstrap intervals over images and, where
+    photos.csv names them, over objects.
+
+    Args:
+        answers: Predictions for the photographs of a folder.
+        by: "mesh" to score each mesh, too. Otherwise "source".
+        points: Operating point of each label, or none.
+
+    Returns:
+        Scores of all photographs, and of each label, source, mesh and class.
+
+    Raises:
+        InputError: If `by` is neither, or if it is "mesh" and no mesh is known.
+    """
+    require_choice("by", by, GROUPS)
+    if by == "mesh" and not any(item.photograph.mesh for item in answers.predictions):
+        problem = f"by=mesh: {answers.folder} has no {TABLE} with a column mesh"
+        raise InputError(f"{problem}: leave it out")
+    limits = {point.label: point.threshold for point in points}
+    pooled = Pooled(answers.predictions, thresholds=limits)
+    has_several = len(answers.labels) > 1
+    return Scores(
+        answers=answers,
+        pooled=pooled,
+        points=points,
+        overall=pooled.all.metrics,
+        by_label=_metrics_of(pooled.by_label) if has_several else {},
+        by_source=_metrics_of(pooled.by_source),
+        by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
+        by_class=_score_classes(answers),
+    )
+
+
+def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
+    """Compute the metrics of pools, which takes a while for the intervals."""
+    return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
+
+
+def _score_classes(answers: FolderPredictions) -> dict[str, ClassScores]:
+    """Score the photographs of each class that the folder has."""
+    by_class: dict[str, list[Prediction]] = {}
+    for prediction in answers.photographs:
+        by_class.setdefault(prediction.photograph.label, []).append(prediction)
+    return {name: _score_class(by_class[name], answers.labels) for name in sorted(by_class)}
+
+
+def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
+    """Score the photographs of one class."""
+    # The rank is None if the model lacks the class.
+    ranks = [item.true_rank for item in predictions if item.true_rank is not None]
+    wrong = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
+    predicted_label = [item.predicted in labels for item in predictions]
+    return ClassScores(
+        n=len(predictions),
+        recall=fraction(ranks.count(1), len(ranks)),
+        top5=fraction(sum(rank <= 5 for rank in ranks), len(ranks)),
+        predicted_label=fraction(sum(predicted_label), len(predictions)),
+        most_common_wrong=dict(wrong.most_common(WRONG_CLASSES)),
+    )
+
+
+def write(scores: Scores, out: Path) -> None:
+    """Write scores into a folder.
+
+    The files are summary.json; predictions.csv, with a row per photograph;
+    contact_sheet.png; and roc.csv and roc.png with the ROC curves of all images
+    and of each label or, with one label, each source.
+
+    Args:
+        scores: Scores of a model on photographs.
+        out: Folder, which is made if it does not exist.
+    """
+    answers = scores.answers
+    out.mkdir(parents=True, exist_ok=True)
+    remove_unfinished(out)
+    write_predictions(out / PREDICTIONS, answers.predictions)
+    text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(out / SUMMARY, text + "\n")
+    write_image(out / CONTACT_SHEET, contact_sheet(answers.predictions, answers.images))
+    pooled = scores.pooled
+    groups = pooled.by_label if len(answers.labels) > 1 else pooled.by_source
+    curves = {name: pool.scores for name, pool in groups.items()}
+    write_roc(out, pooled.all.scores, curves, scores.label)
+
+
+def choose_operating_points(
+    predictor: Predictor,
+    folder: Path,
+    label: Label,
+    rate: float,
+    skip_unreadable: bool = False,
+) -> list[OperatingPoint]:
+    """Choose a threshold on the log-odds of each label for a false-positive rate.
+
+    It is the lowest log-odds of an image of other things that at most this
+    fraction of these images exceed. An image that ties with it does not exceed
+    it.
+
+    Args:
+        predictor: Model whose threshold is chosen.
+        folder: Folder of photographs, as `find_photographs` takes it.
+        label: Class under study, or several.
+        rate: False-positive rate, in (0, 1).
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+
+    Returns:
+        Operating point of each label.
+
+    Raises:
+        InputError: As of `Predictor.predict`, and if the folder has fewer than
+            1 / rate images of other things.
+    """
+    answers = predictor.predict(folder, label, skip_unreadable)
+    exact_rate = Fraction(str(rate))
+    points = []
+    for name in answers.labels:
+        log_odds = np.array(
+            [
+                item.log_odds
+                for item in answers.predictions
+                if item.label == name and not item.positive
+            ]
+        )
+        count = len(log_odds)
+        if count * exact_rate < 1:
+            fault = f"calibrate={folder} has {count} images of other things than {name}"
+            least = math.ceil(1 / exact_rate)
+            raise InputError(f"{fault}: give at least {least} for false_positive_rate={rate}")
+        (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
+        points.append(
+            OperatingPoint(
+                label=name,
+                threshold=float(threshold),
+                false_positive_rate=rate,
+                folder=folder.resolve().name,
+                images=answers.images_hash,
+                negatives=count,
+            )
+        )
+    return points
+
+
+def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Those of a summary: one, or one of each of several labels, or none."""
+    chosen = summary.get("operating_point", [])
+    return chosen if isinstance(chosen, list) else [chosen]
+
+
+def describe_point(point: Mapping[str, Any]) -> str:
+    """How the `operating_point` of a summary was chosen."""
+    others = f"{point['folder']}, {point['negatives']} others"
+    where = "these very images, in-sample" if point.get("in_sample") else others
+    return f"{point['false_positive_rate']:.1%} FPR on {where}"
+
+
+def format_scores(scores: Scores) -> str:
+    """Write scores as Markdown tables, by mesh or by source.
+
+    Args:
+        scores: Scores of a model on photographs.
+
+    Returns:
+        Paragraphs without a newline at the end.
+    """
+    positives = len(scores.pooled.all.positives)
+    negatives = len(scores.pooled.all.negatives)
+    each = COUNTED_EACH if scores.by_label else ""
+    paragraphs = [
+        f"{positives} images of {scores.label}, {negatives} of other things{each}",
+        str(_counted_table(scores)),
+        str(_ranked_table(scores)),
+        str(_class_table(scores)),
+        *_notes(scores),
+    ]
+    return "\n\n".join(paragraphs)
+
+
+def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
+    """Name the metrics that tables show: of all images, each label, and each mesh or source."""
+    yield "all", scores.overall
+    yield from scores.by_label.items()
+    groups = scores.by_source if scores.by_mesh is None else scores.by_mesh
+    yield from groups.items()
+
+
+def _counted_table(scores: Scores) -> Table:
+    """Make the table of the metrics that are fractions of images."""
+    counted = [name for name in COUNTED if scores.overall.find(name) is not None]
+    rows = []
+    for title, metrics in _rows_of(scores):
+        proportions: list[Proportion] = [getattr(metrics, name) for name in counted]
+        rows.append([title, *map(format_fraction, proportions)])
+    return Table("95 % intervals over images", ["", *map(metric_title, counted)], rows)
+
+
+def _ranked_table(scores: Scores) -> Table:
+    """Make the table of the metrics that rank images, with what their intervals are over."""
+    auc = scores.overall.auc
+    resampled = "images"
+    if auc.has_repeated_objects:
+        counts = f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} others"
+        resampled = f"objects and images ({counts})"
+    rows = []
+    for title, metrics in _rows_of(scores):
+        rows.append([title, *(format_interval(metrics.find(name)) for name in RANKED)])
+    return Table(f"95 % intervals over {resampled}", ["", *map(metric_title, RANKED)], rows)
+
+
+def _class_table(scores: Scores) -> Table:
+    """Make the table of the photographs of each class."""
+    header = ["class", "recall", "top-5", f"predicted {scores.label}", "most common wrong classes"]
+    rows = []
+    for name, part in scores.by_class.items():
+        proportions = (part.recall, part.top5, part.predicted_label)
+        wrong = ", ".join(f"{other} {count}" for other, count in part.most_common_wrong.items())
+        rows.append([name, *map(format_fraction, proportions), wrong])
+    return Table("", header, rows)
+
+
+def _notes(scores: Scores) -> Iterator[str]:
+    """Say how thresholds were chosen, and which files were not scored."""
+    for point in scores.point_entries:
+        label = f" of {point['label']}" if scores.by_label else ""
+        threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"
+        yield f"{threshold}, chosen for {describe_point(point)}"
+    unreadable = scores.answers.unreadable
+    if unreadable:
+        yield f"{len(unreadable)} unreadable: {', '.join(unreadable)}"
+    files = scores.answers.left_out
+    if files:
+        yield f"{len(files)} left out, of kinds that are not read, like {files[0]}"

@@ -1,0 +1,228 @@
+"""The images of an evaluation: a contact sheet of photographs with their predictions, and ROC curves."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+
+from renderer.io.files import write_whole
+from renderer.io.tiles import PAPER, Tile, draw_grid
+from train.evaluation.scores.metrics import RATES, auc_and_recalls, roc_curve
+from train.evaluation.scores.predictions import Prediction, by_label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ROC_TABLE = "roc.csv"
+ROC_FIGURE = "roc.png"
+# The images that a section shows, at most, and the images in a row.
+PER_SECTION = 40
+COLUMNS = 10
+# Pixels: the side of an enlarged image, and the width of its frame.
+IMAGE = 96
+FRAME = 4
+# Characters of a caption, at most.
+LONGEST_CAPTION = 18
+LEGEND = (
+    "Under each image: the predicted class and its probability; "
+    "in gray, where that is wrong, the true class"
+)
+# Colors of the frames.
+GREEN = "#2e9e5b"
+RED = "#d03b3b"
+YELLOW = "#e8a317"
+
+Item = TypeVar("Item")
+# The scores of the positives and of the negatives.
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Section:
+    """Images of one kind, by falling probability.
+
+    Attributes:
+        name: The kind, such as "true positives".
+        color: The color of the frames.
+        shown: The predictions and their images.
+        total: The number of images that the kind is a part of.
+    """
+
+    name: str
+    color: str
+    shown: list[tuple[Prediction, torch.Tensor]]
+    total: int
+
+
+def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
+    """Draw what is right and wrong about each class under study.
+
+    True positives, false negatives and false positives have a section each, with up to
+    PER_SECTION images that are evenly spread by probability.
+
+    Args:
+        predictions: The predictions, about the first class for all images, then about the next.
+        images: The images, uint8 sRGB, shape (N, 3, H, W). They are enlarged without smoothing,
+            so that one sees the pixels that the classifier saw.
+
+    Returns:
+        The sheet.
+    """
+    grids = [draw_grid([], heading=LEGEND)]
+    for label, items in by_label(predictions).items():
+        for section in _sections(label, items, images):
+            grids.append(_section_grid(label, section))
+    width = max(grid.width for grid in grids)
+    sheet = Image.new("RGB", (width, sum(grid.height for grid in grids)), PAPER)
+    top = 0
+    for grid in grids:
+        sheet.paste(grid, (0, top))
+        top += grid.height
+    return sheet
+
+
+def _sections(
+    label: str, predictions: Sequence[Prediction], images: torch.Tensor
+) -> list[_Section]:
+    """Divide the predictions about a class into the sections of the contact sheet."""
+    pairs = sorted(zip(predictions, images, strict=True), key=lambda pair: -pair[0].probability)
+    positives = [pair for pair in pairs if pair[0].positive]
+    negatives = [pair for pair in pairs if not pair[0].positive]
+    found = [pair for pair in positives if pair[0].predicted == label]
+    missed = [pair for pair in positives if pair[0].predicted != label]
+    mistaken = [pair for pair in negatives if pair[0].predicted == label]
+    return [
+        _Section("true positives", GREEN, found, len(positives)),
+        _Section("false negatives", RED, missed, len(positives)),
+        _Section("false positives", YELLOW, mistaken, len(negatives)),
+    ]
+
+
+def _section_grid(label: str, section: _Section) -> Image.Image:
+    """Draw a section under its heading."""
+    count = len(section.shown)
+    heading = f"{label}: {count} {section.name} of {section.total}"
+    if count > PER_SECTION:
+        heading += f" ({PER_SECTION} shown, evenly by probability)"
+    tiles = [
+        _tile(prediction, image, section.color)
+        for prediction, image in evenly(section.shown, PER_SECTION)
+    ]
+    rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
+    return draw_grid(rows, heading=heading)
+
+
+def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
+    """Choose items at equal distances, the first and the last among them.
+
+    Args:
+        ordered: The items.
+        count: The number of items to choose.
+
+    Returns:
+        The chosen items; all items if there are no more.
+    """
+    places = np.linspace(0, len(ordered) - 1, min(count, len(ordered)))
+    return [ordered[index] for index in places.round().astype(int)]
+
+
+def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
+    """Frame an image over the predicted class and, if that is wrong, the true class."""
+    pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
+    enlarged = pixels.resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
+    lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
+    if prediction.true_rank != 1:
+        label = prediction.photograph.label
+        probability = prediction.true_probability
+        lines.append(label if probability is None else f"{probability:.0%} {label}")
+    captions = tuple(_shortened(line) for line in lines)
+    return Tile(np.asarray(ImageOps.expand(enlarged, FRAME, color)), captions)
+
+
+def _shortened(caption: str) -> str:
+    """Cut a caption that is too long."""
+    if len(caption) <= LONGEST_CAPTION:
+        return caption
+    return f"{caption[: LONGEST_CAPTION - 1]}…"
+
+
+def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
+    """Write ROC curves as a table, roc.csv, and as a figure, roc.png.
+
+    A curve is left out if it lacks positives or negatives.
+
+    Args:
+        folder: Folder that the files are written to.
+        overall: Scores of the positives and of the negatives among all images.
+        by_name: Such scores of each source or each label. The table has a row
+            for each point of their curves, after those of all images, whose
+            name is empty.
+        label: Classes under study, as axes name them.
+    """
+    from matplotlib.figure import Figure  # half a second
+
+    known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
+    has_overall = all(map(len, overall))
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["source", "false_positive_rate", "recall", "threshold"])
+    if has_overall:
+        writer.writerows(_curve_rows("", overall))
+    for name, pair in known.items():
+        writer.writerows(_curve_rows(name, pair))
+    write_whole(folder / ROC_TABLE, table.getvalue())
+
+    figure = Figure(figsize=(7, 7), layout="constrained")
+    axes = figure.subplots()
+    curves = {"all": [overall]} if has_overall else {}
+    curves |= {name: [pair] for name, pair in known.items()}
+    bold = {"all": {"color": "black", "linewidth": 2.5, "zorder": 3}}
+    draw_roc(axes, curves, label, bold)
+    axes.set_aspect("equal")
+    if curves:
+        axes.legend(loc="lower right")
+    image = io.BytesIO()
+    figure.savefig(image)
+    write_whole(folder / ROC_FIGURE, image.getbuffer())
+
+
+def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
+    """Return a row of roc.csv for each point of a curve."""
+    points = zip(*roc_curve(*pair), strict=True)
+    return [(name, *map(float, point)) for point in points]
+
+
+def draw_roc(
+    axes: "Axes",
+    scores: Mapping[str, Sequence[Pair]],
+    label: str,
+    styles: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Draw ROC curves with their mean AUC, and a line at each of RATES.
+
+    Args:
+        axes: The axes to draw on.
+        scores: The scores of positives and negatives by name. A name has several pairs if it has
+            several seeds.
+        label: The classes under study, as the axes name them.
+        styles: matplotlib's keywords for the lines of a name.
+    """
+    # A classifier that guesses has this line.
+    axes.axline((0, 0), slope=1, color="0.6", linewidth=1)
+    for rate in map(float, RATES):
+        axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
+    for name, pairs in scores.items():
+        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
+        for number, pair in enumerate(pairs):
+            rates, recalls, _ = roc_curve(*pair)
+            title = None if number else f"{name}: AUC {np.mean(areas):.3f}"
+            axes.plot(rates, recalls, label=title, **styles.get(name, {}))
+    axes.set(
+        xlabel="false positive rate", ylabel=f"recall of {label}", xlim=(-0.01, 1), ylim=(0, 1.01)
+    )

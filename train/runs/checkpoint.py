@@ -1,0 +1,160 @@
+"""Checkpoints. They are written atomically with a hash of their content, and read without pickle.
+
+A file holds a dictionary of plain values and tensors. best.pt has `model` (the network's state
+dict), `architecture` (what rebuilds the network, see `train.networks.describe`) and `epoch`.
+last.pt has all of `train.training.loop.Trainer.state_dict`.
+"""
+
+import hashlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, cuda
+
+from renderer.errors import InputError, require_file
+from renderer.io.files import write_whole
+
+LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
+HASH = "sha256"
+# The version of the stored architecture. Version 1 had no size, normalization and encoding.
+VERSION = 2
+
+
+def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
+    """Write a checkpoint with `write_whole`.
+
+    Args:
+        path: The file.
+        state: Tensors and plain values.
+        previous: Where the file that is replaced is kept; None for nowhere.
+    """
+    content = io.BytesIO()
+    torch.save({**state, HASH: content_hash(state)}, content)
+    write_whole(path, content.getbuffer(), durable=True, previous=previous)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The state that `save` wrote, on the CPU.
+
+    Raises:
+        InputError: The file is missing, damaged or not a checkpoint.
+    """
+    require_file(path, "give a run folder that holds a checkpoint")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict) or state.pop(HASH, None) != content_hash(state):
+            raise ValueError("its content does not match its hash")
+    except Exception as error:  # torch raises many types for a damaged or foreign file.
+        problem = f"checkpoint {path} is damaged or not a checkpoint"
+        raise InputError(f"{problem}; use another one of the run") from error
+    return checked(state, path)
+
+
+def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Check that a state can be used.
+
+    Args:
+        state: The state.
+        path: The file that an error names.
+
+    Returns:
+        The same state.
+
+    Raises:
+        InputError: It lacks finite weights or an architecture, or comes from a later version.
+    """
+    try:
+        version = state["architecture"].get("version", 1)
+        finite = all(value.isfinite().all() for value in state["model"].values())
+    except (LookupError, AttributeError) as error:
+        raise InputError(f"checkpoint {path} has no architecture or weights: use another one") from error
+    if version not in range(VERSION + 1):
+        problem = f"checkpoint {path} was written by a later version ({version!r})"
+        raise InputError(f"{problem}: install that version")
+    if not finite:
+        raise InputError(f"checkpoint {path} has NaN or infinity in its weights: use another one")
+    return state
+
+
+def exists(folder: Path) -> bool:
+    """Say whether a folder holds a checkpoint to resume from."""
+    return any((folder / name).exists() for name in (LAST, PREVIOUS))
+
+
+def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """Read the newest whole checkpoint of a run.
+
+    Args:
+        folder: The folder of the run.
+
+    Returns:
+        The state, and the fault of a newer file if that is damaged.
+
+    Raises:
+        InputError: There is no whole checkpoint.
+    """
+    try:
+        return load(folder / LAST), None
+    except InputError as error:
+        if not (folder / PREVIOUS).is_file():
+            raise
+        return load(folder / PREVIOUS), str(error)
+
+
+def content_hash(state: Any) -> str:
+    """Compute the SHA-256 of keys, types, shapes and values.
+
+    Args:
+        state: A tensor, a plain value, or nested mappings and sequences of these.
+
+    Returns:
+        The hash as 64 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    _update(digest, state)
+    return digest.hexdigest()
+
+
+def _update(digest: Any, value: Any) -> None:
+    """Add a value to a hash."""
+    match value:
+        case Tensor():
+            plain = value.detach().cpu().contiguous()
+            digest.update(f"{plain.dtype}{tuple(plain.shape)}".encode())
+            digest.update(plain.flatten().view(torch.uint8).numpy().data)
+        case Mapping():
+            for key, item in value.items():
+                digest.update(f"{key!r}:".encode())
+                _update(digest, item)
+        case list() | tuple():
+            digest.update(f"[{len(value)}]".encode())
+            for item in value:
+                _update(digest, item)
+        case _:
+            digest.update(f"{value!r};".encode())
+
+
+def random_state() -> dict[str, Tensor | list[Tensor]]:
+    """Return the state of the CPU's random generator and of each GPU's."""
+    states = cuda.get_rng_state_all() if cuda.is_available() else []
+    return {"cpu": torch.get_rng_state(), "cuda": states}
+
+
+def restore_random_state(state: Mapping[str, Any]) -> None:
+    """Restore random generators, on as many GPUs as both machines have.
+
+    Args:
+        state: What `random_state` returned.
+    """
+    torch.set_rng_state(state["cpu"])
+    for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
+        cuda.set_rng_state(values, device)

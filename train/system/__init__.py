@@ -1,0 +1,1 @@
+"""The machine: devices, processes, and errors that a user can fix."""

@@ -1,0 +1,1 @@
+"""One training run: its network, its loss, its loop and its averages."""

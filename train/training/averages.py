@@ -1,0 +1,138 @@
+"""The networks that a training keeps: the one that learns, its averages, and the best so far."""
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
+
+from train.system.device import MixedPrecision
+
+
+class MovingAverage(AveragedModel):
+    """The exponential moving average of a model's weights and statistics.
+
+    It begins with those of the first update.
+
+    Args:
+        model: The model.
+        decay: The share of the average that an update keeps, at least 0 and below 1.
+    """
+
+    def __init__(self, model: nn.Module, decay: float):
+        super().__init__(model, use_buffers=True)
+        self._average = get_ema_multi_avg_fn(decay)
+
+    def update_parameters(self, model: nn.Module) -> None:
+        """Move the average towards a model.
+
+        torch's own method makes a GPU wait at every step, since it moves its counter there.
+        """
+        if self.n_averaged == 0:
+            return super().update_parameters(model)
+        averages = [*self.module.parameters(), *self.module.buffers()]
+        latest = [*model.parameters(), *model.buffers()]
+        for is_floating in (True, False):  # A call takes tensors of one type.
+            pairs = [
+                (average.detach(), value.detach())
+                for average, value in zip(averages, latest, strict=True)
+                if average.is_floating_point() == is_floating
+            ]
+            if pairs:
+                self._average([old for old, _ in pairs], [new for _, new in pairs], None)
+        self.n_averaged += 1
+
+
+class Averages:
+    """The averages of a network in training, and which network is kept.
+
+    The soup is the mean of the networks at the ends of all epochs (Wortsman et al. 2022, "Model
+    soups"). With a moving average, it is the mean of the moving averages.
+
+    Args:
+        model: The network that learns.
+        ema_decay: The decay of the moving average; 0 for none.
+        soup: Whether to take the mean over all epochs.
+        keeps_latest: Whether the latest network is kept in place of the one that validates best.
+            A soup always keeps the latest, which has all epochs in it.
+
+    Attributes:
+        selected: The network that is validated and kept: the soup, the moving average, or else
+            the network that learns.
+    """
+
+    def __init__(self, model: MixedPrecision, ema_decay: float, soup: bool, keeps_latest: bool = False):
+        self._model = model
+        self._ema: MovingAverage | None = None
+        if ema_decay:
+            self._ema = MovingAverage(model, ema_decay)
+        self._soup: AveragedModel | None = None
+        if soup:
+            self._soup = AveragedModel(model, avg_fn=get_swa_avg_fn(), use_buffers=True)
+        self._keeps_latest = soup or keeps_latest
+        self._best_accuracy = -1.0
+        average = self._soup or self._ema
+        self.selected = cast(MixedPrecision, average.module) if average else model
+
+    def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:
+        """Go back to the initial network, where each epoch of a soup begins.
+
+        Args:
+            initial: The network that the run began with, if any.
+            optimizer: The optimizer, which forgets its momentum.
+        """
+        if self._soup is None or initial is None:
+            return
+        self._model.load_state_dict(initial.state_dict())
+        optimizer.state.clear()
+        if self._ema:
+            self._ema.n_averaged.zero_()
+
+    def end_step(self) -> None:
+        """Move the moving average towards the network after a step."""
+        if self._ema:
+            self._ema.update_parameters(self._model)
+
+    def end_epoch(self) -> None:
+        """Add the network at the end of an epoch to the soup."""
+        if self._soup:
+            self._soup.update_parameters(self._ema.module if self._ema else self._model)
+
+    def is_kept(self, accuracy: float) -> bool:
+        """Say whether the selected network replaces the one that was kept before.
+
+        Args:
+            accuracy: Its accuracy on the validation images, between 0 and 1.
+
+        Returns:
+            Whether it validates better than all before, or the latest network is kept anyway.
+        """
+        is_best = accuracy > self._best_accuracy
+        self._best_accuracy = max(accuracy, self._best_accuracy)
+        return is_best or self._keeps_latest
+
+    def weights(self) -> dict[str, torch.Tensor]:
+        """Return a copy of the selected network's weights on the CPU."""
+        state = self.selected.network.state_dict()
+        return {name: value.to("cpu", copy=True) for name, value in state.items()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint needs of the averages."""
+        return {
+            "ema": self._ema.state_dict() if self._ema else None,
+            "soup": self._soup.state_dict() if self._soup else None,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any], accuracies: list[float]) -> None:
+        """Restore the averages.
+
+        Args:
+            state: What `state_dict` returned.
+            accuracies: The validation accuracies of the epochs before.
+        """
+        if self._ema:
+            self._ema.load_state_dict(state["ema"])
+        if self._soup:
+            self._soup.load_state_dict(state["soup"])
+        self._best_accuracy = max(accuracies, default=-1.0)

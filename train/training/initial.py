@@ -1,0 +1,200 @@
+"""The network that a run begins with, and the images that neither it nor the run learns from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from augment.classifiers import load_classifier
+from renderer.errors import InputError
+from train import console
+from train.data.cache import TensorCache
+from train.data.sets import HELD_OUT, DataSet
+from train.networks import CLASSIFIER, describe, is_classifier, load_selected, of_one_architecture
+from train.runs.checkpoint import content_hash
+from train.settings import WIDERESNET, ExperimentSettings
+from train.system.device import MixedPrecision
+
+# What a network has in common with one that begins with its weights.
+SHARED = ("classes", "size", "name", "depth", "width")
+# The fraction of the training images that validates, where nothing else says it.
+VALIDATION = 0.1
+
+
+@dataclass(frozen=True)
+class Initial:
+    """The network that `train.init_from` names.
+
+    Attributes:
+        source: The file of a run's network, or the name of a classifier.
+        architecture: What rebuilds the network (see `train.networks.describe`).
+        weights: Its state dict.
+    """
+
+    source: Path
+    architecture: dict[str, Any]
+    weights: dict[str, Tensor]
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of the network's classes, in the order of its outputs."""
+        return tuple(self.architecture["classes"])
+
+    @property
+    def size(self) -> int:
+        """The pixels per side of the images that the network takes."""
+        return self.architecture["size"]
+
+    @property
+    def is_classifier(self) -> bool:
+        """Whether the network is, or began as, a classifier that was trained elsewhere."""
+        return CLASSIFIER in self.architecture
+
+    @property
+    def name(self) -> str:
+        """The name by which the network is built."""
+        return self.architecture["name"]
+
+    @property
+    def validation(self) -> dict[str, Any] | None:
+        """The record of the images that the network never learned from; None if unknown."""
+        stored = self.architecture.get("validation")
+        return stored if isinstance(stored, dict) else None
+
+    def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
+        """Give a network the initial network's weights and normalization.
+
+        Args:
+            network: The network whose weights are replaced.
+            description: What rebuilds that network.
+
+        Raises:
+            InputError: The two differ in classes, image size or shape.
+        """
+        stored = {"name": WIDERESNET, **self.architecture}
+        wanted = {"name": WIDERESNET, **description}
+        for key in SHARED:
+            if key in stored and stored[key] != wanted.get(key):
+                difference = f"{key} {stored[key]}, not {wanted.get(key)}"
+                if key == "classes":
+                    difference = "other classes"
+                raise InputError(f"train.init_from={self.source} was trained with {difference}: give this run the same")
+        with of_one_architecture(self.source):
+            network.load_state_dict(self.weights)
+
+
+def load_initial(settings: ExperimentSettings) -> Initial | None:
+    """Load the network that a run's settings begin with.
+
+    Args:
+        settings: The settings of the run.
+
+    Returns:
+        The network, or None for random weights.
+
+    Raises:
+        InputError: There is no such network, or `weights` is set for a run, which has its own.
+    """
+    name = settings.train.init_from
+    if not name:
+        return None
+    if is_classifier(name):
+        return _classifier(name, settings.weights, settings.data.size)
+    if settings.weights is not None:
+        given = f"weights={settings.weights} is not for train.init_from={name}"
+        raise InputError(f"{given}, which has its own: leave it out")
+    path, state = load_selected(Path(name))
+    return Initial(path, state["architecture"], state["model"])
+
+
+def _classifier(name: str, weights: str | None, size: int | None) -> Initial:
+    """Load a classifier that was trained elsewhere, for images of its own size or another one."""
+    classifier = load_classifier(name, weights)
+    network = cast(nn.Module, classifier.function)
+    shape = {"name": name, CLASSIFIER: True}
+    architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    return Initial(Path(name), architecture, network.state_dict())
+
+
+@dataclass(frozen=True)
+class ValidationPart:
+    """The part of the training images that validates a network.
+
+    Attributes:
+        fraction: The fraction of every class's images.
+        record: What is stored beside the weights: the part that neither this network nor any
+            network before it learned from. None if that is unknown.
+    """
+
+    fraction: float
+    record: dict[str, Any] | None
+
+
+def choose_validation(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> ValidationPart:
+    """Choose the part of the training images that validates a network.
+
+    The parts of one seed are nested. The smallest part among a network and those that it began
+    with is therefore the part that none of them learned from.
+
+    Args:
+        settings: The settings of the run.
+        data: The data of the run.
+        initial: The network that the run begins with, if any.
+
+    Returns:
+        The part.
+    """
+    asked = settings.data.validation
+    fraction = asked
+    if fraction is None:
+        most = 1.0 if data.labeled else HELD_OUT / len(data.train)
+        fraction = min(VALIDATION, most)
+    own = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
+    if data.rendered:
+        own["data"] = "shapes"
+    if initial is None:
+        return ValidationPart(fraction, own)
+
+    stored = initial.validation
+    known = stored.get("fraction") if stored else None
+    if data.rendered and stored and known is not None and "data" not in stored:
+        # The initial network learned from other images than rendered ones.
+        return ValidationPart(fraction, own)
+    begun = settings.train.init_from
+    if not isinstance(known, float) or own | {"fraction": known} != stored:
+        console.info("validation: %s does not say whether it learned from these images, too", begun)
+        return ValidationPart(fraction, None)
+    if asked is None:
+        fraction = known
+    if fraction > known:
+        left_out = f"it left out only data.validation={known}"
+        console.info("validation: %s learned from part of it: %s", begun, left_out)
+    return ValidationPart(fraction, own | {"fraction": min(fraction, known)})
+
+
+class CachedModel:
+    """A model whose logits are stored on disk, so that later runs need not compute them again.
+
+    Args:
+        model: The model.
+        device: The device that computes.
+        cache: Where the logits are stored, under a hash of weights and images.
+    """
+
+    def __init__(self, model: MixedPrecision, device: torch.device, cache: TensorCache):
+        self._model = model
+        self._cache = cache
+        facts = [torch.__version__, str(model), model.precision, str(device), model.state_dict()]
+        self._key = content_hash(facts)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the logits (B, classes) of images (B, 3, size, size) in [0, 1]."""
+        key = content_hash([self._key, images])
+        stored = self._cache.read(key)
+        if stored is None:
+            stored = {"logits": self._model(images).cpu().contiguous()}
+            self._cache.write(key, stored)
+        return stored["logits"]

@@ -1,0 +1,646 @@
+"""The training loop.
+
+An epoch has one or more rounds. Each round begins with fresh renders. Validation ends an epoch,
+and so does a checkpoint. Checkpoints are also written within an epoch that takes long.
+"""
+
+import math
+import time
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from augment import distributed
+from augment.model_passes import eval_mode
+from augment.progress import announced, progress
+from augment.random_streams import stream_seed
+from augment.service import AugmentationService, Renders
+from renderer.errors import InputError, in_one_line
+from renderer.image import to_bytes, to_unit
+from train import console
+from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
+from train.data.sets import Split
+from train.runs import checkpoint
+from train.runs.checkpoint import random_state, restore_random_state
+from train.runs.run_folder import PHASES, RunLog
+from train.settings import TrainSettings
+from train.system.device import GraphedModel, MixedPrecision, compiles
+from train.system.processes import Interruption, replicated, summed
+from train.training.averages import Averages
+from train.training.baselines import Baseline
+from train.training.loss import TrainingLoss
+from train.training.recipe import build_optimizer, learning_rate
+
+# Images that are evaluated at a time.
+EVALUATION_BATCH = 512
+# Seconds between two checkpoints within an epoch, at least.
+SAVING_EVERY = 60.0
+# The largest share of an epoch's time that its checkpoints take.
+SAVING_SHARE = 0.02
+# The diagnostics of each round that metrics.jsonl shows.
+SHOWN = ("attack_success_before", "attack_success", "steps")
+
+# Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
+Batch = tuple[Tensor, Tensor, Tensor]
+
+
+@dataclass
+class EpochState:
+    """How far an epoch has come.
+
+    Attributes:
+        renders: The renders of the current round.
+        sums: Loss and correct predictions, summed over the images that this process has trained
+            on, shape (2,).
+        diagnostics: The diagnostics of the renders of each round so far.
+        step: The steps taken, in all rounds.
+    """
+
+    renders: Renders
+    sums: Tensor
+    diagnostics: list[Mapping[str, float]]
+    step: int = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return plain values and tensors, summed over all processes.
+
+        The renders are bytes, as they are when the network is trained on them.
+        """
+        return {
+            "images": to_bytes(self.renders.images),
+            "labels": self.renders.labels,
+            "diagnostics": [dict(diagnostics) for diagnostics in self.diagnostics],
+            "sums": summed(self.sums.clone()),
+            "step": self.step,
+        }
+
+
+@dataclass(frozen=True)
+class EpochPlan:
+    """What an epoch shows.
+
+    Attributes:
+        split: The images.
+        rows: The rows of the split to learn from, of which the rounds draw some.
+        rounds: The rounds.
+        steps: The number of steps of each round.
+    """
+
+    split: Split
+    rows: Tensor
+    rounds: list[Round]
+    steps: list[int]
+
+    @property
+    def total(self) -> int:
+        """The number of steps of all rounds."""
+        return sum(self.steps)
+
+
+class Trainer:
+    """One run's network, optimizer, augmentation service and folder.
+
+    `fit` trains. `resume` goes on with what the folder holds.
+
+    Args:
+        settings: How the network is trained.
+        model: The network that is trained.
+        architecture: What rebuilds the network from a checkpoint, its classes included.
+        service: What regenerates the renders.
+        folder: The folder of the run.
+        labeled: Whether the labels of the data are known.
+
+    Attributes:
+        initial: A copy of the network as the run began, if that was with another network's
+            weights. It is the teacher, and the epochs of a soup begin with it.
+        averages: The averages of the network, and which network is kept.
+        epoch: The number of epochs that have ended.
+        history: The metrics of each of these epochs.
+
+    Raises:
+        InputError: The processes cannot share a batch equally, or there are no hard negatives
+            for a ranking loss.
+    """
+
+    def __init__(
+        self,
+        settings: TrainSettings,
+        model: MixedPrecision,
+        architecture: dict[str, Any],
+        service: AugmentationService,
+        folder: Path,
+        labeled: bool = True,
+    ):
+        _require_equal_shares(settings)
+        if settings.ranking and not service.studied:
+            needed = "name some in scene.hard_negatives or augment.folder"
+            raise InputError(f"train.ranking ranks hard negatives: {needed}")
+        self.settings = settings
+        self.architecture = architecture
+        self.service = service
+        self.folder = folder
+        self.phases = service.phases
+        self.seed = service.seed
+        self.epoch = 0
+        self.history: list[dict[str, float]] = []
+
+        # The epoch that has begun.
+        self._under_way: EpochState | None = None
+        # The random state at a checkpoint within an epoch.
+        self._random_state: dict[str, Any] = {}
+        # The network that is selected, but not yet written.
+        self._best: dict[str, Any] | None = None
+        # The time at which the last checkpoint was written, or the training began.
+        self._saved_at = time.perf_counter()
+        # The seconds that the last checkpoint took.
+        self._saving_took = 0.0
+
+        self.model = model
+        self.device = next(model.parameters()).device
+        self.initial: MixedPrecision | None = None
+        if settings.init_from:
+            self.initial = deepcopy(model).eval().requires_grad_(False)
+        self.averages = Averages(
+            model,
+            settings.ema_decay,
+            settings.soup,
+            keeps_latest=not labeled,  # Agreement is best without any training.
+        )
+        self._build_step(labeled)
+
+    def _build_step(self, labeled: bool) -> None:
+        """Build what a step needs: the optimizer, the loss and the augmentation."""
+        settings = self.settings
+        studied = self.service.studied
+        # This may replace layers, so the optimizer comes after it.
+        replica = replicated(self.model)
+        with announced("loading the optimizer"):  # torch imports its compiler here: seconds.
+            self.optimizer = build_optimizer(self.model, settings)
+        is_scaled = self.model.precision == "float16"
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
+        teacher = self.initial if settings.distillation else None
+        self._loss = TrainingLoss(replica, settings, studied, teacher, labeled).compute
+        self._baseline = Baseline(settings.augmentation, self.model, self.seed, studied[1:])
+        self._attacked: nn.Module = self.model
+        self._validated: nn.Module = self.averages.selected
+        if compiles(settings.compile, self.device):
+            torch.compiler.reset()  # torch limits the graphs of all runs of a process.
+            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
+            self._attacked = GraphedModel(self.model)
+            self._validated = GraphedModel(self.averages.selected)
+
+    @property
+    def selected(self) -> MixedPrecision:
+        """The network that is validated and kept."""
+        return self.averages.selected
+
+    def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
+        """Train to the last epoch.
+
+        Afterwards best.pt holds the network that validated best. For a soup, and for data without
+        labels, it holds the last network.
+
+        Args:
+            split: The images, on the trainer's device.
+            held_out: Which of the images validate, bool on the CPU, shape (N,).
+            log: What the first process writes to; None for the others.
+
+        Raises:
+            InputError: The training diverges.
+            Interrupted: A signal ended the training, after a checkpoint.
+        """
+        train = torch.nonzero(~held_out).squeeze(1)
+        validation = torch.nonzero(held_out).squeeze(1)
+        with Interruption() as interruption:
+            while self.epoch < self.settings.epochs:
+                if self._train_epoch(split, train, interruption, log):
+                    self._end_epoch(split, validation, log)
+                is_stopping = interruption.requested()
+                is_last = self.epoch == self.settings.epochs
+                is_due = self.epoch % self.settings.checkpoint_every == 0
+                if is_stopping or is_last or (is_due and self._under_way is None):
+                    self._save()
+                if is_stopping:
+                    interruption.stop()
+
+    def _train_epoch(self, split: Split, rows: Tensor, interruption: Interruption, log: RunLog | None) -> bool:
+        """Take the epoch's remaining steps; return whether all were taken before a signal came."""
+        plan = self._plan(split, rows)
+        if self._under_way is None:
+            self._under_way = self._begin_epoch(plan, log)
+        else:
+            restore_random_state(self._random_state)
+        state = self._under_way
+        with closing(self._remaining_batches(plan, state, log)) as batches:
+            for batch in batches:
+                number = self.epoch * plan.total + state.step
+                state.sums += self._step(*batch, state.step / plan.total, number)
+                state.step += 1
+                if interruption.requested():
+                    return state.step == plan.total
+                if state.step < plan.total and self._saving_is_due():
+                    self._save()
+        return True
+
+    def _plan(self, split: Split, rows: Tensor) -> EpochPlan:
+        """Divide the epoch into rounds and steps."""
+        settings = self.settings
+        rounds = rounds_of_epoch(
+            len(rows),
+            len(self.service),
+            self.seed,
+            self.epoch,
+            settings.images_per_epoch,
+            self.service.settings.every,
+        )
+        steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
+        return EpochPlan(split, rows, rounds, steps)
+
+    def _begin_epoch(self, plan: EpochPlan, log: RunLog | None) -> EpochState:
+        """Render for the first round of an epoch."""
+        self.averages.begin_epoch(self.initial, self.optimizer)
+        renders = self._regenerate(plan.rounds[0], log)
+        return EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
+
+    def _remaining_batches(
+        self, plan: EpochPlan, state: EpochState, log: RunLog | None
+    ) -> Generator[Batch, None, None]:
+        """Give the batches that are left of an epoch, and render before each further round."""
+        current = len(state.diagnostics) - 1
+        for index in range(current, len(plan.rounds)):
+            if index == len(state.diagnostics):
+                state.renders = self._regenerate(plan.rounds[index], log)
+                state.diagnostics.append(state.renders.diagnostics)
+            with self.phases("training"):
+                renders = Split(to_bytes(state.renders.images), state.renders.labels)
+                self.model.train(not self.settings.eval_mode)
+                first = state.step - sum(plan.steps[:index])
+                batches = training_batches(
+                    TrainingImages(plan.split, plan.rows, renders),
+                    self.settings.batch_size,
+                    self.seed,
+                    plan.rounds[index],
+                    self.settings.flips,
+                    first,
+                )
+                title = f"epoch {self.epoch + 1}"
+                if len(plan.rounds) > 1:
+                    title += f", round {index + 1} of {len(plan.rounds)}"
+                yield from progress(batches, title, plan.steps[index], first)
+
+    def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
+        """Render for a round, and log a few of its attacks."""
+        torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
+        with self.phases("attack"):
+            renders = self.service.regenerate(self._attacked, now.number)
+        if log and renders.attack_examples:
+            # They are written now, since a run that resumes within the epoch makes no others.
+            with self.phases("input_output"):
+                classes = self.architecture["classes"]
+                log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
+        return renders
+
+    def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
+        """Learn from a batch.
+
+        Args:
+            images: The images, uint8, shape (B, 3, H, W).
+            labels: Their classes, shape (B,).
+            rendered: Which of them are renders, bool, shape (B,).
+            progress: The fraction of the epoch that is done.
+            number: The number of the step in the run, from 0.
+
+        Returns:
+            The sum of the losses and the number of correct predictions, shape (2,).
+        """
+        settings = self.settings
+        # Each epoch of a soup has the whole schedule.
+        done = progress if settings.soup else (self.epoch + progress) / settings.epochs
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(settings, done)
+        images = self._baseline.apply(images, labels, number)
+        self.optimizer.zero_grad(set_to_none=True)
+        sums = torch.zeros(2, device=self.device)
+        parts = zip(
+            images.chunk(settings.accumulate),
+            labels.chunk(settings.accumulate),
+            rendered.chunk(settings.accumulate),
+            strict=True,
+        )
+        for part in parts:
+            loss, hits = self._loss(*part)
+            self.scaler.scale(loss / settings.accumulate).backward()
+            count = len(part[0])
+            sums += torch.stack([loss.detach() * count, hits])
+        if settings.clip_gradient:
+            self.scaler.unscale_(self.optimizer)
+            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        self.averages.end_step()
+        return sums
+
+    def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
+        """Validate on some rows of a split, remember the best network, and log the metrics."""
+        state = cast(EpochState, self._under_way)
+        self._under_way = None
+        loss_sum, hits = summed(state.sums).tolist()
+        self.averages.end_epoch()
+        with self.phases("evaluation"):
+            validated = evaluate(self._validated, split, rows)
+        self.epoch += 1
+        self._require_finite(loss_sum + validated["loss"], self.epoch)
+        if self.averages.is_kept(validated["accuracy"]):
+            self._best = {
+                "model": self.averages.weights(),
+                **self._description(),
+                "validation_accuracy": validated["accuracy"],
+            }
+        if log and len(state.renders.labels):
+            with self.phases("input_output"):
+                log.renders(state.renders.images, self.epoch)
+
+        images = state.step * self.settings.batch_size
+        trained = {
+            "loss": loss_sum / images,
+            "accuracy": hits / images,
+            "learning_rate": self.optimizer.param_groups[0]["lr"],
+        }
+        # A run that is resumed after its last attack of the epoch has no more of that phase.
+        seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
+        metrics = epoch_metrics(trained, validated, state.diagnostics, seconds)
+        self.history.append({"epoch": self.epoch, **metrics})
+        if log:
+            log.scalars(metrics, self.epoch)
+        console.info("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
+
+    def _require_finite(self, loss: float, epoch: int) -> None:
+        """Raise InputError where the loss or a weight is NaN or infinite, before either is kept."""
+        weights = self.model.network.state_dict().values()
+        is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
+        if not (math.isfinite(loss) and is_finite):
+            settings = self.settings
+            rate = f"train.learning_rate={settings.learning_rate}"
+            decay = f"train.weight_decay={settings.weight_decay}"
+            effect = f"made the loss or weights NaN or infinite in epoch {epoch}"
+            raise InputError(f"{rate} with {decay} {effect}: set lower ones")
+
+    def _save(self) -> None:
+        """Write last.pt, keeping the one before, and best.pt if there is a better network."""
+        if self._under_way:
+            self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
+        # This follows the epoch's line of metrics, so that a resumed run never lacks the line.
+        with self.phases("input_output"):
+            state = self.state_dict()
+            best = self._best
+            self._best = None
+            if distributed.rank() > 0:
+                return
+            start = time.perf_counter()
+            if best:
+                checkpoint.save(self.folder / checkpoint.BEST, best)
+            previous = self.folder / checkpoint.PREVIOUS
+            checkpoint.save(self.folder / checkpoint.LAST, state, previous)
+            self._saved_at = time.perf_counter()
+            self._saving_took = self._saved_at - start
+
+    def _saving_is_due(self) -> bool:
+        """Say whether to write a checkpoint within the epoch.
+
+        A killed run then loses about a minute. Several processes would have to agree on the
+        moment. They write at the end of an epoch, or on a signal.
+        """
+        wait = max(SAVING_EVERY, self._saving_took / SAVING_SHARE)
+        return distributed.world_size() == 1 and time.perf_counter() - self._saved_at > wait
+
+    def _description(self) -> dict[str, Any]:
+        """Return what is stored beside the weights of a network."""
+        return {
+            "architecture": self.architecture,
+            "epoch": self.epoch,
+            "seed": self.seed,
+            "arm": self.service.settings.arm,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that a run needs to go on as if it had never ended."""
+        return {
+            **self._description(),
+            "model": self.model.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "scaler": self.scaler.state_dict(),
+            **self.averages.state_dict(),
+            "precision": self.model.precision,
+            "service": self.service.state_dict(),
+            "random_state": random_state(),
+            "under_way": self._under_way.state_dict() if self._under_way else None,
+            "history": self.history,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` gave.
+
+        Args:
+            state: The state. Anything else raises many kinds of errors.
+        """
+        self.epoch = state["epoch"]
+        self.history = state["history"]
+        accuracies = [line["validation/accuracy"] for line in self.history]
+        self.model.network.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.scaler.load_state_dict(state["scaler"])
+        self.averages.load_state_dict(state, accuracies)
+        for network in (self.model, self.initial, self.selected):
+            if network:
+                network.precision = state["precision"]
+        # Without values, the next attack begins at the scene, which settings may change.
+        if "values" in state["service"]:
+            self.service.load_state_dict(state["service"])
+        self._random_state = dict(state["random_state"])
+        if state["under_way"]:
+            self._under_way = self._restored_epoch(state["under_way"])
+
+    def _restored_epoch(self, state: Mapping[str, Any]) -> EpochState:
+        """Restore an epoch that had begun."""
+        images = to_unit(state["images"]).to(self.device)
+        labels = state["labels"].to(self.device)
+        renders = Renders(images, labels, state["diagnostics"][-1])
+        # The sums are over all processes, so that one process counts them.
+        sums = state["sums"].to(self.device) * (distributed.rank() == 0)
+        return EpochState(renders, sums, state["diagnostics"], state["step"])
+
+    def resume(self) -> None:
+        """Go on from the folder's newest whole checkpoint.
+
+        Raises:
+            InputError: The checkpoint does not belong to this run.
+        """
+        state, problem = checkpoint.load_newest(self.folder)
+        try:
+            self._require_own_architecture(state)
+            self.load_state_dict(state)
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            reason = in_one_line(error)
+            fault = f"the checkpoint in {self.folder} is not one that this run can go on from"
+            remedy = f"restore {checkpoint.LAST}, or start in another folder with run="
+            raise InputError(f"{fault} ({reason}): {remedy}") from error
+        self._require_own_best()
+        if problem:
+            console.warning("%s: going on from the one before", problem)
+            # Otherwise it would take the place of the whole one.
+            (self.folder / checkpoint.LAST).unlink(missing_ok=True)
+        steps = self._under_way.step if self._under_way else 0
+        console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
+
+    def _require_own_best(self) -> None:
+        """Raise InputError where best.pt is missing, damaged or another run's.
+
+        The scores at the end are those of its network, so this is checked before any training.
+        The file is first written at the end of an epoch.
+        """
+        if not self.epoch:
+            return
+        path = self.folder / checkpoint.BEST
+        try:
+            best = checkpoint.load(path)
+            self._require_own_architecture(best)
+            own = self._description()
+            if (best["seed"], best["arm"]) != (own["seed"], own["arm"]):
+                raise ValueError("it is of another run")
+            # The file may be newer than the checkpoint. A later network is then found again.
+            if best["epoch"] <= len(self.history):
+                line = self.history[best["epoch"] - 1]
+                if line["validation/accuracy"] != best["validation_accuracy"]:
+                    raise ValueError("its accuracy is not the one that this run had")
+        except (LookupError, TypeError, ValueError) as error:
+            fault = f"{path} is not the network that this run kept ({in_one_line(error)})"
+            remedy = f"restore {checkpoint.BEST}, or start in another folder with run="
+            raise InputError(f"{fault}: {remedy}") from error
+
+    def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
+        """Raise ValueError where a checkpoint holds another network than this run's."""
+        if self.architecture | state["architecture"] != self.architecture:
+            raise ValueError("it has another architecture or other classes")
+
+
+def _require_equal_shares(settings: TrainSettings) -> None:
+    """Raise InputError where a batch cannot be divided among processes and parts."""
+    processes = distributed.world_size()
+    if settings.batch_size % (processes * settings.accumulate):
+        divisor = f"{processes} processes × train.accumulate={settings.accumulate}"
+        raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
+
+
+def epoch_metrics(
+    trained: Mapping[str, float],
+    validated: Mapping[str, float],
+    diagnostics: list[Mapping[str, float]],
+    seconds: Mapping[str, float],
+) -> dict[str, float]:
+    """Name the metrics of an epoch as metrics.jsonl and TensorBoard have them.
+
+    Args:
+        trained: The metrics on the training images.
+        validated: The metrics on the validation images.
+        diagnostics: The diagnostics of the renders of each round.
+        seconds: The time that each phase took.
+
+    Returns:
+        The metrics by group/name. Groups are train, validation, augment (means over the rounds),
+        seconds and, with several rounds, round_1, round_2 and so on.
+    """
+    augment = {name: fmean(part[name] for part in diagnostics) for name in diagnostics[0]}
+    groups = {
+        "train": trained,
+        "validation": validated,
+        "augment": augment,
+        "seconds": seconds,
+    }
+    if len(diagnostics) > 1:
+        for number, part in enumerate(diagnostics, 1):
+            groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
+    return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+
+
+def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
+    """Write the line of an epoch for the console.
+
+    Args:
+        epoch: The epoch, from 1.
+        epochs: The number of epochs.
+        metrics: The metrics of the epoch, by the names of `epoch_metrics`.
+
+    Returns:
+        The line.
+    """
+    total = sum(metrics[f"seconds/{name}"] for name in PHASES)
+    parts = [
+        f"epoch {epoch}/{epochs}",
+        f"train loss {metrics['train/loss']:.3f} accuracy {metrics['train/accuracy']:.3f}",
+        f"validation accuracy {metrics['validation/accuracy']:.3f}",
+    ]
+    success = attack_success(metrics, "augment/")
+    if success is not None:
+        correct = 1 - metrics["augment/attack_success_before"]
+        parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
+    duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"
+    left = total * (epochs - epoch)
+    if left:
+        duration += f"; about {tqdm.format_interval(left)} left"
+    return "  ".join([*parts, duration])
+
+
+def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
+    """Compute how often an attack succeeds on examples that are correct before it.
+
+    Args:
+        diagnostics: The diagnostics of the attack.
+        prefix: What the names of the diagnostics begin with.
+
+    Returns:
+        The fraction of these examples, or None if there are none.
+    """
+    before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
+    if before == 1:
+        return None
+    return (diagnostics[f"{prefix}attack_success"] - before) / (1 - before)
+
+
+@torch.no_grad()
+def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict[str, float]:
+    """Score a network in eval mode. Each process scores a part of the images.
+
+    Args:
+        model: The network, from images in [0, 1] to logits.
+        split: The images and labels.
+        rows: The rows of the split to score, shape (N,). None for all.
+
+    Returns:
+        loss: The mean cross entropy.
+        accuracy: The fraction of images whose class is right.
+    """
+    device = split.labels.device
+    if rows is None:
+        rows = torch.arange(len(split))
+    rows = rows.to(device)
+    totals = torch.zeros(2, device=device)
+    loss_sum, hits = totals
+    batches = rows[distributed.rank() :: distributed.world_size()].split(EVALUATION_BATCH)
+    shown = progress(batches, f"{len(rows)} images")
+    with eval_mode(model):
+        for batch, images in zip(shown, split.squares(batches), strict=True):
+            logits = model(to_unit(images.to(device)))
+            labels = split.labels[batch]
+            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
+            hits += (logits.argmax(1) == labels).sum()
+    loss_sum, hits = summed(totals).tolist()
+    return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

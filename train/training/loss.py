@@ -1,0 +1,88 @@
+"""The loss that a network is trained with."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from augment.attacks.losses import divergence, is_right, label_loss, ranking_loss
+from renderer.image import to_unit
+from train.settings import TrainSettings
+
+
+class TrainingLoss:
+    """The loss of a batch of images, some of which are renders.
+
+    It is the mean of the label loss. With their weights in the settings, two terms are added: the
+    ranking loss of the classes under study, and the divergence from a teacher's predictions.
+
+    Args:
+        model: The network, from images in [0, 1] to logits.
+        settings: The settings, with the weights of the terms.
+        studied: The classes under study that are ranked against others; none without a ranking.
+        teacher: The network whose predictions are kept; None without distillation.
+        labeled: Whether the labels of the data are known. Otherwise only renders have a label
+            loss, and the teacher's answers are the labels of all other images.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        settings: TrainSettings,
+        studied: Sequence[int],
+        teacher: nn.Module | None,
+        labeled: bool = True,
+    ):
+        self._model = model
+        self._settings = settings
+        self._studied = studied
+        self._teacher = teacher
+        self._labeled = labeled
+
+    def compute(self, images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the loss of a batch.
+
+        Args:
+            images: The images, uint8, shape (B, 3, H, W).
+            labels: Their classes, shape (B,).
+            rendered: Which of them are renders, bool, shape (B,).
+
+        Returns:
+            The loss, a scalar, and the number of correct predictions.
+        """
+        settings = self._settings
+        logits = self._model(to_unit(images))
+        targets = None
+        if self._teacher is not None:
+            with torch.no_grad():
+                targets = self._teacher(to_unit(images))
+            if not self._labeled:
+                labels = torch.where(rendered, labels, targets.argmax(1))
+
+        # The first class is the one that a complementary label leaves out.
+        others = self._studied[1:]
+        losses = label_loss(logits, labels, settings.label_smoothing, others)
+        if not self._labeled:
+            losses = losses * rendered
+        loss = losses.mean()
+        if targets is not None:
+            changes = self._changes(logits, targets, rendered)
+            loss = loss + settings.distillation * changes.mean()
+        if self._studied and settings.ranking:
+            ranked = sum(ranking_loss(logits, labels, label) for label in self._studied)
+            loss = loss + settings.ranking * ranked / len(self._studied)
+        hits = is_right(logits.detach().argmax(1), labels, others).sum()
+        return loss, hits
+
+    def _changes(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
+        """Return the divergence of each image's prediction from the teacher's, shape (B,).
+
+        On renders, the classes under study may change, and only the others are compared. Without
+        classes under study, renders have no divergence.
+        """
+        changes = divergence(logits, targets) * ~rendered
+        if self._studied:
+            classes = torch.arange(logits.shape[1], device=logits.device)
+            is_kept = torch.stack([classes != label for label in self._studied]).all(0)
+            changes = changes + divergence(logits[:, is_kept], targets[:, is_kept]) * rendered
+        return changes

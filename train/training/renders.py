@@ -1,0 +1,130 @@
+"""The renders that a run trains on: the scene, its labels, and the service that makes them anew."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment import distributed
+from augment.attacks.losses import complementary_label
+from augment.classifiers.adapter import class_index
+from augment.progress import Phases
+from augment.scene.build import build_scene
+from augment.scene.scene import Scene
+from augment.service import AugmentationService
+from renderer.errors import InputError
+from train import console
+from train.command import keyed
+from train.data.photographs import find_photographs, load_photographs
+from train.data.sets import DataSet
+from train.settings import OTHER, ExperimentSettings, label_names
+from train.system.device import choose_rasterizer
+from train.system.processes import first_process_first
+
+
+def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
+    """Build the service that regenerates a run's renders, and log the rasterizer.
+
+    Args:
+        settings: The settings of the run.
+        data: The data of the run, whose classes the renders share.
+        device: The device that renders.
+
+    Returns:
+        The service. Without renders it has no examples.
+
+    Raises:
+        InputError: A mesh, a background, a light or a class does not exist, or no class is left
+            for other things.
+    """
+    scene: Scene | None = None
+    images: Tensor | None = None
+    labels = torch.zeros(0, dtype=torch.int64, device=device)
+    phases = Phases(device)
+    names = label_names(settings.label)
+    is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1
+    studied: list[int] = []
+    if is_ranked or settings.augment.renders:
+        studied = [class_index(data.classes, name, "label") for name in names]
+
+    if settings.augment.renders and settings.augment.arm == "folder":
+        images, labels = load_renders(settings, data)
+        images = images.to(device)
+        labels = labels.to(device)
+        is_ranked = len(labels.unique()) > 1
+    elif settings.augment.renders:
+        numbers = _class_numbers(settings, data)
+        # The service and the loss know what is none of the other studied classes.
+        numbers[OTHER] = complementary_label(studied[0])
+        scene = _build_scene(settings, data.size, device, phases)
+        labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
+
+    if len(studied) == len(data.classes) and (labels < 0).any():
+        problem = f"label={settings.label} leaves no class of the network for other things"
+        raise InputError(f"{problem}: leave these out")
+    return AugmentationService(
+        settings.augment,
+        scene,
+        labels,
+        settings.seed,
+        phases,
+        studied if is_ranked else (),
+        distributed.rank(),
+        distributed.world_size(),
+        images,
+    )
+
+
+def _build_scene(settings: ExperimentSettings, size: int, device: torch.device, phases: Phases) -> Scene:
+    """Build the scene of a run's meshes, in the first process before the others."""
+    rasterizer = choose_rasterizer(settings.renderer)
+    console.info("rasterizer: %s", rasterizer.description)
+    with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
+        return build_scene(
+            list(settings.objects.values()),
+            size,
+            settings.views,
+            scene=settings.scene,
+            renderer=settings.renderer,
+            rasterizer=rasterizer,
+            attack=settings.augment.attack,
+            vary=settings.augment.vary,
+            device=device,
+        )
+
+
+def _class_numbers(settings: ExperimentSettings, data: DataSet) -> dict[str, int]:
+    """Return the number of each class that a mesh of the run has."""
+    return {
+        item.label: class_index(data.classes, item.label, f"label of {key}")
+        for key, item in settings.objects.items()
+        if item.label != OTHER
+    }
+
+
+def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, Tensor]:
+    """Load the images of `augment.folder`, which take the place of renders.
+
+    Args:
+        settings: The settings of the run.
+        data: The data of the run, whose classes the folders are named by.
+
+    Returns:
+        The images, uint8, shape (N, 3, size, size), and their class numbers, shape (N,).
+
+    Raises:
+        InputError: The folder cannot be read, or it has no image of a class under study.
+    """
+    folder = Path(str(settings.augment.folder))
+    studied = label_names(settings.label)
+    numbers = {name: index for index, name in enumerate(data.classes)}
+    other = complementary_label(numbers[studied[0]])
+    with keyed("augment.folder"):
+        found = find_photographs(folder, data.classes, studied)
+        found, images, _ = load_photographs(folder, found, data.size, advice="")
+        missing = set(studied) - {item.label for item in found}
+        if missing:
+            problem = f"{folder} holds no image of label={min(missing)}"
+            raise InputError(f"{problem}: add a folder of them")
+    labels = torch.tensor([numbers.get(item.label, other) for item in found])
+    return images, labels

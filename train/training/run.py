@@ -1,0 +1,407 @@
+"""One training run, from its settings to its scores.
+
+`train.__main__` makes runs and calls their steps in order: `load`, `fit`, `score`, `export`.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from augment import distributed
+from augment.progress import progress
+from augment.random_streams import stream_seed
+from renderer.errors import InputError
+from train import console
+from train.data.cache import TensorCache, cache_folder
+from train.data.photographs import find_photographs, require_outside
+from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
+from train.evaluation.scores.metrics import METRICS
+from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
+from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
+from train.networks import (
+    CLASSIFIER,
+    PYTHON,
+    WEIGHTS,
+    build_network,
+    describe,
+    export,
+    without_normalization,
+)
+from train.runs import checkpoint
+from train.runs.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
+from train.settings import ExperimentSettings
+from train.system.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
+from train.training.initial import CachedModel, Initial, ValidationPart, choose_validation
+from train.training.loop import Trainer, evaluate
+from train.training.recipe import freeze, learning_rate
+from train.training.renders import build_service
+
+# Images whose channels are measured where all of them are on disk.
+SAMPLED = 1000
+
+
+class Run:
+    """One training run: its data, its network, its folder and its scores.
+
+    The steps are called in order: `load`, `fit`, `score`, `export`. Wrong input shows in `load`,
+    so that several runs can be loaded before the first of them trains.
+
+    Args:
+        settings: The settings of the run.
+        data: Its data set.
+        folder: The folder that the run writes to.
+        initial: The network that it begins with; None for random weights.
+        command: The command that was given, which is recorded.
+    """
+
+    trainer: Trainer
+    log: RunLog | None
+    held_out: Tensor
+
+    def __init__(
+        self,
+        settings: ExperimentSettings,
+        data: DataSet,
+        folder: Path,
+        initial: Initial | None = None,
+        command: str = "",
+    ):
+        self.settings = settings
+        self.data = data
+        self.folder = folder
+        self.initial = initial
+        self.command = command
+        self._scores: dict[str, float] = {}
+        # The threads that the run trains with.
+        self._threads = 1
+        # The classes that the initial network gives the test images, shape (N,).
+        self._answers: Tensor | None = None
+
+    def load(self) -> None:
+        """Do everything that comes before the first epoch.
+
+        Raises:
+            InputError: The settings, the data, the folder or its checkpoint are wrong.
+        """
+        settings = self.settings
+        self.data = _data_for(settings, self.data, self.initial)
+        for name, photographs in settings.evaluate.folders.items():
+            require_outside(self.folder / name, photographs)
+            find_photographs(photographs, self.data.classes, settings.label)
+        set_deterministic(settings.train.deterministic)
+        before = self._require_folder()
+        part = choose_validation(settings, self.data, self.initial)
+        self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
+        self.trainer = build_trainer(settings, self.data, self.folder, self.initial, part, self._asked_threads(before))
+        self._threads = torch.get_num_threads()
+        if before is not None:
+            self.trainer.resume()
+            self._warn_of_stretched_schedule(before.train.epochs)
+        elif settings.train.resume:
+            console.info("nothing to resume in %s; starting at epoch 1", self.folder)
+        if distributed.rank() == 0:
+            self._write_config()
+
+    def fit(self) -> None:
+        """Train to the last epoch. The network that the run begins with is scored before."""
+        torch.set_num_threads(self._threads)  # Other runs may have been loaded since.
+        console.info(
+            "%d images, %d classes; %s, %s, threads: %d, processes: %d",
+            (~self.held_out).sum(),
+            len(self.data.classes),
+            self.trainer.device,
+            self.trainer.model.precision,
+            self._threads,
+            distributed.world_size(),
+        )
+        is_first = distributed.rank() == 0
+        self.log = RunLog(self.folder, self.trainer.history) if is_first else None
+        if self.trainer.initial:
+            self._score_initial(self.trainer.initial)
+        split = self.data.train.to(self.trainer.device)
+        self.trainer.fit(split, self.held_out, self.log)
+
+    def score(self) -> dict[str, float]:
+        """Score the selected network on the test images and the photographs, once.
+
+        Returns:
+            The scores by name, which are also the last line of metrics.jsonl.
+        """
+        trainer = self.trainer
+        self._scores |= self._test_scores()
+        if self._answers is not None and CLASSIFIER in trainer.architecture:
+            self._scores["test/agreement"] = self._agreement(self._answers)
+        if self.log:
+            for name in self.settings.evaluate.folders:
+                scores = self._score_photographs(trainer.selected, name, self.folder)
+                console.info("%s: %s", name, format_scores(scores))
+                self._scores |= _photograph_scores(name, scores)
+            self.log.scalars(self._scores)
+        return self._scores
+
+    def export(self) -> None:
+        """Write the weights of a network that began as a classifier, as its own file has them."""
+        if self.log and CLASSIFIER in self.trainer.architecture:
+            path = self.folder / WEIGHTS
+            export(path, self.trainer.selected.network)
+            console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
+
+    def _require_folder(self) -> DictConfig | None:
+        """Return the settings of the run that goes on in the folder; None if none does."""
+        resumes = self.settings.train.resume
+        begins_anew = self.settings.overwrite and not resumes
+        if begins_anew or not checkpoint.exists(self.folder):
+            return None
+        if not resumes:
+            remedy = "set train.resume=true to go on or overwrite=true to begin anew"
+            raise InputError(f"run={self.folder} holds a run already: {remedy}, or choose another run")
+        return require_same_run(self.folder, self.settings)
+
+    def _asked_threads(self, before: DictConfig | None) -> int | None:
+        """Return the threads that the settings ask for, or those of the run that goes on."""
+        asked = self.settings.train.threads
+        if asked or before is None:
+            return asked
+        recorded = OmegaConf.select(before, "hardware.threads")
+        return recorded if isinstance(recorded, int) and recorded > 0 else None
+
+    def _warn_of_stretched_schedule(self, planned: int) -> None:
+        """Warn of the jump of the learning rate that another number of epochs causes."""
+        recipe = self.settings.train
+        # Each epoch of a soup has the whole schedule.
+        if recipe.epochs == planned or recipe.soup:
+            return
+        rate = learning_rate(recipe, self.trainer.epoch / recipe.epochs)
+        rate_before = learning_rate(recipe, self.trainer.epoch / planned)
+        change = f"train.epochs={recipe.epochs}, not {planned}"
+        console.warning(
+            "%s, stretches train.schedule=%s: the learning rate goes on at %.3g, not %.3g",
+            change,
+            recipe.schedule,
+            rate,
+            rate_before,
+        )
+
+    def _write_config(self) -> None:
+        """Write the settings and the facts of the run into its folder."""
+        if self.settings.overwrite and not self.settings.train.resume:
+            remove_run(self.folder)
+        hardware = {
+            "device": str(self.trainer.device),
+            "precision": self.trainer.model.precision,
+            "threads": self._threads,
+        }
+        write_config(
+            self.folder,
+            self.settings,
+            hardware=hardware,
+            command=self.command,
+            test_images=describe_test_images(self.settings, self.data),
+        )
+
+    def _score_initial(self, model: MixedPrecision) -> None:
+        """Score the network that the run begins with, and label unlabeled data by its answers."""
+        settings = self.settings
+        # The code of a foreign function may change unseen, so its logits are not stored.
+        is_foreign = settings.model.name.startswith(PYTHON)
+        cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
+        predict = CachedModel(model, self.trainer.device, cache)
+        test = self.data.test
+        self._answers = self._predicted_classes(predict, test)
+        if not self.data.labeled:
+            # The loss asks the teacher about the images that the network learns from.
+            labels = self.data.train.labels.clone()
+            held_out = self.data.train[self.held_out]
+            labels[self.held_out] = self._predicted_classes(predict, held_out)
+            train = Split(self.data.train.images, labels)
+            test = Split(test.images, self._answers)
+            self.data = replace(self.data, train=train, test=test)
+        if distributed.rank() > 0:
+            return
+        accuracy = (self._answers == test.labels).float().mean().item()
+        if self.data.labeled:
+            images = describe_test_images(settings, self.data)
+            begun = settings.train.init_from
+            console.info("before: %s has accuracy %.4f on %s", begun, accuracy, images)
+        for name in settings.evaluate.folders:
+            self._score_photographs(predict, name, self.folder / BEFORE)
+        self._scores["test/accuracy_before"] = accuracy
+
+    def _predicted_classes(self, model: Model, split: Split) -> Tensor:
+        """Return the classes that a model gives the images of a split, shape (N,)."""
+        batches = torch.arange(len(split)).split(BATCH)
+        count = len(self.trainer.architecture["classes"])
+        classes = [
+            compute_logits(model, images, count, self.trainer.device).argmax(1)
+            for images in progress(split.squares(batches), "predictions", len(batches))
+        ]
+        return torch.cat(classes)
+
+    def _test_scores(self) -> dict[str, float]:
+        """Look at the test images once: with the last network and, if it is another, the best.
+
+        The best network stays loaded.
+        """
+        trainer = self.trainer
+        test = self.data.test.to(trainer.device)
+        last = evaluate(trainer.selected, test)["accuracy"]
+        selected = last
+        best = checkpoint.load(self.folder / checkpoint.BEST)
+        if best["epoch"] != trainer.epoch:
+            trainer.selected.network.load_state_dict(best["model"])
+            selected = evaluate(trainer.selected, test)["accuracy"]
+        console.info(
+            "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s",
+            selected,
+            best["epoch"],
+            last,
+            describe_test_images(self.settings, self.data),
+        )
+        return {
+            "test/accuracy": selected,
+            "test/accuracy_last": last,
+            "test/epoch": best["epoch"],
+        }
+
+    def _agreement(self, answers: Tensor) -> float:
+        """Return how often the selected network answers test images as the initial one did."""
+        agreement = self._scores["test/accuracy"]
+        if self.data.labeled:
+            answered = Split(self.data.test.images, answers).to(self.trainer.device)
+            agreement = evaluate(self.trainer.selected, answered)["accuracy"]
+        console.info(
+            "agreement with %s on %d held-out images: %.4f",
+            self.settings.train.init_from,
+            len(answers),
+            agreement,
+        )
+        return agreement
+
+    def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
+        """Score a model on the folder of photographs with a name; write the scores below `folder`."""
+        asked = self.settings.evaluate
+        return evaluate_photographs(
+            Predictor(model, self.data.classes, self.data.size, self.trainer.device),
+            asked.folders[name],
+            self.settings.label,
+            folder / name,
+            asked.skip_unreadable,
+        )
+
+
+def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
+    """Return the data in the classes that the run's network has."""
+    if not data.labeled:
+        if not (initial and settings.train.distillation):
+            missing = "set train.init_from and train.distillation"
+            problem = f"data={settings.data.name}: a network keeps its answers on it"
+            raise InputError(f"{problem}: {missing}")
+        return replace(data, classes=initial.classes)
+    if initial and (data.rendered or initial.is_classifier):
+        return relabeled(data, initial.classes, f"data={settings.data.name}")
+    return data
+
+
+def build_trainer(
+    settings: ExperimentSettings,
+    data: DataSet,
+    folder: Path,
+    initial: Initial | None,
+    validation: ValidationPart,
+    threads: int | None,
+) -> Trainer:
+    """Build a run's network, optimizer and scene. Nothing is written.
+
+    Args:
+        settings: The settings of the run.
+        data: The data, in the classes of the network.
+        folder: The folder of the run.
+        initial: The network that the run begins with, if any.
+        validation: The images that validate the network, whose record is stored with it.
+        threads: The number of threads; None for `choose_threads`.
+
+    Returns:
+        The trainer, ready for `Trainer.fit`.
+
+    Raises:
+        InputError: The network, the renders or the initial weights do not fit together.
+    """
+    device = choose_device(settings.train.device)
+    shape = _network_shape(settings, initial)
+    images = data.train.images
+    if not isinstance(images, Tensor):
+        images = data.train.sample(SAMPLED)
+    mean, std = channel_statistics(images)
+    torch.manual_seed(stream_seed(settings.seed, "weights"))
+    network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
+    facts = {
+        "classes": list(data.classes),
+        "size": data.size,
+        "encoding": settings.renderer.encoding,
+        **shape,
+    }
+    if initial:
+        initial.copy_to(network, facts)
+    if settings.train.freeze:
+        freeze(without_normalization(network), settings.train.freeze)
+    precision = choose_precision(settings.train.precision, device, network)
+    model = MixedPrecision(network.to(device), precision)
+    torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
+    recipe = settings.train
+    if recipe.eval_mode is None:
+        recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
+    return Trainer(
+        recipe,
+        model,
+        describe(network, **facts, validation=validation.record),
+        build_service(settings, data, device),
+        folder,
+        data.labeled,
+    )
+
+
+def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
+    """Return what the run's network is built from: its settings, or the initial classifier's."""
+    shape = settings.model.shape
+    if initial is None or not initial.is_classifier:
+        return shape
+    if shape.get("name", initial.name) != initial.name:
+        problem = f"model={shape['name']}: train.init_from={initial.source} has its own network"
+        raise InputError(f"{problem}: leave it out")
+    return {"name": initial.name, CLASSIFIER: True}
+
+
+def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
+    """Say in words what the test accuracy is of.
+
+    Args:
+        settings: The settings of a run.
+        data: Its data, in the classes of its network.
+
+    Returns:
+        The words, such as "the test images of cifar100".
+    """
+    if not data.labeled:
+        return f"the answers of {settings.train.init_from} to held-out photographs"
+    kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
+    # The labels of the test images are looked at once, later.
+    others = len(data.classes) - len(data.train.labels.unique())
+    return f"{kind}, not of the network's {others} other classes" if others else kind
+
+
+def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
+    """Return the known metrics of photographs and of each label, by name."""
+    parts = {name: scores.overall}
+    for label, metrics in scores.by_label.items():
+        parts[f"{name}/{label}"] = metrics
+    values = {}
+    for part, metrics in parts.items():
+        for metric in ("top5", *METRICS):
+            estimate = metrics.find(metric)
+            if estimate is not None and estimate.value is not None:
+                values[f"{part}/{metric}"] = estimate.value
+    return values
