@@ -16,9 +16,9 @@ from augment import distributed
 from augment.attacks.attack import fooled_in_views, logits_of, warn_of_changed_light
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers.adapter import NetworkCall
+from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.model_passes import as_found
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
@@ -105,10 +105,11 @@ class Renders(Dataset[tuple[Tensor, int]]):
 class AugmentationService:
     """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
 
-    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.attacks.losses`.
-    studied: the classes that hard negatives, the examples of all other labels, are attacked towards, in turn. Without any, every
-    attack leads away from the example's own class. rank, world_size: of this process among those that train together;
-    each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W) uint8, of arm="folder".
+    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`.
+    studied: the classes that hard negatives, the examples of all other labels, are attacked towards, in turn.
+    Without any, every attack leads away from the example's own class. rank, world_size: of this process among those
+    that train together; each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W)
+    uint8, of arm="folder".
     """
 
     settings: AugmentationSettings

@@ -2,8 +2,8 @@
 
     python -m benchmarks.gpu --out gpu.jsonl
 
-The command checks first (tests/train/system/test_gpu.py), then measures. A question that fails has a line with its error, and
-the next one is asked. Meshes, data and networks are the project's own. Where there are several GPUs, `training` runs on
+The command checks first (tests/train/system/test_gpu.py), then measures. A question that fails has a line with its
+error, and the next one is asked. Meshes, data and networks are the project's own. Where there are several GPUs, `training` runs on
 one and on all of them. --device cpu rehearses what needs no CUDA. A machine without an index of packages installs what
 `pip download -d wheels ".[test]"` brings elsewhere: pip install --no-index --find-links wheels ".[test]"
 """
@@ -30,7 +30,7 @@ from augment.settings import TrainingAttackSettings
 from benchmarks.common import Row, machine, medians, record
 from benchmarks.training import last_epoch
 from renderer.visibility.rasterizers import choose
-from train.networks import load_run
+from train.runs.saved_networks import load_run
 from train.system.device import GraphedModel, MixedPrecision, choose_precision, set_deterministic
 
 NETWORK, MESHES, VIEWS, STEPS, ROUNDS, SAMPLES = "pretrained/none", 2, 10, 10, 5, (64, 512, 2048)

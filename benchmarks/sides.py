@@ -29,21 +29,21 @@ import numpy as np
 import torch
 from PIL import Image
 
-from augment.classifiers import Classifier, build_classifier, load_classifier
+from augment.classifiers import Classifier, build_classifier
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
-from train.commands.settings import LabSettings
+from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.data.sets import held_out_rows, load_npz
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import METRICS, Pooled, metric_title
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, Predictor, write_predictions
 from train.evaluation.tables import Estimate, Table, format_interval
-from train.networks import is_classifier, load_run
 from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary, summarize
-from train.runs.checkpoint import content_hash
+from train.runs.saved_networks import is_classifier, load_network, load_run
 from train.system.device import MixedPrecision, choose_precision
+from train.system.hashing import content_hash
 from train.training.loop import evaluate
 
 LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
@@ -144,7 +144,7 @@ def load(name: str, size: int) -> Classifier:
     if not is_classifier(name):
         return load_run(name)
     classifier = build_classifier(name, size)
-    classifier.load_state_dict(load_classifier(name).state_dict())
+    classifier.load_state_dict(load_network(name).state_dict())
     return classifier
 
 

@@ -1,7 +1,7 @@
 """pnb-attack: attack a classifier through the lighting, the shape, the colors or the pixels of a mesh."""
 
 from train.command import Command
-from train.commands.settings import AttackExperimentSettings
+from train.command_settings import AttackExperimentSettings
 from train.help import HelpText
 
 

@@ -1,7 +1,7 @@
 """pnb-compare: print Markdown tables of finished runs, side by side."""
 
 from train.command import Command
-from train.commands.settings import CompareSettings
+from train.command_settings import CompareSettings
 from train.help import HelpText
 
 main = Command(

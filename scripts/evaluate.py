@@ -1,7 +1,7 @@
 """pnb-evaluate: score a network on a folder of photographs."""
 
 from train.command import Command
-from train.commands.settings import EvaluateSettings
+from train.command_settings import EvaluateSettings
 from train.help import HelpText
 
 main = Command(

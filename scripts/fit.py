@@ -1,7 +1,7 @@
 """pnb-fit: find the camera and the lighting of a photograph."""
 
 from train.command import Command
-from train.commands.settings import FitSettings
+from train.command_settings import FitSettings
 from train.help import HelpText
 
 main = Command(

@@ -1,7 +1,7 @@
 """pnb-light: write a light as an environment map for other software."""
 
 from train.command import Command
-from train.commands.settings import LightSettings
+from train.command_settings import LightSettings
 from train.help import HelpText
 
 main = Command(

@@ -1,7 +1,7 @@
 """pnb-publish: write the network of a run as half-precision safetensors."""
 
 from train.command import Command
-from train.commands.settings import PublishSettings
+from train.command_settings import PublishSettings
 from train.help import HelpText
 
 main = Command(

@@ -3,7 +3,7 @@
 import os
 
 from train.command import Command, quoted
-from train.commands.settings import ReportSettings
+from train.command_settings import ReportSettings
 from train.help import HelpText
 
 

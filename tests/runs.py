@@ -12,7 +12,7 @@ from train.training.run import Run
 def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:
     """Make a run and load it. Without data, the settings name them."""
     initial = load_initial(settings)
-    run = Run(settings, data or load_data(settings, initial), folder, initial)
+    run = Run(settings, data or load_data(settings, initial.size if initial else None), folder, initial)
     run.load()
     return run
 

@@ -293,25 +293,6 @@ def _read_node(node: DictConfig, key: str) -> Any:
         raise error.within(key, values) from None
 
 
-@contextmanager
-def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
-    """Put a key in front of the sentences of the library.
-
-    Args:
-        key: Key of the settings that the library was given.
-        names: Names of their fields.
-
-    Raises:
-        InputError: The error that was raised inside, with the key.
-    """
-    try:
-        yield
-    except InputError as error:
-        if str(error).startswith(key):
-            raise
-        raise error.within(key, names) from error
-
-
 def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     """Put a word of the command line into Hydra's form.
 

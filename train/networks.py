@@ -1,41 +1,29 @@
-"""The networks that are trained, a WideResNet, torchvision's or a Python function's, and loading them from files."""
+"""The networks that are trained: a WideResNet, torchvision's, or a Python function's."""
 
-import io
-import json
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-import safetensors.torch
 import torch
 import torch.nn.functional as F
-from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.classifiers import SOURCES, Classifier, OperatingPoint, Source, build_classifier
+from augment.classifiers import build_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.sources import require_architecture
 from augment.model_passes import eval_mode
 from renderer.errors import InputError, in_one_line
-from renderer.io.files import write_whole
-from renderer.validation import as_path, require_kind
-from train.runs.checkpoint import BEST, VERSION, checked, load
-from train.settings import WIDERESNET, published
+from train.settings import WIDERESNET
 
 TORCHVISION, PYTHON = "torchvision:", "python:"
+# The version of the description of a network. Version 1 had no size, normalization and encoding.
+VERSION = 2
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
 DROPOUT_LEVELS = 2**16
 Color = Sequence[float]  # (3,) RGB
 MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are not given
-PUBLISHED = "model.safetensors"
 CLASSIFIER = "classifier"  # of a description: of a network that began as one of `augment.classifiers`
-WEIGHTS = "weights.pt"  # of a run that began with a classifier: under the names of its own file
-META = ("architecture", "settings", "scores", "versions", "operating_point")  # of a published network's file
-FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
 _OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
 
 
@@ -189,94 +177,3 @@ def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: st
     with `shape`, the network's own settings, and its normalization, unless the network's own code has it."""
     statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
     return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
-
-
-def is_classifier(name: str) -> bool:
-    """Whether `train.init_from` names a classifier, rather than a run or a file."""
-    source, colon, _ = name.partition(":")
-    return (found := SOURCES.get(source + colon)) is not None and found.build is not None
-
-
-def export(path: Path, network: nn.Module) -> None:
-    """Write the weights of a network that began with a classifier, under the names of its own file."""
-    content = io.BytesIO()
-    torch.save({name: value.cpu() for name, value in without_normalization(network).state_dict().items()}, content)
-    write_whole(path, content.getbuffer(), durable=True)
-
-
-def without_normalization(network: nn.Module) -> nn.Module:
-    """The network whose parameters have its own file's names."""
-    return network.network if isinstance(network, Normalized) else network
-
-
-def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:
-    """The network that `load_selected` finds for a run's folder, one under pretrained/, or a file of either.
-
-    model: the python:package.module:function that makes it, where one does: code runs because the user names it, never
-    because a file does. InputError for weights=, since the run holds its own.
-    """
-    if weights is not None:
-        raise InputError(f"weights={weights} is not for classifier=run:{run}, which has its own: leave it out")
-    require_kind("model", model, str | None, "python:package.module:function, or None")
-    path, state = load_selected(as_path("run", run))
-    shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
-    name = str(shape.get("name", WIDERESNET))
-    if name.startswith(PYTHON) and name != model:
-        attack = "for an attack, classifier=python: with a function that loads the weights"
-        raise InputError(f"the network in {path} is made by {name}: give model={name} to run that code or, {attack}")
-    with of_one_architecture(path):
-        size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
-        network = build_network(classes, size, **shape)
-        network.load_state_dict(state["model"])
-        classifier = Classifier(network, size, classes, f"run:{run}")
-        points = state.get("operating_point", [])  # one, or several
-        classifier.operating_points = [OperatingPoint(**p) for p in (points if isinstance(points, list) else [points])]
-        for point in classifier.operating_points:
-            classifier.label(point.label)  # or InputError
-        return classifier
-
-
-SOURCES["run:"] = Source(load_run, None)  # a classifier's name in the commands
-
-
-@contextmanager
-def of_one_architecture(path: Path) -> Iterator[None]:
-    """InputError naming the file where its description or its weights do not fit the network."""
-    try:
-        yield
-    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
-        reason, advice = textwrap.shorten(in_one_line(error), 300), "use the model settings of its training"
-        raise InputError(f"checkpoint {path} is from another architecture ({reason}): {advice}") from error
-
-
-def selected_file(run: Path) -> Path | None:
-    """The file of a run's selected network, best.pt or model.safetensors or such a file itself; None without one."""
-    found = published(run)
-    return next((file for file in (found, found / BEST, found / PUBLISHED) if file.is_file()), None)
-
-
-def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
-    """The file of a run's selected network, and its content."""
-    if (path := selected_file(run)) is None:
-        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote")
-    return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
-
-
-
-
-def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint's network as half-precision safetensors, with its architecture and other facts as metadata."""
-    model, metadata = state["model"], {key: json.dumps(state[key], ensure_ascii=False) for key in META if key in state}
-    weights = {name: value.half().contiguous() if value.is_floating_point() else value for name, value in model.items()}
-    write_whole(path, safetensors.torch.save(weights, metadata), durable=True)
-
-
-def _load_published(path: Path) -> dict[str, Any]:
-    try:
-        with safe_open(path, "pt") as file:
-            facts = {name: json.loads(text) for name, text in file.metadata().items()}
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except Exception as error:  # safetensors and JSON raise many kinds for a damaged or foreign file
-        raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
-    weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
-    return checked({**facts, "model": weights}, path)

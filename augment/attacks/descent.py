@@ -38,7 +38,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.attacks.eot import ExpectationOverTransformations, stored
-from augment.attacks.losses import NO_CLASS, adversarial_cost, logit_gap
+from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.model_passes import BatchSize, as_found
 from augment.progress import Phases, progress
 from augment.random_streams import generator

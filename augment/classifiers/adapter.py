@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.losses import log_odds
+from augment.losses import log_odds
 from renderer.errors import InputError, describe, in_one_line, is_out_of_memory, require_range
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole

@@ -113,7 +113,8 @@ class Scene:
         require_kind("basis", self.basis, Basis, "a basis of light, such as Harmonics(degree)")
         require_kind("camera_effects", self.camera_effects, Callable | None, "a function of images and examples")
         if not hasattr(self.rasterizer, "rasterize"):
-            raise InputError(f"rasterizer is {describe(self.rasterizer)}: give renderer.visibility.rasterizers.choose(name)")
+            advice = "give renderer.visibility.rasterizers.choose(name)"
+            raise InputError(f"rasterizer is {describe(self.rasterizer)}: {advice}")
         self.objects = as_list("objects", self.objects, SceneObject, "a list of scene objects")
         self.examples = as_list("examples", self.examples, Example, "a list of examples")
         self.lights = as_tensor("lights", self.lights)

@@ -16,8 +16,7 @@ import torch
 import yaml
 from torch import Tensor
 
-import train.networks  # noqa: F401 (whose networks are classifiers, too: run:FOLDER)
-from augment import AttackSettings, Classifier, Scene, StepSettings, load_classifier
+from augment import AttackSettings, Classifier, Scene, StepSettings
 from augment.attacks.attack import logits_of
 from augment.scene.objects import SceneObject, load_object
 from augment.scene.scene import Example
@@ -25,6 +24,7 @@ from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.visibility.rasterizers import choose
+from train.runs.saved_networks import load_network
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 WIDTHS = (2.0, 3.0)  # of the image in world units (the paper's appendix on rendering quality)
@@ -62,7 +62,7 @@ def prepare(
     """
     arguments = options.parse_args(argv)
     torch.set_num_threads(arguments.threads)
-    classifier = load_classifier(*arguments.classifier.split("=", 1))
+    classifier = load_network(*arguments.classifier.split("=", 1))
     items = [read_item(mesh) for mesh in arguments.meshes]
     subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
     begin(arguments)

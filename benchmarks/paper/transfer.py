@@ -13,13 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment import AttackSettings, Classifier, load_classifier
+from augment import AttackSettings, Classifier
 from augment.attacks.descent import Goal, descend
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.paper import common
 from renderer.errors import FACTOR
+from train.runs.saved_networks import load_network
 
 FURTHER = 10  # steps that an adversary goes on for
 ATTACKED = (1, 5)  # views that share one light or shape
@@ -104,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.add_argument("--steps", type=int, default=30, help="of a descent at most (the paper's appendix C)")
     options.add_argument("--targets", nargs="*", default=[], help="networks that are not attacked, NAME[=WEIGHTS]")
     args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
-    others = [load_classifier(*target.split("=", 1)) for target in args.targets] if args.study == "networks" else []
+    others = [load_network(*target.split("=", 1)) for target in args.targets] if args.study == "networks" else []
     for subject in subjects:
         if args.study == "networks":
             to_networks(subject, classifier, others, args)

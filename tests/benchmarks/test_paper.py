@@ -44,7 +44,7 @@ def small(monkeypatch, tmp_path):
     monkeypatch.setattr(common, "VERTICES", 0)
     monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
     for module in (common, transfer):
-        monkeypatch.setattr(module, "load_classifier", lambda name, weights=None: by_brightness(0.1, name))
+        monkeypatch.setattr(module, "load_network", lambda name, weights=None: by_brightness(0.1, name))
     return ["--out", str(tmp_path / "records.jsonl"), "--meshes", str(tmp_path / "ball.ply")]
 
 

@@ -28,6 +28,7 @@ from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
 from train.data.sets import load_folder, load_npz
 from train.runs import checkpoint
+from train.system.hashing import content_hash
 
 from .conftest import PATIENCE, RENDERER, TRAINING, run_here
 
@@ -131,7 +132,7 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
     edits = [edit(node[key]) for edit in TENSOR_EDITS] if isinstance(node[key], torch.Tensor) else VALUES
     node[key] = draw(st.sampled_from(edits))
     content = io.BytesIO()
-    torch.save({**state, checkpoint.HASH: checkpoint.content_hash(state)}, content)
+    torch.save({**state, checkpoint.HASH: content_hash(state)}, content)
     return content.getvalue()
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from train.runs import checkpoint
 from train.runs.run_folder import METRICS, read_metrics
+from train.system.hashing import content_hash
 
 from .conftest import PATIENCE, TRAINING, Process, end, run_here, start_command
 
@@ -49,7 +50,7 @@ def contents(run: Path) -> dict[str, Any]:
     result: dict[str, Any] = {METRICS: without_seconds(read_metrics(run))}
     for name in (checkpoint.LAST, checkpoint.BEST):
         for part, value in checkpoint.load(run / name).items():
-            result[f"{name}: {part}"] = checkpoint.content_hash(without_seconds(value))
+            result[f"{name}: {part}"] = content_hash(without_seconds(value))
     result["half-written"] = sorted(path.name for path in run.glob("**/*.tmp"))
     for folder in ("renders", "photographs"):
         result |= {path.relative_to(run).as_posix(): path.read_bytes() for path in (run / folder).glob("*")}

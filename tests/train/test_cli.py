@@ -17,12 +17,12 @@ import yaml
 from renderer.errors import InputError
 from train import command
 from train.command import USER_ERROR, Command
-from train.commands.settings import LightSettings
+from train.command_settings import LightSettings
 from train.help import HelpText
-from train.runs import checkpoint
 from train.runs.checkpoint import LAST
 from train.runs.run_folder import locked
 from train.system import user_errors as errors
+from train.system.hashing import content_hash
 from train.system.user_errors import one_sentence, writable_folder
 
 ROOT = Path(__file__).parents[2]
@@ -137,7 +137,7 @@ def test_a_run_is_resumed_by_its_folder_alone(call, tmp_path, stopped):
     assert call("train", f"run={whole}", *begun) == 0
     for arm in (".", "none"):
         states = [torch.load(run / arm / LAST, weights_only=True) for run in (stopped, whole)]
-        assert states[0]["epoch"] == 2 and checkpoint.content_hash(states[0]["model"]) == checkpoint.content_hash(
+        assert states[0]["epoch"] == 2 and content_hash(states[0]["model"]) == content_hash(
             states[1]["model"]
         )
         assert (stopped / arm / "photographs" / "summary.json").is_file()

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import renderer
-from train.networks import load_run
+from train.runs.saved_networks import load_run
 
 EARLIER = Path(__file__).with_name("earlier_files")
 EXAMPLE = EARLIER / "attack" / "0_solid_orange_0" / "example_000"

@@ -8,10 +8,10 @@ import torch.nn.functional as F
 from torch import nn
 from torchvision.models import resnet18
 
-from augment.classifiers import load_classifier
 from renderer.errors import InputError
-from train.networks import PUBLISHED, Dropout, WideResNet, build_network, describe, load_run, load_selected, publish
+from train.networks import Dropout, WideResNet, build_network, describe
 from train.runs.checkpoint import BEST, save
+from train.runs.saved_networks import PUBLISHED, load_network, load_run, load_selected, publish
 from train.training.initial import Initial
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
@@ -189,7 +189,7 @@ def test_an_impossible_architecture_names_its_key(settings):
 
 @pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
 def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, file):
-    classifier = load_classifier(f"run:{write(tmp_path, network) / file}")
+    classifier = load_network(f"run:{write(tmp_path, network) / file}")
     assert (classifier.classes, classifier.size) == (CLASSES, 48)
     assert classifier.name == f"run:{tmp_path / file}"
     images = torch.rand(3, 3, 48, 48)
@@ -269,7 +269,7 @@ def test_a_published_network_is_found_from_any_folder_unless_that_has_its_own(tm
 
 @pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
 def test_the_published_networks_are_classifiers_of_cifar_100(arm):
-    classifier = load_classifier(f"run:{PRETRAINED / arm}")
+    classifier = load_network(f"run:{PRETRAINED / arm}")
     assert (len(classifier.classes), classifier.size, classifier.label("orange")) == (100, 32, 53)
     images = torch.full((1, 3, 32, 32), 0.5, requires_grad=True)
     (gradient,) = torch.autograd.grad(classifier(images)[0, 53], images)

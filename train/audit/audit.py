@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from augment.classifiers import load_classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -20,13 +19,14 @@ from train import console
 from train.audit import audit_page as page
 from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers
 from train.command import command_line
-from train.commands.settings import AuditSettings, LabSettings
+from train.command_settings import AuditSettings, LabSettings
+from train.commands.results import RESULTS, require_replaceable
 from train.data.photographs import FOREIGN, find_photographs
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
-from train.runs.results import RESULTS, require_replaceable
 from train.runs.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
+from train.runs.saved_networks import load_network
 from train.settings import published, read_objects, solid_name
 from train.system.device import choose_device
 from train.system.user_errors import writable_folder
@@ -45,9 +45,9 @@ def audit(settings: AuditSettings) -> None:
 def run_audit(settings: AuditSettings) -> Path:
     """Measure what is not yet measured in the folder `settings.out`, and write the page; returns its path."""
     device = choose_device(settings.device)
-    networks = {page.CLASSIFIER: load_classifier(settings.classifier, settings.weights).to(device)}
+    networks = {page.CLASSIFIER: load_network(settings.classifier, settings.weights).to(device)}
     if settings.hardened:
-        networks[page.HARDENED] = load_classifier(settings.hardened).to(device)
+        networks[page.HARDENED] = load_network(settings.hardened).to(device)
     meshes, others = read_meshes(settings)
     given = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
     folders = {part: published(Path(folder)) for part, folder in given.items() if folder}

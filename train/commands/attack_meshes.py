@@ -16,18 +16,19 @@ from augment.attacks.attack_files import LINES, require_renderers, save
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.losses import NO_CLASS
 from augment.attacks.search import find_scene
 from augment.attacks.settings import AttackSettings
-from augment.classifiers import Classifier, load_classifier
+from augment.classifiers import Classifier
+from augment.losses import NO_CLASS
 from augment.random_streams import generator
 from augment.scene.build import build_scene
 from augment.scene.objects import load_object, on_ground
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from train.command import command_line, keyed
-from train.commands.settings import AttackExperimentSettings, AttackSceneSettings
+from train.command import command_line
+from train.command_settings import AttackExperimentSettings, AttackSceneSettings
+from train.commands.results import require_replaceable
 from train.report.attack_tables import (
     FIGURE,
     TABLE,
@@ -38,11 +39,11 @@ from train.report.attack_tables import (
     write_sweeps,
     write_transfers,
 )
-from train.runs.results import require_replaceable
 from train.runs.run_folder import sole_writer, write_config
+from train.runs.saved_networks import load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
-from train.system.user_errors import writable_folder
+from train.system.user_errors import keyed, writable_folder
 
 
 def run(settings: AttackExperimentSettings) -> None:
@@ -57,7 +58,7 @@ def run(settings: AttackExperimentSettings) -> None:
         with keyed("attack"):
             settings.attack.require_parameters()
     device = choose_device(settings.device)
-    classifier = load_classifier(settings.classifier, settings.weights).to(device)
+    classifier = load_network(settings.classifier, settings.weights).to(device)
     if adversary is not None:
         images = adversary.render(choose_rasterizer(settings.renderer)).to(device)
         print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
@@ -160,7 +161,7 @@ def load_others(settings: AttackExperimentSettings, attacked: Classifier, device
     named = [item if isinstance(item, dict) else {"classifier": item} for item in others.classifiers]
     if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
         raise InputError(f"transfer.classifiers: {unknown} is not known: give names, or {{classifier, weights}}")
-    classifiers = [load_classifier(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
+    classifiers = [load_network(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
     items = [*read_objects(others.meshes, label, "transfer.meshes").values()]
     for network, name in [*((other, label) for other in classifiers), *((attacked, item.label) for item in items)]:
         network.label(name)  # before anything is attacked

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from train.commands.settings import CompareSettings
+from train.command_settings import CompareSettings
 from train.report.comparison import format_comparison
 from train.report.summary import summarize
 

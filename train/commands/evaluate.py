@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from augment.classifiers import Classifier, load_classifier
-from train.commands.settings import EvaluateSettings
+from augment.classifiers import Classifier
+from train.command_settings import EvaluateSettings
+from train.commands.results import require_replaceable
 from train.data.photographs import require_outside
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
-from train.networks import load_run
-from train.runs.results import require_replaceable
 from train.runs.run_folder import sole_writer
+from train.runs.saved_networks import load_network, load_run
 from train.settings import label_names, published
 from train.system.device import MixedPrecision, choose_device, choose_precision
 from train.system.user_errors import writable_folder
@@ -52,5 +52,5 @@ def evaluate(settings: EvaluateSettings) -> None:
 def _load_network(settings: EvaluateSettings) -> Classifier:
     """Load the network of a run, or any other classifier."""
     if settings.run is None:
-        return load_classifier(str(settings.classifier), settings.weights)
+        return load_network(str(settings.classifier), settings.weights)
     return load_run(settings.run, settings.weights, settings.model)

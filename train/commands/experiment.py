@@ -14,17 +14,17 @@ from omegaconf import DictConfig
 from augment import distributed
 from augment.settings import ARMS
 from train import console
-from train.command import keyed, program, read_settings
+from train.command import program, read_settings
+from train.commands.results import require_new_run
 from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import report_of
 from train.report.summary import summarize
 from train.runs import checkpoint
-from train.runs.results import require_new_run
 from train.runs.run_folder import CONFIG, given_command, require_same_run, resumed, sole_writer
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
-from train.system.user_errors import writable_folder
+from train.system.user_errors import keyed, writable_folder
 from train.training.initial import load_initial
 from train.training.run import Run
 
@@ -82,7 +82,7 @@ def _train_arms(arms: dict[Path, ExperimentSettings], folder: Path, command: str
     """Train each arm in its folder, the main one last in `folder`, and compare them."""
     main = arms[folder]
     initial = load_initial(main)
-    data = load_data(main, initial)
+    data = load_data(main, initial.size if initial else None)
     runs = [Run(settings, data, path, initial, command) for path, settings in arms.items()]
     for run in runs:  # All are loaded before the first one trains, so that every mistake shows.
         run.load()

@@ -7,9 +7,9 @@ from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import degree_of, irradiance_error
 from renderer.light.presets import load_light
-from train.command import keyed
-from train.commands.settings import LightSettings
-from train.runs.results import require_replaceable
+from train.command_settings import LightSettings
+from train.commands.results import require_replaceable
+from train.system.user_errors import keyed
 
 
 def export_light(settings: LightSettings) -> None:

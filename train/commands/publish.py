@@ -3,12 +3,13 @@
 from dataclasses import asdict
 from pathlib import Path
 
-from train.commands.settings import PublishSettings
+from train.command_settings import PublishSettings
+from train.commands.results import require_replaceable
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
-from train.networks import PUBLISHED, PYTHON, load_run, load_selected, publish
+from train.networks import PYTHON
 from train.report.summary import summarize
-from train.runs.results import require_replaceable
+from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published
 from train.system.user_errors import writable_folder
 

@@ -3,9 +3,9 @@
 import os
 from pathlib import Path
 
-from train.commands.settings import ReportSettings
+from train.command_settings import ReportSettings
+from train.commands.results import OF_AUDIT, RESULTS, require_replaceable
 from train.report.report_page import write_report
-from train.runs.results import OF_AUDIT, RESULTS, require_replaceable
 from train.system.user_errors import writable_folder
 
 

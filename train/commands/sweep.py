@@ -22,12 +22,12 @@ from renderer.io.files import write_whole
 from train import console
 from train.command import quoted, read_settings
 from train.commands.experiment import LOG, logged_to
+from train.commands.results import require_new_run, require_replaceable
 from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import PAGE, report_of
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
-from train.runs.results import require_new_run, require_replaceable
 from train.runs.run_folder import FAILURE, given_command, locked, require_same_run, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
@@ -117,7 +117,7 @@ def run_in_sweep(config: DictConfig) -> None:
                 settings.train.resume = checkpoint.exists(folder)
                 command = given_command([*map(_unescaped, job.overrides.task)])
                 initial = load_initial(settings)
-                run = Run(settings, load_data(settings, initial), folder, initial, command)
+                run = Run(settings, load_data(settings, initial.size if initial else None), folder, initial, command)
                 run.load()
                 run.fit()
                 run.score()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from renderer.io.files import write_whole
 from train import console
-from train.runs.checkpoint import content_hash
+from train.system.hashing import content_hash
 
 # The length of the checksum, a SHA-256.
 CHECKSUM_BYTES = 32

@@ -3,13 +3,12 @@
 from renderer.errors import require_choice, require_range
 from renderer.settings import MAX_SIZE
 from train import console
-from train.command import keyed
 from train.data.cache import TensorCache, cache_folder
 from train.data.rendered_shapes import load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled
 from train.settings import MIN_SIZE, ExperimentSettings
 from train.system.processes import first_process_first
-from train.training.initial import Initial
+from train.system.user_errors import keyed
 
 # Pixels per side of the images of a folder, where neither data.size nor the network begun with
 # says it.
@@ -17,12 +16,13 @@ SIZE = 32
 SOURCES = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 
 
-def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> DataSet:
+def load_data(settings: ExperimentSettings, size: int | None = None) -> DataSet:
     """Load the data set of a run.
 
     Args:
         settings: The settings of the run.
-        initial: The network that the run begins with, whose image size a folder takes.
+        size: The pixels per side of the images that the run's network takes, if it begins with
+            a trained one. The images of a folder and rendered solids take this size.
 
     Returns:
         The data set.
@@ -34,20 +34,20 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
     require_choice("data.name", name, SOURCES)
     console.info("data: %s", name)
     with first_process_first():
-        data = _load(name, settings, initial)
+        data = _load(name, settings, size)
     with keyed("data.path"):
         require_range("image size", data.size, MIN_SIZE, MAX_SIZE)
     return data
 
 
-def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
+def _load(name: str, settings: ExperimentSettings, network_size: int | None) -> DataSet:
     """Load the data set of a name, one of SOURCES."""
     data = settings.data
     if name == "cifar100":
         return load_cifar100(data.path)
     if name == "npz":
         return load_npz(data.path)
-    size = data.size or (initial.size if initial else SIZE)
+    size = data.size or network_size or SIZE
     if name == "shapes":
         cache = TensorCache(cache_folder(settings.train.cache))
         return load_shapes(data.train_per_class, data.test_per_class, size, data.seed, cache)

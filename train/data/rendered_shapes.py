@@ -25,7 +25,7 @@ from renderer.visibility.rasterizers import choose
 from train import console
 from train.data.cache import TensorCache, source_key
 from train.data.sets import DataSet, Split
-from train.runs.checkpoint import content_hash
+from train.system.hashing import content_hash
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)

@@ -16,7 +16,7 @@ from renderer.errors import InputError, in_one_line
 from train import console
 from train.data.images import RESIDENT, ImageFiles
 from train.data.photographs import Photograph, find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
-from train.runs.checkpoint import content_hash
+from train.system.hashing import content_hash
 
 # Names of folders that divide a data set. They are not names of classes.
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")

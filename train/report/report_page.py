@@ -24,9 +24,9 @@ from train.report import comparison as compare
 from train.report import plots, summary
 from train.report.plots import Picture
 from train.report.summary import Arms, RunSummary, Scored
+from train.runs.epoch_metrics import attack_success
 from train.runs.run_folder import CONFIG, read_config
 from train.system.user_errors import one_sentence
-from train.training.loop import attack_success
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons

@@ -17,9 +17,9 @@ from renderer.errors import InputError, in_one_line
 from train.evaluation.scores.metrics import METRICS, AreaUnderCurve, Thresholds, metric_title, read_metric
 from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.evaluation.tables import Estimate, Table, format_interval
-from train.networks import PUBLISHED, load_selected
 from train.runs import checkpoint, run_folder
 from train.runs.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
+from train.runs.saved_networks import PUBLISHED, load_selected
 from train.settings import label_names, published
 
 # Number of arms up to which they are named by their settings.

@@ -5,7 +5,6 @@ dict), `architecture` (what rebuilds the network, see `train.networks.describe`)
 last.pt has all of `train.training.loop.Trainer.state_dict`.
 """
 
-import hashlib
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,11 +15,11 @@ from torch import Tensor, cuda
 
 from renderer.errors import InputError, require_file
 from renderer.io.files import write_whole
+from train.networks import VERSION
+from train.system.hashing import content_hash
 
 LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
 HASH = "sha256"
-# The version of the stored architecture. Version 1 had no size, normalization and encoding.
-VERSION = 2
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
@@ -108,39 +107,6 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         if not (folder / PREVIOUS).is_file():
             raise
         return load(folder / PREVIOUS), str(error)
-
-
-def content_hash(state: Any) -> str:
-    """Compute the SHA-256 of keys, types, shapes and values.
-
-    Args:
-        state: A tensor, a plain value, or nested mappings and sequences of these.
-
-    Returns:
-        The hash as 64 hexadecimal digits.
-    """
-    digest = hashlib.sha256()
-    _update(digest, state)
-    return digest.hexdigest()
-
-
-def _update(digest: Any, value: Any) -> None:
-    """Add a value to a hash."""
-    match value:
-        case Tensor():
-            plain = value.detach().cpu().contiguous()
-            digest.update(f"{plain.dtype}{tuple(plain.shape)}".encode())
-            digest.update(plain.flatten().view(torch.uint8).numpy().data)
-        case Mapping():
-            for key, item in value.items():
-                digest.update(f"{key!r}:".encode())
-                _update(digest, item)
-        case list() | tuple():
-            digest.update(f"[{len(value)}]".encode())
-            for item in value:
-                _update(digest, item)
-        case _:
-            digest.update(f"{value!r};".encode())
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:

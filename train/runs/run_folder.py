@@ -32,8 +32,8 @@ from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
 from train.command import program
-from train.networks import selected_file
 from train.runs.checkpoint import BEST, LAST, PREVIOUS
+from train.runs.saved_networks import selected_file
 from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, mapped
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"

@@ -15,7 +15,7 @@ from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
 from renderer.visibility.rasterizers import Rasterizer, choose
 from train import console
-from train.command import keyed
+from train.system.user_errors import keyed
 
 # Linux writes a container's quota of cores into this file.
 QUOTA = Path("/sys/fs/cgroup/cpu.max")

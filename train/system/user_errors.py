@@ -2,12 +2,33 @@
 
 import errno
 import tempfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from renderer.errors import InputError, is_out_of_memory
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_NAME = 200  # characters
+
+
+@contextmanager
+def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
+    """Put a key in front of the sentences of the library.
+
+    Args:
+        key: Key of the settings that the library was given.
+        names: Names of their fields.
+
+    Raises:
+        InputError: The error that was raised inside, with the key.
+    """
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(key):
+            raise
+        raise error.within(key, names) from error
 
 
 def one_sentence(error: BaseException) -> str | None:

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.attacks.losses import label_loss
 from augment.attacks.norm_ball import project, sample, take_step
 from augment.attacks.parameters.settings import StepSettings
+from augment.losses import label_loss
 from augment.model_passes import as_found
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
@@ -97,7 +97,7 @@ def pgd(
     Args:
         model: Classifier of images in [0, 1], which is in eval mode meanwhile.
         images: Images, shape (B, 3, H, W), uint8.
-        labels: Labels, shape (B,); see `augment.attacks.losses.label_loss`.
+        labels: Labels, shape (B,); see `augment.losses.label_loss`.
         draws: CPU generator of the random start.
         absent: Further classes that no image of a complementary label shows.
 

@@ -13,10 +13,11 @@ from renderer.errors import InputError
 from train import console
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
-from train.networks import CLASSIFIER, describe, is_classifier, load_selected, of_one_architecture
-from train.runs.checkpoint import content_hash
+from train.networks import CLASSIFIER, describe
+from train.runs.saved_networks import is_classifier, load_selected, of_one_architecture
 from train.settings import WIDERESNET, ExperimentSettings
 from train.system.device import MixedPrecision
+from train.system.hashing import content_hash
 
 # What a network has in common with one that begins with its weights.
 SHARED = ("classes", "size", "name", "depth", "width")

@@ -11,13 +11,11 @@ from contextlib import closing
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from augment import distributed
 from augment.model_passes import eval_mode
@@ -31,6 +29,7 @@ from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_
 from train.data.sets import Split
 from train.runs import checkpoint
 from train.runs.checkpoint import random_state, restore_random_state
+from train.runs.epoch_metrics import epoch_metrics, format_epoch
 from train.runs.run_folder import PHASES, RunLog
 from train.settings import TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
@@ -46,8 +45,6 @@ EVALUATION_BATCH = 512
 SAVING_EVERY = 60.0
 # The largest share of an epoch's time that its checkpoints take.
 SAVING_SHARE = 0.02
-# The diagnostics of each round that metrics.jsonl shows.
-SHOWN = ("attack_success_before", "attack_success", "steps")
 
 # Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
 Batch = tuple[Tensor, Tensor, Tensor]
@@ -538,81 +535,6 @@ def _require_equal_shares(settings: TrainSettings) -> None:
     if settings.batch_size % (processes * settings.accumulate):
         divisor = f"{processes} processes × train.accumulate={settings.accumulate}"
         raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
-
-
-def epoch_metrics(
-    trained: Mapping[str, float],
-    validated: Mapping[str, float],
-    diagnostics: list[Mapping[str, float]],
-    seconds: Mapping[str, float],
-) -> dict[str, float]:
-    """Name the metrics of an epoch as metrics.jsonl and TensorBoard have them.
-
-    Args:
-        trained: The metrics on the training images.
-        validated: The metrics on the validation images.
-        diagnostics: The diagnostics of the renders of each round.
-        seconds: The time that each phase took.
-
-    Returns:
-        The metrics by group/name. Groups are train, validation, augment (means over the rounds),
-        seconds and, with several rounds, round_1, round_2 and so on.
-    """
-    augment = {name: fmean(part[name] for part in diagnostics) for name in diagnostics[0]}
-    groups = {
-        "train": trained,
-        "validation": validated,
-        "augment": augment,
-        "seconds": seconds,
-    }
-    if len(diagnostics) > 1:
-        for number, part in enumerate(diagnostics, 1):
-            groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
-    return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
-
-
-def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
-    """Write the line of an epoch for the console.
-
-    Args:
-        epoch: The epoch, from 1.
-        epochs: The number of epochs.
-        metrics: The metrics of the epoch, by the names of `epoch_metrics`.
-
-    Returns:
-        The line.
-    """
-    total = sum(metrics[f"seconds/{name}"] for name in PHASES)
-    parts = [
-        f"epoch {epoch}/{epochs}",
-        f"train loss {metrics['train/loss']:.3f} accuracy {metrics['train/accuracy']:.3f}",
-        f"validation accuracy {metrics['validation/accuracy']:.3f}",
-    ]
-    success = attack_success(metrics, "augment/")
-    if success is not None:
-        correct = 1 - metrics["augment/attack_success_before"]
-        parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
-    duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"
-    left = total * (epochs - epoch)
-    if left:
-        duration += f"; about {tqdm.format_interval(left)} left"
-    return "  ".join([*parts, duration])
-
-
-def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
-    """Compute how often an attack succeeds on examples that are correct before it.
-
-    Args:
-        diagnostics: The diagnostics of the attack.
-        prefix: What the names of the diagnostics begin with.
-
-    Returns:
-        The fraction of these examples, or None if there are none.
-    """
-    before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
-    if before == 1:
-        return None
-    return (diagnostics[f"{prefix}attack_success"] - before) / (1 - before)
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.losses import divergence, is_right, label_loss, ranking_loss
+from augment.losses import divergence, is_right, label_loss, ranking_loss
 from renderer.image import to_unit
 from train.settings import TrainSettings
 

@@ -6,20 +6,20 @@ import torch
 from torch import Tensor
 
 from augment import distributed
-from augment.attacks.losses import complementary_label
 from augment.classifiers.adapter import class_index
+from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene
 from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from renderer.errors import InputError
 from train import console
-from train.command import keyed
 from train.data.photographs import find_photographs, load_photographs
 from train.data.sets import DataSet
 from train.settings import OTHER, ExperimentSettings, label_names
 from train.system.device import choose_rasterizer
 from train.system.processes import first_process_first
+from train.system.user_errors import keyed
 
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:

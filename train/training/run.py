@@ -22,17 +22,10 @@ from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, r
 from train.evaluation.scores.metrics import METRICS
 from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
 from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
-from train.networks import (
-    CLASSIFIER,
-    PYTHON,
-    WEIGHTS,
-    build_network,
-    describe,
-    export,
-    without_normalization,
-)
+from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.runs import checkpoint
 from train.runs.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
+from train.runs.saved_networks import WEIGHTS, export, without_normalization
 from train.settings import ExperimentSettings
 from train.system.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.training.initial import CachedModel, Initial, ValidationPart, choose_validation

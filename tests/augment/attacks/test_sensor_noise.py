@@ -12,7 +12,7 @@ import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
 from augment.attacks.descent import Goal
 from augment.attacks.eot import NOISE_DRAWS, stored
-from augment.attacks.losses import NO_CLASS
+from augment.losses import NO_CLASS
 from augment.settings import TrainingAttackSettings
 from renderer.errors import InputError
 

@@ -22,9 +22,9 @@ from renderer.light.presets import load_light
 from renderer.light.projector import Projector
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
+from renderer.shaded_view import ShadedView
 from renderer.surface.gloss import Gloss, SampleGloss
 from renderer.surface.microfacets import AMPLITUDE, degree_for, highlight_window, reflectance
-from renderer.surface.shaded_view import ShadedView
 from renderer.transport.lamp_paths import _reflectance
 from renderer.transport.operators import build_operators
 from renderer.transport.rays import Rays

@@ -19,7 +19,7 @@ from train.audit import audit, lights
 from train.audit import audit_page as page
 from train.audit.audit import run_audit
 from train.audit.lights import KINDS, Views, adversaries, success_by_light, transfers
-from train.commands.settings import AuditSettings
+from train.command_settings import AuditSettings
 from train.evaluation.laboratory import lab_patterns as patterns
 
 CLASSES = ("orange", "other")
@@ -107,7 +107,7 @@ def given(monkeypatch, tmp_path) -> dict:
         monkeypatch.setattr(audit, name, value)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
     monkeypatch.setattr(
-        audit, "load_classifier", lambda name, weights=None: {"a": brightness(0.5), "b": chance()}[name]
+        audit, "load_network", lambda name, weights=None: {"a": brightness(0.5), "b": chance()}[name]
     )
     meshes = {
         "meshes": ["solid:orange:0"],
@@ -167,7 +167,7 @@ def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_render
         Image.new("RGB", (8, 8), "black" if label == "orange" else "white").save(tmp_path / "lab" / label / "a.png")
     folders = {"look_alikes": [], "laboratory": str(tmp_path / "lab"), "out": str(tmp_path / "ready")}
     monkeypatch.setattr(
-        audit, "load_classifier", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name])
+        audit, "load_network", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name])
     )
     monkeypatch.setattr(
         audit, "transfers", lambda *arguments: {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}

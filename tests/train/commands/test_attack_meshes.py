@@ -16,8 +16,8 @@ from renderer.light.presets import probe
 from renderer.visibility.rasterizers import opengl
 from scripts.attack import main as attack_command
 from tests.runs import loaded_run
+from train.command_settings import AttackExperimentSettings
 from train.commands.attack_meshes import attacks, overrides
-from train.commands.settings import AttackExperimentSettings
 from train.report.attack_tables import format_attack
 
 CLASSES = ("orange", "lime", "sky")

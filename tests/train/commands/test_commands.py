@@ -22,9 +22,10 @@ from renderer.light.light_files import save_light
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
 from train.commands.fit import grab_cut
-from train.networks import WideResNet, describe, load_run
+from train.networks import WideResNet, describe
 from train.runs.checkpoint import BEST, save
 from train.runs.run_folder import LOCK, sole_writer
+from train.runs.saved_networks import load_run
 
 USER_ERROR = 2
 CLASSES = ["fig", "lime", "orange"]

@@ -9,12 +9,13 @@ from safetensors import safe_open
 
 from renderer.errors import InputError
 from renderer.io.images import read_square
+from train.command_settings import EvaluateSettings, PublishSettings
 from train.commands.evaluate import evaluate
 from train.commands.publish import publish_network
-from train.commands.settings import EvaluateSettings, PublishSettings
-from train.networks import PUBLISHED, load_run, load_selected
 from train.report.summary import summarize
 from train.runs import checkpoint
+from train.runs.saved_networks import PUBLISHED, load_run, load_selected
+from train.system.hashing import content_hash
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
@@ -43,7 +44,7 @@ def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_pat
         load_run(first).detect(torch.zeros(1, 3, 16, 16))
     publish_network(PublishSettings(str(first), str(first), 0.5, str(photos)))
     publish_network(PublishSettings(str(first), str(second)))
-    hashes = [checkpoint.content_hash(sorted(load_selected(folder)[1].items())) for folder in (first, second)]
+    hashes = [content_hash(sorted(load_selected(folder)[1].items())) for folder in (first, second)]
     assert hashes[0] == hashes[1]
     network = load_run(second)
     files = [path for path in sorted(photos.rglob("*.png")) if path.parent.name != "orange"]

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from augment import distributed
-from augment.attacks.losses import ranking_loss
+from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet

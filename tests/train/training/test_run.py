@@ -15,19 +15,20 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment.attacks.losses import complementary_label
+from augment.losses import complementary_label
 from augment.scene.build import build_scene
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run, finish, loaded_run
 from train.data import batches
 from train.data.load import load_data
-from train.networks import load_run
 from train.report.comparison import format_table
 from train.report.report_page import write_report
 from train.report.summary import summarize
 from train.runs import checkpoint
 from train.runs.run_folder import read_metrics
+from train.runs.saved_networks import load_run
+from train.system.hashing import content_hash
 from train.system.processes import Interrupted
 from train.system.user_errors import one_sentence
 from train.training import loop
@@ -37,7 +38,7 @@ from train.training.run import describe_test_images
 
 def weights(folder: Path) -> list[str]:
     """Hashes of the last and the selected ones."""
-    return [checkpoint.content_hash(checkpoint.load(folder / name)["model"]) for name in ("last.pt", "best.pt")]
+    return [content_hash(checkpoint.load(folder / name)["model"]) for name in ("last.pt", "best.pt")]
 
 
 def metrics(folder: Path) -> list[dict]:

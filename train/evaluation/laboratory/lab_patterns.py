@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from augment.scene import patterns
-from train.commands.settings import SLIDES
+from train.command_settings import SLIDES
 
 RESOLUTION = 512  # pixels per side of a projected image
 
@@ -115,7 +115,7 @@ def _sampled(image: np.ndarray, points: Tensor, order: int) -> Tensor:
     return torch.from_numpy(np.stack(channels))
 
 
-FAMILIES = {  # see PATTERNS in train/commands/settings.py
+FAMILIES = {  # see PATTERNS in train/command_settings.py
     family.__name__: family
     for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
 }

@@ -29,11 +29,10 @@ from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
-from train.commands.settings import LabSettings
+from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, FOREIGN, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
-from train.runs.results import require_replaceable
 from train.runs.run_folder import LOCK, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
@@ -119,21 +118,14 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     return shapes
 
 
-def render_laboratory(settings: LabSettings) -> None:
-    """Render the laboratory of pnb-lab, and print what was written."""
-    count = write_laboratory(settings)
-    print(f"{settings.out}: {count} renders under {settings.setups} setups")
-
-
 def write_laboratory(settings: LabSettings) -> int:
     """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
 
-    The folder has class folders of PNG files, photos.csv and lab.json, as `train.photographs` reads them. InputError: a
+    The folder has class folders of PNG files, photos.csv and lab.json, as `train.data.photographs` reads them. InputError: a
     folder that is not empty; meshes that cannot be read or have no label; no mesh of a label under study, or no other;
     Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
-    require_replaceable(out, "out", settings.overwrite)
     subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
     environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
     labels = label_names(settings.label)

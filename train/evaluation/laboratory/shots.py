@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from augment.random_streams import stream_seed
 from renderer.light.harmonics import equirectangular
-from train.commands.settings import LabSettings
+from train.command_settings import LabSettings
 from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
 
 FOV = 25.0  # degrees, of the camera

@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from augment.attacks.losses import log_odds
 from augment.classifiers.adapter import Label, NetworkCall, as_class_names
+from augment.losses import log_odds
 from augment.model_passes import eval_mode
 from augment.progress import progress
 from renderer.errors import InputError, in_one_line, require_range

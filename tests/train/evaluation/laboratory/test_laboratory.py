@@ -14,7 +14,7 @@ from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import corner_normals
 from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS, solid
-from train.commands.settings import LabSettings
+from train.command_settings import LabSettings
 from train.data.photographs import find_photographs, load_photographs
 from train.evaluation.laboratory import lab_patterns as patterns
 from train.evaluation.laboratory import laboratory as lab

@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.attacks.losses import (
+from augment.losses import (
     NO_CLASS,
     adversarial_cost,
     complementary_label,

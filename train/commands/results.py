@@ -11,11 +11,11 @@ from train.data import photographs
 from train.evaluation.scores.predictions import PREDICTIONS
 from train.evaluation.scores.scoring import CONTACT_SHEET, SUMMARY
 from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
-from train.networks import PUBLISHED, WEIGHTS
 from train.report.report_page import PAGE
 from train.report.summary import is_finished
 from train.runs import checkpoint
 from train.runs.run_folder import CONFIG, METRICS, read_config
+from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
 # By command, the files that show its results in a folder: patterns of `Path.glob`, the most telling first.
 OF_AUDIT = ("*/recognized.json",)

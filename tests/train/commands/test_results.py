@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 import renderer
+from train.commands.results import require_new_run, require_replaceable
 from train.networks import WideResNet, describe
 from train.runs.checkpoint import BEST, LAST, save
-from train.runs.results import require_new_run, require_replaceable
 from train.runs.run_folder import write_config
 
 USER_ERROR = 2

@@ -1,0 +1,86 @@
+"""The metrics of an epoch: their names, and their line on the console."""
+
+from collections.abc import Mapping
+from statistics import fmean
+
+from tqdm import tqdm
+
+from train.runs.run_folder import PHASES
+
+# The diagnostics of each round that metrics.jsonl shows.
+SHOWN = ("attack_success_before", "attack_success", "steps")
+
+
+def epoch_metrics(
+    trained: Mapping[str, float],
+    validated: Mapping[str, float],
+    diagnostics: list[Mapping[str, float]],
+    seconds: Mapping[str, float],
+) -> dict[str, float]:
+    """Name the metrics of an epoch as metrics.jsonl and TensorBoard have them.
+
+    Args:
+        trained: The metrics on the training images.
+        validated: The metrics on the validation images.
+        diagnostics: The diagnostics of the renders of each round.
+        seconds: The time that each phase took.
+
+    Returns:
+        The metrics by group/name. Groups are train, validation, augment (means over the rounds),
+        seconds and, with several rounds, round_1, round_2 and so on.
+    """
+    augment = {name: fmean(part[name] for part in diagnostics) for name in diagnostics[0]}
+    groups = {
+        "train": trained,
+        "validation": validated,
+        "augment": augment,
+        "seconds": seconds,
+    }
+    if len(diagnostics) > 1:
+        for number, part in enumerate(diagnostics, 1):
+            groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
+    return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+
+
+def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
+    """Write the line of an epoch for the console.
+
+    Args:
+        epoch: The epoch, from 1.
+        epochs: The number of epochs.
+        metrics: The metrics of the epoch, by the names of `epoch_metrics`.
+
+    Returns:
+        The line.
+    """
+    total = sum(metrics[f"seconds/{name}"] for name in PHASES)
+    parts = [
+        f"epoch {epoch}/{epochs}",
+        f"train loss {metrics['train/loss']:.3f} accuracy {metrics['train/accuracy']:.3f}",
+        f"validation accuracy {metrics['validation/accuracy']:.3f}",
+    ]
+    success = attack_success(metrics, "augment/")
+    if success is not None:
+        correct = 1 - metrics["augment/attack_success_before"]
+        parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
+    duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"
+    left = total * (epochs - epoch)
+    if left:
+        duration += f"; about {tqdm.format_interval(left)} left"
+    return "  ".join([*parts, duration])
+
+
+def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
+    """Compute how often an attack succeeds on examples that are correct before it.
+
+    Args:
+        diagnostics: The diagnostics of the attack.
+        prefix: What the names of the diagnostics begin with.
+
+    Returns:
+        The fraction of these examples, or None if there are none.
+    """
+    before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
+    if before == 1:
+        return None
+    return (diagnostics[f"{prefix}attack_success"] - before) / (1 - before)

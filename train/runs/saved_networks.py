@@ -1,0 +1,226 @@
+"""The networks that runs have trained: finding, loading, publishing and exporting them."""
+
+import io
+import json
+import textwrap
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+
+from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
+from augment.classifiers.adapter import Normalized
+from renderer.errors import InputError, in_one_line
+from renderer.io.files import write_whole
+from renderer.validation import as_path, require_kind
+from train.networks import PYTHON, WIDERESNET, build_network
+from train.runs.checkpoint import BEST, checked, load
+from train.settings import published
+
+# The name of a trained network among the sources of classifiers is this, and then a folder.
+RUN = "run:"
+# The file of a published network, in half precision.
+PUBLISHED = "model.safetensors"
+# The file of a network that began as a classifier, whose weights have the names of its own file.
+WEIGHTS = "weights.pt"
+# What the file of a published network tells besides the weights.
+PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
+# What is stored in the description of a network, but does not build it.
+FACTS = ("version", "encoding", "validation")
+# Characters of a reason in an error, at most.
+LONGEST_REASON = 300
+
+
+def load_network(name: str, weights: str | Path | None = None) -> Classifier:
+    """Load a classifier by its name: a trained network, or one that was trained elsewhere.
+
+    Args:
+        name: "run:FOLDER" for the network of a run, or a name that `augment.load_classifier`
+            takes.
+        weights: A local file of weights, if the source brings none.
+
+    Returns:
+        The classifier.
+
+    Raises:
+        InputError: There is no such network, or the weights are not for it.
+    """
+    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    if name.startswith(RUN):
+        return load_run(name.removeprefix(RUN), weights)
+    return load_classifier(name, weights)
+
+
+def load_run(
+    run: str | Path, weights: str | Path | None = None, model: str | None = None
+) -> Classifier:
+    """Load the network that a run selected.
+
+    Args:
+        run: The folder of the run, a folder below pretrained/, or a file of either.
+        weights: None. A run has its own weights.
+        model: "python:package.module:function", if such a function makes the network. Code runs
+            because the user names it, and never because a file does.
+
+    Returns:
+        The network.
+
+    Raises:
+        InputError: There is no such network, `weights` is given, or `model` is missing.
+
+    Example:
+        >>> load_run("pretrained/best").size
+        32
+    """
+    if weights is not None:
+        given = f"weights={weights} is not for classifier={RUN}{run}"
+        raise InputError(f"{given}, which has its own: leave it out")
+    require_kind("model", model, str | None, "python:package.module:function, or None")
+    path, state = load_selected(as_path("run", run))
+    shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
+    name = str(shape.get("name", WIDERESNET))
+    if name.startswith(PYTHON) and name != model:
+        problem = f"the network in {path} is made by {name}"
+        attack = "for an attack, classifier=python: with a function that loads the weights"
+        raise InputError(f"{problem}: give model={name} to run that code or, {attack}")
+    with of_one_architecture(path):
+        size = int(shape.pop("size"))
+        classes = tuple(map(str, shape.pop("classes")))
+        network = build_network(classes, size, **shape)
+        network.load_state_dict(state["model"])
+        classifier = Classifier(network, size, classes, f"{RUN}{run}")
+        classifier.operating_points = _operating_points(state)
+        for point in classifier.operating_points:
+            classifier.label(point.label)  # This raises InputError if the class is missing.
+        return classifier
+
+
+def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
+    """Return the operating points that are stored with a network: none, one or several."""
+    stored = state.get("operating_point", [])
+    if not isinstance(stored, list):
+        stored = [stored]
+    return [OperatingPoint(**facts) for facts in stored]
+
+
+@contextmanager
+def of_one_architecture(path: Path) -> Iterator[None]:
+    """Raise InputError if a file does not fit the network that is built or filled inside.
+
+    Args:
+        path: The file that the error names.
+    """
+    try:
+        yield
+    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
+        reason = textwrap.shorten(in_one_line(error), LONGEST_REASON)
+        problem = f"checkpoint {path} is from another architecture ({reason})"
+        raise InputError(f"{problem}: use the model settings of its training") from error
+
+
+def is_classifier(name: str) -> bool:
+    """Say whether `train.init_from` names a classifier, rather than a run or a file.
+
+    Args:
+        name: The name.
+
+    Returns:
+        Whether it is the name of a classifier that was trained elsewhere.
+    """
+    source, colon, _ = name.partition(":")
+    return source + colon in SOURCES
+
+
+def selected_file(run: Path) -> Path | None:
+    """Find the file of a run's selected network.
+
+    Args:
+        run: The folder of the run, a folder below pretrained/, or a file of either.
+
+    Returns:
+        best.pt, model.safetensors or the file itself. None if there is no such file.
+    """
+    found = published(run)
+    for file in (found, found / BEST, found / PUBLISHED):
+        if file.is_file():
+            return file
+    return None
+
+
+def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Read a run's selected network.
+
+    Args:
+        run: The folder of the run, a folder below pretrained/, or a file of either.
+
+    Returns:
+        The file and its content.
+
+    Raises:
+        InputError: There is no such file, or it is damaged.
+    """
+    path = selected_file(run)
+    if path is None:
+        problem = f"run={run} holds neither {BEST} nor {PUBLISHED}"
+        raise InputError(f"{problem}: give a folder that pnb-train wrote")
+    if path.suffix == ".safetensors":
+        return path, _load_published(path)
+    return path, load(path)
+
+
+def publish(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint's network in half precision.
+
+    Args:
+        path: The safetensors file. Its metadata tell the architecture and other facts.
+        state: The checkpoint.
+    """
+    metadata = {
+        key: json.dumps(state[key], ensure_ascii=False) for key in PUBLISHED_FACTS if key in state
+    }
+    weights = {}
+    for name, value in state["model"].items():
+        weights[name] = value.half().contiguous() if value.is_floating_point() else value
+    write_whole(path, safetensors.torch.save(weights, metadata), durable=True)
+
+
+def _load_published(path: Path) -> dict[str, Any]:
+    """Read a file that `publish` wrote, in single precision."""
+    weights: dict[str, Tensor] = {}
+    try:
+        with safe_open(path, "pt") as file:
+            facts = {name: json.loads(text) for name, text in file.metadata().items()}
+            for name in file.keys():  # noqa: SIM118 (The file is no mapping.)
+                value = file.get_tensor(name)
+                weights[name] = value.float() if value.is_floating_point() else value
+    except Exception as error:  # safetensors and JSON raise many kinds for a foreign file.
+        problem = f"checkpoint {path} is damaged or lacks its architecture"
+        raise InputError(f"{problem}; use another one") from error
+    return checked({**facts, "model": weights}, path)
+
+
+def export(path: Path, network: nn.Module) -> None:
+    """Write the weights of a network that began as a classifier.
+
+    Args:
+        path: The file, for `torch.load`. Its weights have the names of the classifier's own file.
+        network: The network.
+    """
+    state = without_normalization(network).state_dict()
+    content = io.BytesIO()
+    torch.save({name: value.cpu() for name, value in state.items()}, content)
+    write_whole(path, content.getbuffer(), durable=True)
+
+
+def without_normalization(network: nn.Module) -> nn.Module:
+    """Return the network whose parameters have the names of its own file.
+
+    Args:
+        network: The network, which may be wrapped in its normalization.
+    """
+    return network.network if isinstance(network, Normalized) else network
