@@ -23,8 +23,9 @@ from augment.model_passes import as_found
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
 from augment.scene.build import Shown, build_scene
+from augment.scene.conditions import Conditions
 from augment.scene.degree import with_needed_degree
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import AugmentationSettings
 from renderer.errors import InputError, describe

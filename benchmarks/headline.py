@@ -18,7 +18,7 @@ from matplotlib.patches import FancyBboxPatch
 from PIL import Image
 
 import augment
-from augment.scene.scene import Conditions
+from augment.scene.conditions import Conditions
 from renderer.image import to_bytes, to_unit
 from renderer.io.images import read_image
 from renderer.light.basis import parts_of

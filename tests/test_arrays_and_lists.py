@@ -93,8 +93,8 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
         LIGHT,
         lambda x: render_scene(augment.build_scene([(MESH, "a")], SIZE, light=x, samples=1)),
     ),
-    "lights of a scene": (LIGHT, lambda x: render_scene(replace(SCENE, lights=x))),
-    "backgrounds of a scene": (IMAGES[:1], lambda x: render_scene(replace(SCENE, backgrounds=x))),
+    "lights of a scene": (LIGHT, lambda x: render_scene(SCENE.changed(lights=x))),
+    "backgrounds of a scene": (IMAGES[:1], lambda x: render_scene(SCENE.changed(backgrounds=x))),
     "examples": (torch.tensor([1, 0]), lambda x: SCENE.render(SCENE.conditions(LABELS), x)),
     "images": (IMAGES, CLASSIFIER),
     "labels": (

@@ -17,7 +17,7 @@ import augment
 import renderer
 from augment.attacks.attack import AttackResult
 from augment.progress import Phases
-from augment.scene.scene import Conditions
+from augment.scene.conditions import Conditions
 from augment.settings import RandomLightSettings
 from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
@@ -776,7 +776,7 @@ SCENES = [
     ),
     *calls_of(
         "backgrounds",
-        lambda x: replace(small_scene(), backgrounds=x),
+        lambda x: small_scene().changed(backgrounds=x),
         "gray",
         None,
         BYTES,
@@ -785,7 +785,7 @@ SCENES = [
     ),
     *calls_of(
         "lights",
-        lambda x: replace(small_scene(), lights=x),
+        lambda x: small_scene().changed(lights=x),
         "grace",
         None,
         LIGHT[:9],
@@ -793,9 +793,9 @@ SCENES = [
         LIGHT * NAN,
         LIGHT.long() > 0,
     ),
-    *calls_of("examples", lambda x: replace(small_scene(), examples=x), [], None, [3], "all"),
-    *calls_of("objects", lambda x: replace(small_scene(), objects=x), [MESH], None, [], "orange"),
-    *calls_of("settings", lambda x: replace(small_scene(), settings=x), None, 8, {"size": 8}),
+    *calls_of("examples", lambda x: small_scene().changed(examples=x), [], None, [3], "all"),
+    *calls_of("objects", lambda x: small_scene().changed(objects=x), [MESH], None, [], "orange"),
+    *calls_of("settings", lambda x: small_scene().changed(settings=x), None, 8, {"size": 8}),
     *calls_of("conditions", lambda x: small_scene().render(x, torch.arange(2)), None, LIGHT, "now"),
     *calls_of(
         "examples",
@@ -965,9 +965,9 @@ def returning(value: Any) -> augment.Classifier:
 
 
 DIRECT = [
-    *calls_of("rasterizer", lambda x: replace(small_scene(), rasterizer=x), "numpy", None),
-    *calls_of("basis", lambda x: replace(small_scene(), basis=x), "harmonics", None, 6),
-    *calls_of("camera_effects", lambda x: replace(small_scene(), camera_effects=x), 3, "blur"),
+    *calls_of("rasterizer", lambda x: small_scene().changed(rasterizer=x), "numpy", None),
+    *calls_of("basis", lambda x: small_scene().changed(basis=x), "harmonics", None, 6),
+    *calls_of("camera_effects", lambda x: small_scene().changed(camera_effects=x), 3, "blur"),
     *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes", None),
     *calls_of("classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}),

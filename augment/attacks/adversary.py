@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import SceneObject
-from augment.scene.scene import Conditions, Example, Scene
+from augment.scene.scene import Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
     FACTOR,

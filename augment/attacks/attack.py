@@ -24,8 +24,9 @@ from augment.losses import logit_gap
 from augment.model_passes import BatchSize
 from augment.progress import Phases, progress
 from augment.random_streams import generator
+from augment.scene.conditions import Conditions
 from augment.scene.degree import NOTICED, with_needed_degree
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from renderer.errors import InputError, is_whole
 from renderer.light.harmonics import irradiance_error
 from renderer.validation import as_list, require_flag, require_kind, require_seed

@@ -1,7 +1,6 @@
 """All parameters that an attack changes, as one vector of values."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,7 +10,8 @@ from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.settings import AttackSettings
 from augment.progress import progress
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 
 
 class AttackProblem:
@@ -176,7 +176,7 @@ def build_problem(settings: AttackSettings, scene: Scene) -> AttackProblem:
         light of the scene is first made physically possible.
     """
     if not settings.allow_negative:
-        scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
+        scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
     parameters = []
     for name, steps in settings.parameters.items():
         options = {}

@@ -146,7 +146,7 @@ def _under_lights(scene: Scene, skies: Tensor) -> Scene:
     sky = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)
     local_lights = scene.lights.repeat(count, 1, 1)[:, sky.shape[1] :]
     lights = torch.cat([sky, local_lights], dim=1)
-    return replace(scene, examples=[*scene.examples] * count, lights=lights)
+    return scene.changed(examples=[*scene.examples] * count, lights=lights)
 
 
 @torch.no_grad()

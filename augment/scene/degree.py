@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -183,7 +182,7 @@ def with_needed_degree(
         if scene.lights.shape[1:] == built.shape and (scene.lights == built.to(scene.lights)).all():
             reached.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, reached.gloss)
-            return replace(scene, basis=basis, lights=lights.to(scene.lights))
+            return scene.changed(basis=basis, lights=lights.to(scene.lights))
     if scene.lights[:, degree**2 : (degree + 1) ** 2].any():  # it may go on
         reached.warn(f"degree={degree}", degree)
     return scene

@@ -30,7 +30,7 @@ from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import Rasterizer
 
 if TYPE_CHECKING:
-    from augment.scene.scene import Conditions
+    from augment.scene.conditions import Conditions
 
 NEAR = 0.001  # world units: shadows and bounces are computed again once a coordinate has moved farther
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
+from inspect import signature
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from augment.memory import attack_bytes, require_memory
 from augment.progress import progress
+from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import SceneObject
 from augment.scene.relighting import Layer, Relighting
 from augment.scene.reshading import Reshading
@@ -30,133 +32,139 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-AT_ONCE = 2**24  # pixels of the images that are rendered at once
+# The pixels of the images that are rendered at a time.
+AT_ONCE = 2**24
+# More views than this are counted on the console. A step of few views would take 4 % longer.
+UNCOUNTED_VIEWS = 8
 
 
-@dataclass(frozen=True)
-class Example:
-    """A row of a scene: an object from V cameras before a background.
-
-    object, background: indices into the scene's lists. exposure: multiplies the light.
-    """
-
-    object: int
-    cameras: tuple[Camera, ...]
-    background: int
-    exposure: float = 1.0
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """The light, shape and colors that A examples are rendered with.
-
-    light: coefficients of the scene's basis. vertices: None for those of the meshes. albedo: added to each face's
-    linear albedo. pixels: added to the values of the V images. positions: of the lamps, None for those of the basis.
-    cameras: what is added to the polar angle, the azimuth and the logarithm of the distance of all V cameras. gloss:
-    roughness, metallic and strength, which gloss textures multiply. hue: by which a changed albedo is turned, radians.
-    N and F are the largest mesh's; a smaller mesh has the first of them.
-    """
-
-    light: Float[Tensor, "A coefficients 3"]
-    vertices: Float[Tensor, "A N 3"] | None = None
-    albedo: Float[Tensor, "A F 3"] | None = None
-    pixels: Float[Tensor, "A V 3 size size"] | None = None
-    positions: Float[Tensor, "A L 3"] | None = None
-    cameras: Float[Tensor, "A 3"] | None = None
-    gloss: Float[Tensor, "A F 3"] | Float[Tensor, "A 1 3"] | None = None
-    hue: Float[Tensor, "A F"] | None = None
-
-    def __post_init__(self) -> None:
-        for name, values in vars(self).items():
-            if values is not None and not isinstance(values, Tensor):
-                object.__setattr__(self, name, as_tensor(name, values))
-
-    def row(self, index: int, mesh: Mesh) -> Conditions:
-        """One row as it is for its mesh, without the first dimension."""
-        counts = {"vertices": len(mesh.vertices), **dict.fromkeys(("albedo", "gloss", "hue"), len(mesh.faces))}
-        given = {name: values for name, values in vars(self).items() if values is not None}
-        return Conditions(**{name: values[index, : counts.get(name)] for name, values in given.items()})
-
-
-@dataclass(eq=False, repr=False)
 class Scene:
-    """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
+    """E examples of V views each, over B backgrounds.
 
-    While the light alone changes, nothing is rasterized after the first time: the transfer operators of many views are
-    stacked (`Relighting`). Where vertices move, a view is rasterized each time (`Reshading`). lights: (E, size, 3), or
-    (size, 3) for all, where attacks begin; images have their dtype and device. basis: of the lights'
-    coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered images (A, V, 3, size,
-    size) and their examples (A,); see `draw_camera_effects`. one_light: without operators, for views shown once.
-    lights_of_degree: the basis and the lights (size, 3) of another degree, and for gloss of a roughness, where a name
-    tells what they are.
+    While the light alone changes, nothing is rasterized after the first time: the transfer
+    operators of many views are stacked (see `Relighting`). A view whose vertices move is
+    rasterized each time (see `Reshading`).
 
-    >>> from augment.scene.build import build_scene
-    >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
-    >>> examples = torch.arange(len(scene))
-    >>> scene.render(scene.conditions(examples), examples).shape
-    torch.Size([2, 1, 3, 8, 8])
+    Args:
+        objects: The objects.
+        examples: The examples, which have the same number of views.
+        backgrounds: The backgrounds, with values in [0, 1], shape (B, 3, size, size) or
+            (B, 1, size, size).
+        lights: The lights where attacks begin, shape (E, coefficients, 3), or (coefficients, 3)
+            for all examples. Images have their dtype and device.
+        settings: The settings of the images.
+        rasterizer: The rasterizer.
+        basis: The basis of the lights' coefficients, by default 49 harmonics.
+        camera_effects: A differentiable function of rendered images (A, V, 3, size, size) and
+            their examples (A,). See `draw_camera_effects`.
+        one_light: Whether the views are shown once, so that no operators are built.
+        lights_of_degree: Returns the basis and the lights (coefficients, 3) of another degree,
+            for gloss of a roughness. None if the lights are known by their coefficients alone.
+
+    Attributes:
+        views: The number of views of an example.
+        object_of: The index of the object of each example, shape (E,).
+        at_once: The number of examples that are rendered at a time.
+        attack_bytes: The memory that an attack on the light needs beside the operators.
+
+    Raises:
+        InputError: An argument is of another kind, shape or range, or memory is too small.
+
+    Example:
+        >>> from augment.scene.build import build_scene
+        >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
+        >>> examples = torch.arange(len(scene))
+        >>> scene.render(scene.conditions(examples), examples).shape
+        torch.Size([2, 1, 3, 8, 8])
     """
 
-    objects: Sequence[SceneObject]
-    examples: Sequence[Example]
-    backgrounds: Tensor
-    lights: Tensor
-    settings: ImageSettings
-    rasterizer: Rasterizer
-    basis: Basis = HARMONICS
-    camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
-    one_light: bool = False
-    lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None
-
-    def __post_init__(self) -> None:
-        require_kind("settings", self.settings, ImageSettings, "renderer.ImageSettings(size)")
-        require_kind("basis", self.basis, Basis, "a basis of light, such as Harmonics(degree)")
-        require_kind("camera_effects", self.camera_effects, Callable | None, "a function of images and examples")
-        if not hasattr(self.rasterizer, "rasterize"):
+    def __init__(
+        self,
+        objects: Sequence[SceneObject],
+        examples: Sequence[Example],
+        backgrounds: Tensor,
+        lights: Tensor,
+        settings: ImageSettings,
+        rasterizer: Rasterizer,
+        basis: Basis = HARMONICS,
+        camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None,
+        one_light: bool = False,
+        lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None,
+    ):
+        require_kind("settings", settings, ImageSettings, "renderer.ImageSettings(size)")
+        require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
+        effects = "a function of images and examples"
+        require_kind("camera_effects", camera_effects, Callable | None, effects)
+        if not hasattr(rasterizer, "rasterize"):
             advice = "give renderer.visibility.rasterizers.choose(name)"
-            raise InputError(f"rasterizer is {describe(self.rasterizer)}: {advice}")
-        self.objects = as_list("objects", self.objects, SceneObject, "a list of scene objects")
-        self.examples = as_list("examples", self.examples, Example, "a list of examples")
-        self.lights = as_tensor("lights", self.lights)
-        self.backgrounds = as_tensor("backgrounds", self.backgrounds)
-        require_bounded(lights=self.lights)
-        size, device = self.settings.size, self.lights.device
-        if not self.examples:
-            raise InputError("examples is empty: give at least one mesh, one view and one background")
-        if max(example.object for example in self.examples) >= len(self.objects):
-            raise InputError(f"objects holds {len(self.objects)}: give all that the examples name")
-        if self.lights.shape[-2:] != (self.basis.size, 3):
-            raise InputError(f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows")
-        fit = self.backgrounds.shape[1:] in ((1, size, size), (3, size, size))
-        if not (fit and self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
-            raise InputError(f"backgrounds: give (B, 3, {size}, {size}) of values in [0, 1]")
-        radii = [item.radius for item in self.objects]  # a camera's depth range holds the whole object
-        cameras = [tuple(camera.seeing(radii[row.object]) for camera in row.cameras) for row in self.examples]
-        self.examples = [replace(row, cameras=views) for row, views in zip(self.examples, cameras, strict=True)]
-        self.backgrounds = self.backgrounds.to(self.lights)
-        self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
-        self.views = len(self.examples[0].cameras)  # per example
-        self.object_of = torch.tensor([example.object for example in self.examples], device=device)  # (E,)
-        self._background = torch.tensor([example.background for example in self.examples], device=device)
-        exposures = torch.tensor([example.exposure for example in self.examples])
-        self._exposure = exposures.to(self.lights)[:, None, None]
-        views = [(example.object, camera) for example in self.examples for camera in example.cameras]
-        self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
-        renders = f"{len(views)} renders of {size} pixels per side (meshes × views × backgrounds)"
-        pixels_per_example = self.views * size**2
+            raise InputError(f"rasterizer is {describe(rasterizer)}: {advice}")
+        self.objects = as_list("objects", objects, SceneObject, "a list of scene objects")
+        examples = as_list("examples", examples, Example, "a list of examples")
+        lights = as_tensor("lights", lights)
+        backgrounds = as_tensor("backgrounds", backgrounds)
+        _require_examples(examples, self.objects)
+        _require_lights(lights, basis)
+        _require_backgrounds(backgrounds, settings.size)
+
+        self.settings = settings
+        self.rasterizer = rasterizer
+        self.basis = basis
+        self.camera_effects = camera_effects
+        self.one_light = one_light
+        self.lights_of_degree = lights_of_degree
+        # The depth range of a camera holds the whole object.
+        self.examples = [self._seeing(example) for example in examples]
+        self.backgrounds = backgrounds.to(lights)
+        self.lights = lights.expand(len(examples), *lights.shape[-2:])
+        self.views = len(examples[0].cameras)
+        device = lights.device
+        self.object_of = torch.tensor([row.object for row in examples], device=device)
+        self._background = torch.tensor([row.background for row in examples], device=device)
+        exposures = torch.tensor([row.exposure for row in examples])
+        self._exposure = exposures.to(lights)[:, None, None]
+
+        pixels_per_example = self.views * settings.size**2
+        self.at_once = max(1, AT_ONCE // pixels_per_example)
         self.attack_bytes = attack_bytes(
             pixels=len(self) * pixels_per_example,
             pixels_at_once=min(len(self), self.at_once) * pixels_per_example,
             lights=self.lights,
-            camera_effects=self.camera_effects is not None,
+            camera_effects=camera_effects is not None,
         )
-        require_memory(renders, self.attack_bytes, device)
-        shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
-        # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
-        build = partial(build_operators, **shading, dtype=self.lights.dtype)
-        behind, backgrounds = self._background.repeat_interleave(self.views), self.backgrounds.flatten(2)
-        self._relighting = Relighting(self.objects, views, behind, backgrounds, self.settings, build, self.attack_bytes)
-        self._reshading = Reshading(self.objects, like=self.lights, cached=not self.one_light, **shading)
+        count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
+        require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
+        self._relighting = self._build_relighting()
+        self._reshading = Reshading(
+            self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
+        )
+
+    def _seeing(self, example: Example) -> Example:
+        """Return an example whose cameras have a depth range that holds the whole object."""
+        radius = self.objects[example.object].radius
+        return replace(example, cameras=tuple(camera.seeing(radius) for camera in example.cameras))
+
+    def _build_relighting(self) -> Relighting:
+        """Prepare the operators of all views, which are built when they are first needed."""
+        views = [(row.object, camera) for row in self.examples for camera in row.cameras]
+        # This is no method of `self`: a reference back would keep the scenes of all epochs in
+        # memory.
+        build = partial(
+            build_operators,
+            settings=self.settings,
+            rasterizer=self.rasterizer,
+            basis=self.basis,
+            dtype=self.lights.dtype,
+        )
+        behind = self._background.repeat_interleave(self.views)
+        return Relighting(
+            self.objects,
+            views,
+            behind,
+            self.backgrounds.flatten(2),
+            self.settings,
+            build,
+            self.attack_bytes,
+        )
 
     @classmethod
     def grid(
@@ -168,11 +176,40 @@ class Scene:
         shared: bool = False,
         **options: Any,
     ) -> Scene:
-        """Every object from every camera over every background, in that order; or with `shared`, where the views share
-        one light or shape, every object over every background from all cameras. of_scene, options: of `Scene`."""
+        """Build a scene of every object from every camera over every background, in that order.
+
+        Args:
+            objects: The objects.
+            cameras: The cameras.
+            backgrounds: The backgrounds, shape (B, 3, size, size) or (B, 1, size, size).
+            of_scene: Further arguments of `Scene`, by position.
+            shared: Whether the cameras are the views of one example, which share one light and
+                one shape. Otherwise each camera makes an example of its own.
+            options: Further arguments of `Scene`, by name.
+
+        Returns:
+            The scene.
+        """
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
-        examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
+        examples = [
+            Example(number, view, background)
+            for number, view, background in product(
+                range(len(objects)), views, range(len(backgrounds))
+            )
+        ]
         return cls(objects, examples, backgrounds, *of_scene, **options)
+
+    def changed(self, **arguments: Any) -> Scene:
+        """Return a scene with some other arguments.
+
+        Args:
+            arguments: Arguments of `Scene` that are replaced, by name.
+
+        Returns:
+            The scene.
+        """
+        own = {name: getattr(self, name) for name in _ARGUMENTS}
+        return Scene(**own | arguments)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -189,7 +226,7 @@ class Scene:
 
     @cached_property
     def vertices(self) -> Tensor:
-        """(M, N, 3) of each object; those of smaller meshes end in zeros."""
+        """The vertices of each object, shape (M, N, 3). Those of smaller meshes end in zeros."""
         return torch.nn.utils.rnn.pad_sequence(self._reshading.vertices, batch_first=True)
 
     @property
@@ -198,99 +235,195 @@ class Scene:
         return self._relighting.stacks
 
     def mesh(self, example: int) -> Mesh:
-        """The mesh of an example."""
+        """Return the mesh of an example, which is given by its index."""
         return self.objects[self.examples[example].object].mesh
 
     def basis_under(self, conditions: Conditions, row: int) -> Basis:
-        """The light's basis for a row of conditions, with lamps at its positions."""
-        return self.basis if conditions.positions is None else self.basis.moved(conditions.positions[row].detach())
+        """Return the basis of the light under some conditions.
+
+        Args:
+            conditions: The conditions.
+            row: The row of the conditions.
+
+        Returns:
+            The basis, with lamps at the positions of the row.
+        """
+        if conditions.positions is None:
+            return self.basis
+        return self.basis.moved(conditions.positions[row].detach())
 
     def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
-        """The cameras of an example under a row of conditions."""
+        """Return the cameras of an example under some conditions.
+
+        Args:
+            conditions: The conditions.
+            row: The row of the conditions.
+            example: The index of the example.
+
+        Returns:
+            The V cameras.
+        """
         cameras = self.cameras[example]
         if conditions.cameras is None:
             return cameras
-        radius = 0.0 if conditions.vertices is None else float(conditions.vertices[row].detach().norm(dim=1).max())
-        return tuple(camera.moved(*conditions.cameras[row]).seeing(radius) for camera in cameras)
+        radius = 0.0
+        if conditions.vertices is not None:
+            radius = float(conditions.vertices[row].detach().norm(dim=1).max())
+        moves = conditions.cameras[row]
+        return tuple(camera.moved(*moves).seeing(radius) for camera in cameras)
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
-        """The unattacked conditions of some examples. InputError: indices that are not there."""
+        """Return the conditions of some examples before any attack.
+
+        Args:
+            examples: The indices of the examples, shape (A,).
+
+        Returns:
+            The conditions.
+
+        Raises:
+            InputError: There is no such example.
+        """
         return Conditions(self.lights[self._as_examples(examples)])
 
-    def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
-        """Images in [0, 1] of examples from their V views, differentiable in the conditions.
+    def render(
+        self, conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
+        """Render examples from their views, differentiable in the conditions.
 
-        InputError: NaN, other examples than the conditions are of.
+        Args:
+            conditions: The light, shape and colors of each example.
+            examples: The indices of the examples, shape (A,).
+
+        Returns:
+            The images, with values in [0, 1], shape (A, V, 3, size, size).
+
+        Raises:
+            InputError: There is no such example, or the conditions are of other examples or hold
+                NaN.
         """
-        require_kind("conditions", conditions, Conditions, "conditions, such as scene.conditions(examples)")
+        expected = "conditions, such as scene.conditions(examples)"
+        require_kind("conditions", conditions, Conditions, expected)
         if conditions.light.shape[1:] != (self.basis.size, 3):
-            shape, expected = tuple(conditions.light.shape), (len(self), self.basis.size, 3)
-            raise InputError(f"conditions: light has shape {shape}, give one of each example, such as {expected}")
+            given = f"light has shape {tuple(conditions.light.shape)}"
+            shape = (len(self), self.basis.size, 3)
+            raise InputError(f"conditions: {given}, give one of each example, such as {shape}")
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
-        canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
+        behind = self._background[examples].repeat_interleave(self.views)
+        canvas = self.backgrounds.flatten(2).index_select(0, behind)
         covered = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
         images = InPlace.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
-        images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
-        images = self.camera_effects(images, examples) if self.camera_effects else images
-        return images if conditions.pixels is None else clamp(images + conditions.pixels)
+        size = self.settings.size
+        images = images.view(len(examples), self.views, 3, size, size)
+        if self.camera_effects:
+            images = self.camera_effects(images, examples)
+        if conditions.pixels is not None:
+            images = clamp(images + conditions.pixels)
+        return images
 
     def _as_examples(self, examples: object, count: int | None = None) -> Tensor:
-        """Convert `count` indices of examples; InputError for others. On a GPU, the range of a tensor goes unchecked,
-        since the host would wait for it."""
+        """Convert indices of examples, `count` of them, and raise InputError for others.
+
+        On a GPU, the range of the indices goes unchecked, since the host would wait for it.
+        """
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
-            advice = f"give {'a list of' if count is None else count} indices, one for each light"
+            number = "a list of" if count is None else str(count)
+            advice = f"give {number} indices, one for each light"
             raise InputError(f"examples has shape {tuple(indices.shape)}: {advice}")
-        if (
-            indices.device.type == "cpu"
-            and len(indices)
-            and not 0 <= int(indices.min()) <= int(indices.max()) < len(self)
-        ):
-            raise InputError(f"examples names some that are not there: give indices from 0 to {len(self) - 1}")
+        if indices.device.type != "cpu" or not len(indices):
+            return indices.to(self.lights.device)
+        if int(indices.min()) < 0 or int(indices.max()) >= len(self):
+            advice = f"give indices from 0 to {len(self) - 1}"
+            raise InputError(f"examples names some that are not there: {advice}")
         return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
+        """Give the covered pixels of all images in the way that the conditions need."""
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        if self.one_light or not (conditions.vertices is conditions.albedo is conditions.gloss is None):
+        surface = (conditions.vertices, conditions.albedo, conditions.gloss)
+        if self.one_light or any(values is not None for values in surface):
             return self._reshaded(light, conditions, examples)
         if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)
         return self._relit(light, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """One product per stack of operators."""
+        """Give the layers of stacked operators, with one matrix product for each stack."""
         views = torch.arange(self.views, device=examples.device)
         images = (examples[:, None] * self.views + views).flatten()
-        return self._relighting.layers(light.repeat_interleave(self.views, dim=0) if self.views > 1 else light, images)
+        if self.views > 1:
+            light = light.repeat_interleave(self.views, dim=0)
+        return self._relighting.layers(light, images)
 
-    def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """The same products for all other light, and the lamps image by image."""
+    def _under_moved_lamps(
+        self, light: Tensor, positions: Tensor, examples: Tensor
+    ) -> Iterator[Layer]:
+        """Give the layers of all other light by operators, and add the lamps image by image."""
         where, lamps = next(part for part in self.basis.local_lights if part.basis.is_movable)
-        rest = light.clone()
-        rest[:, where] = 0
-        for rows, pixels, composite in self._relit(rest, examples):
+        other_light = light.clone()
+        other_light[:, where] = 0
+        numbers = torch.arange(len(light) * self.views, device=light.device)
+        for rows, pixels, composite in self._relit(other_light, examples):
             added = []
-            for image in torch.arange(len(light) * self.views, device=light.device)[rows].tolist():
+            for image in numbers[rows].tolist():
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
-                shown = example.object, example.cameras[view]
-                view_in_lamps, (fragments, albedo) = self._reshading.local_view(*shown), self._reshading.view(*shown)
+                camera = example.cameras[view]
+                view_in_lamps = self._reshading.local_view(example.object, camera)
+                fragments, albedo = self._reshading.view(example.object, camera)
                 radiance = view_in_lamps.radiance(lamps, albedo, light[row, where], positions[row])
                 covered = torch.searchsorted(pixels, fragments.pixels)
-                added.append(radiance.new_zeros(3, len(pixels)).index_copy(1, covered, radiance))
+                canvas = radiance.new_zeros(3, len(pixels))
+                added.append(canvas.index_copy(1, covered, radiance))
             yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
+        """Give the layer of each view, which is shaded anew."""
         views = [*product(range(len(examples)), range(self.views))]
-        counted = progress(views, "rendering views") if len(views) > 8 else views  # a bar costs a step of few views 4 %
+        counted = progress(views, "rendering views") if len(views) > UNCOUNTED_VIEWS else views
         for image, (row, view) in enumerate(counted):
-            index = int(examples[row])
-            example, changed = self.examples[index], conditions.row(row, self.mesh(index))
-            cameras = self.cameras_under(conditions, row, index)
-            shown, behind = (index, example.object, cameras[view]), self.backgrounds[example.background].flatten(1)
-            pixels, coverage, radiance = self._reshading.radiance(*shown, light[row], changed, behind)
-            term = background_term(coverage[None], behind.index_select(1, pixels), self.settings.encoding)
+            number = int(examples[row])
+            example = self.examples[number]
+            camera = self.cameras_under(conditions, row, number)[view]
+            background = self.backgrounds[example.background].flatten(1)
+            pixels, coverage, radiance = self._reshading.radiance(
+                number,
+                example.object,
+                camera,
+                light[row],
+                conditions.row(row, self.mesh(number)),
+                background,
+            )
+            behind = background.index_select(1, pixels)
+            term = background_term(coverage[None], behind, self.settings.encoding)
             yield Layer(slice(image, image + 1), pixels, (radiance + term)[None])
+
+
+# The arguments of `Scene`, which are its attributes, too.
+_ARGUMENTS = tuple(name for name in signature(Scene).parameters)
+
+
+def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject]) -> None:
+    """Raise InputError unless there are examples, and objects of all their numbers."""
+    if not examples:
+        raise InputError("examples is empty: give at least one mesh, one view and one background")
+    if max(example.object for example in examples) >= len(objects):
+        raise InputError(f"objects holds {len(objects)}: give all that the examples name")
+
+
+def _require_lights(lights: Tensor, basis: Basis) -> None:
+    """Raise InputError unless lights are finite coefficients of the basis."""
+    require_bounded(lights=lights)
+    if lights.shape[-2:] != (basis.size, 3):
+        raise InputError(f"lights has shape {tuple(lights.shape)}: give {basis.size} rows")
+
+
+def _require_backgrounds(backgrounds: Tensor, size: int) -> None:
+    """Raise InputError unless backgrounds are images of a size with values in [0, 1]."""
+    is_image = backgrounds.shape[1:] in ((1, size, size), (3, size, size))
+    if not (is_image and backgrounds.min() >= 0 and backgrounds.max() <= 1):
+        raise InputError(f"backgrounds: give (B, 3, {size}, {size}) of values in [0, 1]")

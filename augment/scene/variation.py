@@ -13,10 +13,11 @@ from torch import Tensor
 
 from augment.progress import progress
 from augment.scene.camera_effects import draw_camera_effects
+from augment.scene.conditions import Example
 from augment.scene.objects import another_instance, rotated, varnished
 from augment.scene.patterns import pixel_middles, random_colors
 from augment.scene.room import Room, above_table, across_light, irradiance
-from augment.scene.scene import Example, Scene
+from augment.scene.scene import Scene
 from augment.settings import CameraEffectSettings, VariationSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
@@ -99,7 +100,7 @@ def _with_moved_rows(
         rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     # Rays take longer than an operator.
     has_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
-    return replace(scene, examples=rows, one_light=once and settings.moves and not has_rays, **changed)
+    return scene.changed(examples=rows, one_light=once and settings.moves and not has_rays, **changed)
 
 
 def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Generator, on_table: Tensor) -> Scene:
@@ -125,7 +126,7 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         if settings.tables:
             sky = sky.clone()
             sky[on_table] = above_table(sky[on_table], lamps[on_table], albedo[on_table].mean((2, 3)))
-        lit = replace(scene, examples=rows, lights=torch.cat([_with_directional(sky, lamps), local], dim=1))
+        lit = scene.changed(examples=rows, lights=torch.cat([_with_directional(sky, lamps), local], dim=1))
         values = albedo * _facing(lit) if settings.lit_background else albedo.expand(-1, 3, -1, -1).clone()
         if settings.tables:
             arriving, points = _in_rooms(lit, sky, lamps, _log_uniform(WALL, len(rows), draws), on_table)
@@ -136,7 +137,7 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         effects = settings.camera, len(rows), scene.settings, draws, scene.lights.device, points
         changed["camera_effects"] = draw_camera_effects(*effects)
     lights = torch.cat([_with_directional(sky, lamps), local], dim=1)
-    return replace(scene, examples=rows, lights=lights, **changed)
+    return scene.changed(examples=rows, lights=lights, **changed)
 
 
 def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings
 from augment.attacks.attack import logits_of
+from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, load_object
-from augment.scene.scene import Example
 from augment.settings import ObjectSettings
 from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light

@@ -33,7 +33,7 @@ def as_one_example(problem: AttackProblem) -> Any:
     def render(values: Tensor, examples: Tensor) -> Tensor:
         return problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
 
-    same = {"step": problem.step, "project": problem.project, "at_once": problem.at_once}
+    same = {"take_step": problem.take_step, "project": problem.project, "at_once": problem.at_once}
     return SimpleNamespace(start=problem.start[:1], render=render, **same)
 
 

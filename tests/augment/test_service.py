@@ -11,7 +11,8 @@ from augment.attacks.parameters.settings import StepSettings
 from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from augment.service import AugmentationService, Renders
 from augment.settings import AugmentationSettings, RandomLightSettings, TrainingAttackSettings, VariationSettings
 from renderer.errors import InputError

@@ -168,13 +168,13 @@ def test_nothing_is_written_to_a_folder_that_holds_no_run(call, capsys, tmp_path
     assert sorted(tmp_path.rglob("*")) == files
 
 
-@pytest.mark.parametrize("stage", ["experiment.load_data", "run.evaluate_photographs"])
+@pytest.mark.parametrize("stage", ["commands.experiment.load_data", "training.run.evaluate_photographs"])
 def test_ctrl_c_tells_how_to_go_on_from_a_checkpoint(call, capsys, monkeypatch, tmp_path, tiny_npz, photos, stage):
     monkeypatch.setattr(f"train.{stage}", Mock(side_effect=KeyboardInterrupt))
     arguments = "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", *SMALL
     assert call("train", *arguments) == 128 + signal.SIGINT
     advice = capsys.readouterr().out.splitlines()[-1]
-    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == (stage != "experiment.load_data")
+    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == (stage != "commands.experiment.load_data")
 
 
 def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):

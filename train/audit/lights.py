@@ -26,8 +26,9 @@ from augment.classifiers import Classifier
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.build import build_local_light
+from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
 from renderer.camera import orbit_cameras

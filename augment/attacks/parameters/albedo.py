@@ -6,7 +6,8 @@ from torch import Tensor
 
 from augment.attacks.parameters.mesh_parameter import MeshParameter
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 
 
 class Albedo(MeshParameter):

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.light.ball import Ball
 from renderer.light.basis import Harmonics, LocalBasis, parts_of

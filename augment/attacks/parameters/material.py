@@ -12,8 +12,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import MaterialSettings
+from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS
 

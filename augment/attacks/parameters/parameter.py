@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.attacks.norm_ball import anywhere, project, sample, take_step
 from augment.attacks.parameters.settings import StepSettings
-from augment.scene.scene import Conditions
+from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 
 

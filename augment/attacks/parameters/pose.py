@@ -13,8 +13,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import PoseSettings
+from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
 from renderer.geometry.skin import Skin

@@ -9,7 +9,8 @@ from torch import Tensor
 from augment.attacks.parameters.light_parameter import environment_light, replace_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.attacks.parameters.settings import SkylightSettings
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import ZENITH

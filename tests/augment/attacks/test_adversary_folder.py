@@ -13,8 +13,9 @@ import torch
 import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
 from augment.attacks.parameters.settings import PARAMETER_NAMES
+from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, on_ground, with_props
-from augment.scene.scene import Example, Scene
+from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, normalize
 from renderer.geometry.shapes import solid
@@ -84,14 +85,13 @@ def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(
     size = (1, 1, 2) if kind in PAINTED else (4, 4, 2)
     texels = np.random.default_rng(1).integers(150, 255, size, dtype=np.uint8)
     item = on_ground(SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2))
-    scene = replace(
-        augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6), objects=[item]
-    )
+    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6)
+    scene = scene.changed(objects=[item])
     done = attacked({kind}, scene)
     write_adversary(adversary_of(done), tmp_path)
     limit = 1 / 255 if kind in PAINTED else 1e-5
     torch.testing.assert_close(reload(tmp_path).render(SOFTWARE), done.images[0], rtol=0, atol=limit)
-    matte = adversary_of(attacked({kind}, replace(scene, objects=[replace(item, mesh=replace(item.mesh, gloss=None))])))
+    matte = adversary_of(attacked({kind}, scene.changed(objects=[replace(item, mesh=replace(item.mesh, gloss=None))])))
     assert (matte.images - done.images[0]).abs().max() > 0.02
 
 
@@ -100,7 +100,7 @@ def test_props_and_table_are_never_attacked_not_after_they_are_read_back_either(
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
     item = on_ground(with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2))
     scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6)
-    scene = replace(scene, objects=[item])
+    scene = scene.changed(objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]
     assert painted[item.own_faces].any() and not painted[~item.own_faces].any()
     for folder in (tmp_path / "first", tmp_path / "second"):
@@ -130,7 +130,7 @@ def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     ((camera,),) = scene.cameras
     row = Example(0, (replace(camera, right=0.3, up=-0.2, width=3.0),), 1, exposure=1.7)
     objects = [replace(each, albedo_scale=0.6) for each in scene.objects]
-    done = attacked({"albedo", "lighting"}, replace(scene, examples=[row], objects=objects, backgrounds=backgrounds))
+    done = attacked({"albedo", "lighting"}, scene.changed(examples=[row], objects=objects, backgrounds=backgrounds))
     write_adversary(adversary_of(done), tmp_path)
     found = reload(tmp_path)
     assert torch.equal(found.background, backgrounds[1]) and found.cameras == row.cameras

@@ -140,7 +140,7 @@ def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_clas
     assert row["predicted"] == [["sky"]] * 2 and all(row["clean_correct"] + row["success"])
     scene = result.problem.scene
     behind = scene.backgrounds[..., :1, :1].expand(-1, -1, 36, 36)
-    finer = replace(scene, settings=replace(scene.settings, size=36), backgrounds=behind)
+    finer = scene.changed(settings=replace(scene.settings, size=36), backgrounds=behind)
     images = finer.render(result.conditions, torch.arange(2))
     assert row["confidence"] == confidence(other(images[:, 0])[:, None])
     with pytest.raises(InputError, match="'sky' is not a class of the model"):
@@ -149,12 +149,12 @@ def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_clas
 
 def test_other_azimuths_and_other_meshes_are_those_of_a_scene_with_them(result):
     scene = result.problem.scene
-    apple = replace(scene, objects=augment.build_scene([("solid:apple", "lime")], 12).objects)
+    apple = scene.changed(objects=augment.build_scene([("solid:apple", "lime")], 12).objects)
     turned, other = augment.transfer(result, azimuths=[-30.0], objects=apple.objects)
     assert (turned["azimuth"], other["mesh"]) == ("-30°", "solid:apple")
     cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - math.pi / 6) for row in scene.examples]
     rows = [replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)]
-    for row, shown in ((turned, replace(scene, examples=rows)), (other, apple)):
+    for row, shown in ((turned, scene.changed(examples=rows)), (other, apple)):
         logits = network()(shown.render(result.conditions, torch.arange(2))[:, 0])[:, None]
         assert row["confidence"] == confidence(logits)
     assert not any(other["clean_correct"])  # a lime by its label, and none by its color

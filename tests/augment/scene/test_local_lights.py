@@ -10,7 +10,8 @@ from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.settings import StepSettings
 from augment.attacks.problem import AttackProblem
 from augment.scene.build import build_local_light
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings, SceneSettings
 from renderer.errors import InputError
 from renderer.light.light_files import read_light, save_light
@@ -189,7 +190,7 @@ def test_a_moved_mesh_under_local_lights_looks_like_a_mesh_built_so(normals, sha
     positions = torch.tensor(LAMPS.positions) + 0.3 * torch.randn(2, 3, generator=draws)
     given = Conditions(shown.lights, vertices.expand(2, -1, -1), positions=positions.expand(2, -1, -1))
     mesh = replace(shown.mesh(0), vertices=vertices.double().numpy())
-    other = replace(shown, objects=[replace(shown.objects[0], mesh=mesh)], basis=shown.basis_under(given, 0))
+    other = shown.changed(objects=[replace(shown.objects[0], mesh=mesh)], basis=shown.basis_under(given, 0))
     expected = other.render(other.conditions(EVERY), EVERY)
     seen = shown.render(given, EVERY)
     torch.testing.assert_close(seen, expected, rtol=0, atol=2e-3 if shadows else 2e-6)

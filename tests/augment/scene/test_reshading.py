@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.shapes import solid
 from renderer.image import decode, encode

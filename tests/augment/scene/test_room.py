@@ -8,6 +8,7 @@ import renderer
 from augment.scene import room
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh, concatenate, normalize
+from renderer.geometry.shapes import sphere
 from renderer.light.basis import HARMONICS
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, probe
@@ -58,7 +59,7 @@ def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
 @pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
 def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera):
     """In closed form: with the height of the unit sphere or of the table there, the camera sees the pixel's middle."""
-    ball, image = Mesh.plain(*renderer.shapes.sphere(5)), ImageSettings(SIZE)
+    ball, image = Mesh.plain(*sphere(5)), ImageSettings(SIZE)
     around = room.Room(Rays(ball), 1.0, -1.0, 50.0)
     placed = room.across_light(around, ball, camera, image, torch.tensor([0.0, 0.0, 1.0]).double())
     y, x = np.array([1, -1])[:, None, None] * placed.numpy() * camera.width / 2

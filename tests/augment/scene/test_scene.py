@@ -15,9 +15,10 @@ from augment.attacks.parameters.settings import SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem
 from augment.scene import relighting
 from augment.scene.build import build_scene, load_backgrounds
+from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import load_object
 from augment.scene.reshading import NEAR
-from augment.scene.scene import Conditions, Example, Scene
+from augment.scene.scene import Scene
 from augment.settings import ObjectSettings, count_views
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError

@@ -15,8 +15,9 @@ from torch import Tensor
 import augment
 from augment.random_streams import generator
 from augment.scene.camera_effects import draw_camera_effects
+from augment.scene.conditions import Conditions
 from augment.scene.patterns import draw_patterns
-from augment.scene.scene import Conditions, Scene
+from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import (
     LampsSettings,
@@ -192,7 +193,7 @@ def test_local_lights_and_props_light_and_shadow_a_drawn_table_as_they_do_a_grou
     onto = augment.build_scene(meshes, SIZE, ground=[1.0] * 3, backgrounds=[0.0], **options)
     rows = drawn(augment.build_scene(meshes, SIZE, backgrounds=[1.0], **options), tables=1.0)
     expected, seen = images(onto)[0], images(rows)[0]
-    on_ground = images(replace(onto, lights=torch.ones_like(onto.lights))).amin((0, 1)) > 0
+    on_ground = images(onto.changed(lights=torch.ones_like(onto.lights))).amin((0, 1)) > 0
     errors, dark = (seen - expected).abs()[:, on_ground], expected.sum(0)[on_ground] < 0.02
     assert on_ground.float().mean() > 0.7 and 0.01 < dark.float().mean() < 0.5 and expected.max() > 0.3
     assert errors.median() < 1e-3 and errors.quantile(0.97) < 0.05  # samples of a pixel differ where a shadow ends
@@ -261,7 +262,7 @@ def test_views_that_are_shown_once_are_shaded_as_their_operators_shade_them(opti
         shown.append((rendered, *torch.autograd.grad(rendered.square().sum(), lights)))
     torch.testing.assert_close(shown[0][0], shown[1][0], rtol=0, atol=2e-6)  # of float32, and sRGB's slope of 13
     torch.testing.assert_close(shown[0][1], shown[1][1], rtol=1e-4, atol=1e-4)
-    shadowed = replace(still, settings=replace(still.settings, shadows=True))
+    shadowed = still.changed(settings=replace(still.settings, shadows=True))
     assert not vary(shadowed, VariationSettings(shift=0.1), generator(0), True).one_light
 
 

@@ -242,7 +242,7 @@ def test_opengl_and_numpy_agree_on_any_triangles(seed, count, resolution, lattic
 def test_triton_can_be_loaded_after_opengl():
     """As by torch's optimizers. Its LLVM must not meet Mesa's already there: in a process of its own, which would
     crash."""
-    script = "from renderer import rasterizer; rasterizer.choose('opengl'); import triton"
+    script = "from renderer.visibility import rasterizers; rasterizers.choose('opengl'); import triton"
     subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[3])
 
 

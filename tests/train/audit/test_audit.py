@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 import augment
+from augment.scene.conditions import Conditions
 from augment.scene.objects import load_object
-from augment.scene.scene import Conditions
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of

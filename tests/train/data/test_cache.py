@@ -22,7 +22,7 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
     package = tmp_path / "package"
     shutil.copytree(Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     assert source_key(package) == source_key(Path(renderer.__file__).parent)
-    module, keys = package / "mesh.py", {source_key(package)}
+    module, keys = package / "camera.py", {source_key(package)}
     for change in (
         lambda: module.write_text(module.read_text() + "\n"),
         lambda: module.rename(package / "other.py"),

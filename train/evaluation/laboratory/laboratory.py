@@ -121,8 +121,8 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
 def write_laboratory(settings: LabSettings) -> int:
     """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
 
-    The folder has class folders of PNG files, photos.csv and lab.json, as `train.data.photographs` reads them. InputError: a
-    folder that is not empty; meshes that cannot be read or have no label; no mesh of a label under study, or no other;
+    The folder has class folders of PNG files, photos.csv and lab.json, as `train.data.photographs` reads them.
+    InputError: a folder that is not empty; meshes that cannot be read or have no label; no mesh of a label under study, or no other;
     Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")

@@ -48,7 +48,7 @@ def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Sce
     scene = augment.build_scene([(meshes[0], "egg")], 16, **choices)
     items = [on_ground(SceneObject("egg", mesh), ground) for mesh in meshes]
     rows = [replace(scene.examples[0], object=index) for index in range(len(items))]
-    return replace(scene, objects=items, examples=rows, lights=0.4 * scene.lights[0].double())
+    return scene.changed(objects=items, examples=rows, lights=0.4 * scene.lights[0].double())
 
 
 def problem_of(scene: Scene, **settings) -> AttackProblem:
@@ -61,7 +61,7 @@ def problem_of(scene: Scene, **settings) -> AttackProblem:
 )
 def test_gradients_are_central_differences(options):
     scene = scene_of(egg(Gloss(0.5, 0.3, 0.6), options.pop("textured", False)), **options)
-    problem, draws = problem_of(replace(scene, lights=scene.lights + 0.05)), torch.Generator().manual_seed(0)
+    problem, draws = problem_of(scene.changed(lights=scene.lights + 0.05)), torch.Generator().manual_seed(0)
     weights = torch.randn(3, 16, 16, generator=draws, dtype=torch.float64)
 
     def weighed(values: torch.Tensor) -> torch.Tensor:
@@ -172,7 +172,7 @@ def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change, limi
     """A metal's, and a varnish whose diffuse part is Disney's there; beside a table, which stays diffuse."""
     pytest.importorskip("mitsuba")
     scene = scene_of(egg(Gloss(0.5, 0.3, 0.4)), ground=[0.5, 0.4, 0.3], shadows=True, samples=8, polar=40.0)
-    scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
+    scene = scene.changed(lights=scene.basis.project_nonnegative(scene.lights))
     problem = problem_of(scene)
     values = problem.project(problem.start + torch.tensor([change]), ONE)
     images = [final_images(problem, at, ONE, problem.images(at))[0] for at in (problem.start, values)]

@@ -19,7 +19,8 @@ from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSetting
 from augment.attacks.problem import AttackProblem
 from augment.attacks.settings import AttackSettings
 from augment.scene import reshading
-from augment.scene.scene import Conditions, Scene
+from augment.scene.conditions import Conditions
+from augment.scene.scene import Scene
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.basis import DEGREE
@@ -89,7 +90,7 @@ def test_a_sky_outside_of_the_model_is_refused_when_its_settings_are_made_in_the
 def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene):
     scene = make_scene()
     lights = scene.lights * torch.tensor([1.0, 0.3, 2.5]).double()[:, None, None]
-    scene = replace(scene, lights=lights)
+    scene = scene.changed(lights=lights)
     problem = problem_of(scene, skylight=sky_at(SKY))
     skies = problem.conditions(problem.start, EVERY).light
     for sky, light in zip(skies, lights, strict=True):
@@ -223,7 +224,7 @@ def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball
 def ringing(scene: Scene) -> Scene:
     """The same in the light of a sun, which dips below zero where harmonics of degree 6 cut it short."""
     sun = directional(torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64), 0.3 * torch.ones(3, dtype=torch.float64))
-    return replace(scene, lights=sun)
+    return scene.changed(lights=sun)
 
 
 @pytest.mark.parametrize("norm", ["linf", "l2"])

@@ -26,7 +26,7 @@ ONE = torch.zeros(1, dtype=torch.int64)
 def scene_of(size: int = 24, **options) -> Scene:
     choices = {"samples": 2, "silhouettes": True, "width": 2.6, "fov": 40.0, "rasterizer": "numpy"} | options
     scene = augment.build_scene([("solid:pear:0", "pear")], size, **choices)
-    return replace(scene, lights=0.4 * scene.lights.double())
+    return scene.changed(lights=0.4 * scene.lights.double())
 
 
 def problem_of(scene: Scene, **units) -> AttackProblem:
@@ -109,7 +109,7 @@ def arm(tmp_path_factory):
 def test_joints_bend_before_the_object_turns_as_far_as_their_limits_and_others_not_at_all(arm):
     scene = augment.build_scene([(arm, "arm")], 16, silhouettes=True, rasterizer="numpy", ground=[0.5, 0.5, 0.5])
     settings = augment.PoseSettings(radius=3.0, joints={"elbow": 60.0, "wrist": 30})
-    scene = replace(scene, lights=scene.lights.double())
+    scene = scene.changed(lights=scene.lights.double())
     problem = AttackProblem(scene, [Pose(scene, settings)])
     draws = torch.cat([problem.sample(torch.Generator().manual_seed(seed)) for seed in range(100)])
     assert (draws[:, 9:12] == 0).all() and (draws[:, 12:].abs().amax(0) == 1).all() and draws[:, :9].max() > 2.5
@@ -143,7 +143,7 @@ def test_descent_by_the_joints_alone_goes_beyond_as_many_random_poses_and_surviv
 
 
 def test_a_pose_without_outlines_or_parts_is_refused_in_one_sentence():
-    with pytest.raises(InputError, match="set renderer"):
+    with pytest.raises(InputError, match="set silhouettes=True"):
         problem_of(scene_of(silhouettes=False))
     with pytest.raises(InputError, match="are all 0"):
         augment.PoseSettings(**ONLY)
