@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = attach(
         "attacks.checks": ["check", "success_by_radius", "transfer"],
         "attacks.attack_files": ["save"],
         "attacks.settings": ["AttackSettings"],
-        "attacks.parameters.settings": [
+        "attacks.parameter_settings": [
             *("MaterialSettings", "PoseSettings", "SkylightSettings", "StepSettings"),
         ],
         "scene.build": ["build_scene"],

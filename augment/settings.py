@@ -11,7 +11,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.settings import AttackSettings
 from renderer.errors import FACTOR, InputError, describe, is_number, require_choice
 from renderer.settings import (

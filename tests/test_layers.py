@@ -37,24 +37,51 @@ def test_only_one_module_imports_opengl():
     assert users == ["renderer/visibility/rasterizers/opengl.py"]
 
 
-def test_no_import_within_the_renderer_leads_back_also_inside_functions():
-    names = {
-        path.relative_to(ROOT).with_suffix("").as_posix().replace("/", "."): path
-        for path in (ROOT / "renderer").rglob("*.py")
-    }
+def modules() -> dict[str, Path]:
+    """The files of all packages by module."""
+    paths = [path for package in ALLOWED for path in (ROOT / package).rglob("*.py")]
+    names = [path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for path in paths]
+    return dict(zip((name.removesuffix(".__init__") for name in names), paths, strict=True))
+
+
+def imported_modules() -> dict[str, set[str]]:
+    """What each module imports of the packages, also inside functions and for types alone."""
+    known = modules()
     imported = {}
-    for name, path in names.items():
+    for name, path in known.items():
         nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
         members = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
-        imported[name] = (members | {node.module for node in nodes}) & names.keys()
-    order = list(TopologicalSorter(imported).static_order())  # CycleError names the circle
-    modules = ["renderer.geometry.normals", "renderer.geometry.mesh", "renderer.io.meshes"]
-    assert sorted(modules, key=order.index) == modules
+        parents = {f"{node.module}" for node in nodes} - {name}
+        imported[name] = (members | parents) & known.keys() - {name}
+    return imported
+
+
+def test_no_import_leads_back_to_its_module():
+    order = list(TopologicalSorter(imported_modules()).static_order())  # CycleError names the circle
+    path = ["renderer.geometry.mesh", "renderer.io.meshes", "augment.scene.scene", "train.training.run"]
+    assert sorted(path, key=order.index) == path
+
+
+@pytest.mark.parametrize("package", ["train"])
+def test_no_folder_of_a_package_imports_one_that_imports_it(package):
+    folders: dict[str, set[str]] = {}
+    for name, imported in imported_modules().items():
+        if name.startswith(f"{package}."):
+            folder = folder_of(name)
+            inside = {folder_of(other) for other in imported if other.startswith(f"{package}.")}
+            folders.setdefault(folder, set()).update(inside - {folder})
+    assert len(list(TopologicalSorter(folders).static_order())) > 10
+
+
+def folder_of(module: str) -> str:
+    """The folder below a package, or the module itself if it lies in no such folder."""
+    parts = module.split(".")
+    return ".".join(parts[:2])
 
 
 def test_settings_need_neither_torch_nor_numpy():
     """Commands check their settings and print --help before anything that takes seconds to import."""
-    modules = [path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/settings.py")]
+    modules = [path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/*settings.py")]
     names = [name.replace("/", ".") for name in modules if name.partition("/")[0] in ALLOWED]
     code = f"import sys; sys.modules['torch'] = sys.modules['numpy'] = None; import {', '.join(names)}"
     assert len(names) > 2

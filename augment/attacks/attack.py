@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import preprocessed_model, stored
+from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.light_parameter import environment_light
-from augment.attacks.parameters.settings import StepSettings
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier, class_index, require_classifier

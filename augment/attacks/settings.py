@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from augment.attacks.parameters import parameter_class
-from augment.attacks.parameters.settings import PARAMETER_NAMES, ParameterSettings
+from augment.attacks.parameter_settings import PARAMETER_NAMES, ParameterSettings
 from renderer.errors import FACTOR, InputError
 from renderer.settings import Settings, setting
 
@@ -107,7 +106,7 @@ class AttackSettings(ParameterSettings):
             return 0.0
         if self.noise_margin is not None:
             return self.noise_margin
-        needed = any(parameter_class(name).needs_noise_margin for name in self.parameters)
+        needed = any(settings.needs_noise_margin for settings in self.parameters.values())
         return NOISE_MARGIN if needed else 0.0
 
     def require_parameters(self) -> None:

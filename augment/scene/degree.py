@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from augment.attacks.parameter_settings import MaterialSettings
 from augment.attacks.parameters.material import ROUGHNESS, initial_surface
-from augment.attacks.parameters.settings import MaterialSettings
 from augment.memory import has_memory, operator_bytes
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene

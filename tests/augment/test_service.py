@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
-from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.parameter_settings import StepSettings
 from augment.losses import complementary_label
 from augment.progress import Phases
 from augment.scene.build import build_scene

@@ -174,7 +174,8 @@ def test_ctrl_c_tells_how_to_go_on_from_a_checkpoint(call, capsys, monkeypatch, 
     arguments = "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", *SMALL
     assert call("train", *arguments) == 128 + signal.SIGINT
     advice = capsys.readouterr().out.splitlines()[-1]
-    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == (stage != "commands.experiment.load_data")
+    has_trained = stage != "commands.experiment.load_data"
+    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == has_trained
 
 
 def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):

@@ -19,7 +19,7 @@ from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits
 from augment.attacks.checks import success_by_radius
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.parameters.settings import SkylightSettings, StepSettings
+from augment.attacks.parameter_settings import SkylightSettings, StepSettings
 from augment.attacks.problem import build_problem
 from augment.attacks.settings import NOISE_MARGIN, AttackSettings
 from augment.classifiers import Classifier

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.attacks.norm_ball import project, sample, take_step
-from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.parameter_settings import StepSettings
 from augment.losses import label_loss
 from augment.model_passes import as_found
 from augment.random_streams import generator, stream_seed

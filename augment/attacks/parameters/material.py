@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from augment.attacks.parameter_settings import MaterialSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.attacks.parameters.settings import MaterialSettings
 from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
@@ -57,7 +57,6 @@ class Material(Parameter):
 
     name = "material"
     fits_other_meshes = False
-    needs_noise_margin = True
 
     def __init__(self, scene: Scene, settings: MaterialSettings):
         self._object_of = scene.object_of

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.norm_ball import anywhere, project, sample, take_step
-from augment.attacks.parameters.settings import StepSettings
+from augment.attacks.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 
@@ -26,9 +26,6 @@ class Parameter(ABC):
             the name of the module.
         fits_other_meshes: Whether the values can be given to another mesh.
         fits_other_views: Whether the values can be given to another view.
-        needs_noise_margin: Whether adversaries often end where the noise of a
-            sensor still decides, so that an attack should go on beyond it
-            (see `AttackSettings.noise_margin`).
         settings: Norm-ball and steps of the attack.
         start: Values at which attacks start and on which the norm-balls are
             centered, shape (E, D).
@@ -40,7 +37,6 @@ class Parameter(ABC):
     name: ClassVar[str]
     fits_other_meshes: ClassVar[bool] = True
     fits_other_views: ClassVar[bool] = True
-    needs_noise_margin: ClassVar[bool] = False
 
     def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
         self.settings = settings

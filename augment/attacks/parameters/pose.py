@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -11,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from augment.attacks.parameter_settings import PoseSettings
 from augment.attacks.parameters.parameter import Parameter
-from augment.attacks.parameters.settings import PoseSettings
 from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
@@ -59,12 +60,11 @@ class Pose(Parameter):
     Raises:
         InputError: If `ImageSettings.silhouettes` of the scene is False. Also
             if an object has no skin or lacks a named joint, which
-            `PoseSettings.joint_limits` finds.
+            `joint_limits` finds.
     """
 
     name = "pose"
     fits_other_meshes = False
-    needs_noise_margin = True
 
     def __init__(self, scene: Scene, settings: PoseSettings):
         if not scene.settings.silhouettes:
@@ -155,7 +155,7 @@ def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
     units += [math.log1p(settings.scale)]
     units += [view_angle, view_angle]
     units += [math.log1p(settings.distance)]
-    for degrees in settings.joint_limits(item):
+    for degrees in joint_limits(settings, item):
         joint_angle = math.radians(degrees)
         units += [joint_angle, joint_angle, joint_angle]
     return torch.tensor(units, dtype=torch.float64)
@@ -176,7 +176,7 @@ def _movable_objects(scene: Scene, settings: PoseSettings) -> list[_MovableObjec
                 object_mask=object_mask,
                 ground_height=item.lowest if stands_on_ground else None,
                 skin=item.mesh.skin,
-                rotated_joint_count=len(settings.joint_limits(item)),
+                rotated_joint_count=len(joint_limits(settings, item)),
             )
         )
     return movable_objects
@@ -242,3 +242,32 @@ class _MovableObject:
         # The scene pads the vertices of smaller meshes to those of the largest.
         padding_count = len(vertices) - len(displacement)
         return vertices + F.pad(displacement, (0, 0, 0, padding_count))
+
+
+def joint_limits(settings: PoseSettings, item: SceneObject) -> list[float]:
+    """Return the largest rotation of each joint of an object.
+
+    Args:
+        settings: Settings of the attack.
+        item: Object with a skin.
+
+    Returns:
+        Rotation of each joint in degrees; none if no joint is to move.
+
+    Raises:
+        InputError: If the object has no skin, or lacks a joint that the settings name.
+    """
+    if not settings.joints:
+        return []
+    if item.mesh.skin is None:
+        message = f"joints: {item.name} has no skin: give a glTF file with one, or joints=0"
+        raise InputError(message, "joints")
+    names = item.mesh.skin.names
+    limits = settings.joints
+    if not isinstance(limits, Mapping):
+        limits = dict.fromkeys(names, limits)
+    for name in limits:
+        if name not in names:
+            choices = f"choose from {', '.join(names)}"
+            raise InputError(f"joints: {item.name} has no joint {name}: {choices}", "joints")
+    return [float(limits.get(name, 0)) for name in names]

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.parameters.settings import PARAMETER_NAMES
+from augment.attacks.parameter_settings import PARAMETER_NAMES
 from augment.losses import adversarial_cost
 from renderer.errors import InputError
 from renderer.light.nonnegative import project_nonnegative

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import project, sample, scale_gradient
-from augment.attacks.parameters.settings import STEPS, StepSettings
+from augment.attacks.parameter_settings import STEPS, StepSettings
 from augment.attacks.settings import AttackSettings
 
 EPS = torch.finfo(torch.float64).eps

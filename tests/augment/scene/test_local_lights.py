@@ -6,8 +6,8 @@ import torch
 
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
+from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.settings import StepSettings
 from augment.attacks.problem import AttackProblem
 from augment.scene.build import build_local_light
 from augment.scene.conditions import Conditions

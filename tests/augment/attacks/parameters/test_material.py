@@ -12,8 +12,8 @@ import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
 from augment.attacks.attack_files import render_again
+from augment.attacks.parameter_settings import MATERIAL
 from augment.attacks.parameters.material import Material
-from augment.attacks.parameters.settings import MATERIAL
 from augment.attacks.problem import AttackProblem
 from augment.scene.objects import SceneObject, on_ground
 from augment.scene.scene import Scene
@@ -80,9 +80,8 @@ def test_a_material_starts_as_the_scene_shows_it_and_changes_the_object_alone():
     varied = Gloss(torch.linspace(0.3, 0.7, len(egg(None).faces)), 0.2, 0.5).on(egg(None))
     scene = scene_of(egg(None), egg(Gloss(0.4)), varied, ground=[0.5, 0.4, 0.3])
     problem, rows = problem_of(scene), torch.arange(3)
-    varnished = replace(
-        scene, objects=[on_ground(SceneObject("egg", Gloss().on(egg(None))), [0.5, 0.4, 0.3]), *scene.objects[1:]]
-    )
+    egg_on_ground = on_ground(SceneObject("egg", Gloss().on(egg(None))), [0.5, 0.4, 0.3])
+    varnished = scene.changed(objects=[egg_on_ground, *scene.objects[1:]])
     shown = varnished.render(scene.conditions(rows), rows)
     before = scene.objects[1].mesh.gloss.copy()
     torch.testing.assert_close(problem.render(problem.start, rows), shown, rtol=0, atol=2e-6)

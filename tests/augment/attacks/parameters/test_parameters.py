@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from augment.attacks import norm_ball
 from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.attacks.parameters import make_parameter, parameter_class
-from augment.attacks.parameters.settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem
 from augment.attacks.settings import AttackSettings
 from augment.scene import reshading

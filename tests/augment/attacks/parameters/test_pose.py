@@ -12,8 +12,8 @@ from torch.nn.functional import pad
 
 import augment
 import renderer
+from augment.attacks.parameter_settings import POSE
 from augment.attacks.parameters.pose import Pose
-from augment.attacks.parameters.settings import POSE
 from augment.attacks.problem import AttackProblem
 from augment.scene.scene import Scene
 from renderer.errors import InputError

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar
 
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.settings import TURBIDITY, Settings, setting
-
-if TYPE_CHECKING:
-    from augment.scene.objects import SceneObject
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
@@ -39,7 +36,14 @@ class StepSettings(Settings):
 
     >>> StepSettings(norm="l2", radius=1.0).step
     'unit'
+
+    Attributes:
+        needs_noise_margin: Whether adversaries often end where the noise of a
+            camera decides about success (see `AttackSettings.noise_margin`).
     """
+
+    needs_noise_margin: ClassVar[bool] = False
+
 
     norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
     radius: float | None = setting(
@@ -86,6 +90,8 @@ class PoseSettings(StepSettings):
     Each part of the pose is measured in the unit that its field gives. A part with the unit 0
     stays as it is.
     """
+
+    needs_noise_margin = True
 
     rotation: float = setting(
         10.0,
@@ -138,27 +144,6 @@ class PoseSettings(StepSettings):
             parts = f"{', '.join(POSE)} and joints"
             raise InputError(f"{parts} are all 0: nothing of the pose would change")
 
-    def joint_limits(self, item: SceneObject) -> list[float]:
-        """Return the largest rotation of each joint of an object in degrees.
-
-        Raises:
-            InputError: If the object has no skin, or lacks a joint that the settings name.
-        """
-        if not self.joints:
-            return []
-        if item.mesh.skin is None:
-            message = f"joints: {item.name} has no skin: give a glTF file with one, or joints=0"
-            raise InputError(message, "joints")
-        names = item.mesh.skin.names
-        limits = self.joints
-        if not isinstance(self.joints, Mapping):
-            limits = dict.fromkeys(names, self.joints)
-        for name in limits:
-            if name not in names:
-                choices = f"choose from {', '.join(names)}"
-                raise InputError(f"joints: {item.name} has no joint {name}: {choices}", "joints")
-        return [float(limits.get(name, 0)) for name in names]
-
 
 @dataclass
 class MaterialSettings(StepSettings):
@@ -167,6 +152,8 @@ class MaterialSettings(StepSettings):
     Each part is measured in the unit that its field gives. A part with the unit 0 stays as it
     is. See `renderer.Gloss` for roughness, metallic and strength.
     """
+
+    needs_noise_margin = True
 
     roughness: float = setting(
         0.3,
