@@ -76,7 +76,7 @@ def test_gradients_by_the_rotations_are_finite_differences(tmp_path):
     ("change", "arrays", "message"),
     [
         (lambda tree: tree["meshes"][0]["primitives"][0]["attributes"].pop("WEIGHTS_0"), {}, "no joints and weights"),
-        (None, {"weights": 0.5 * np.rint(255 * WEIGHTS)}, "sum to 0.49.* instead of one"),
+        (None, {"weights": 0.5 * np.rint(255 * WEIGHTS)}, "add up to 0.49.* instead of 1"),
         (None, {"joints": np.full((len(WEIGHTS), 4), 7)}, "joint 7, but its skin has 3"),
         (lambda tree: tree["skins"][0].update(joints=[1, 2, 70]), {}, "cannot be read as a mesh"),
         (lambda tree: tree["skins"].clear(), {}, "cannot be read as a mesh"),
