@@ -207,8 +207,8 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
-    # At 0, where the curve is a line, the power would have an infinite
-    # derivative. The lower limit keeps it finite.
+    # The power would have an infinite derivative at 0, where `where` does not
+    # even select it. The lower limit keeps the derivative finite.
     curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 

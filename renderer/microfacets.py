@@ -579,8 +579,8 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
 
     Args:
         cosine: Cosine n·v = cos θ in [0, 1] at the S samples, shape (S,).
-        roughness: Roughness r in [MIN_ROUGHNESS, 1], shape (S,), or (1,) if all samples
-            share one roughness.
+        roughness: Roughness r in [MIN_ROUGHNESS, 1], shape (S,), or (1,) if all
+            samples share one roughness.
         degree: Largest degree l of the spherical harmonics.
         terms: T Fresnel terms among SCHLICK, EDGE and DIELECTRIC.
 
@@ -589,10 +589,10 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
         0 ≤ m ≤ l, in ascending order of l and then of m, shape (T, M, S).
     """
     term_indices = list(terms)
-    one_roughness = len(roughness) == 1
+    has_one_roughness = len(roughness) == 1
     # If no gradient is needed, a table for this one roughness takes less time
     # than the table for all values of the roughness.
-    if degree > USUAL and one_roughness and not roughness.requires_grad:
+    if degree > USUAL and has_one_roughness and not roughness.requires_grad:
         table_at_roughness = _table_at(degree, float(roughness)).to(cosine)
         # Shape (T, M, P), with P Chebyshev polynomials in the cosine.
         cosine_coefficients = table_at_roughness[term_indices]
@@ -604,7 +604,7 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
     # Shapes (P, S) and (NODES, S), or (NODES, 1) for one roughness.
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = along(roughness)
-    if one_roughness:
+    if has_one_roughness:
         # Shape (T, M, P).
         cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
         return cosine_coefficients @ in_cosine
@@ -639,14 +639,15 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
 
 @per_degree
 def coat_bands(degree: int) -> Tensor:
-    """Compute how much of each degree of the lighting a dielectric coat reflects diffusely.
+    """Compute the factors by which a dielectric coat reflects each degree of the lighting.
 
-    The coat has the strength 1 and takes away E(μ) of the light at the cosine
-    μ (see `coat_albedo`). The irradiance that the coat reflects is
+    A coat of strength 1 reflects the fraction E(μ) of the light at the cosine μ
+    (see `coat_albedo`). The irradiance that it reflects in total is
     Σ_lm B_l U_lm Y_lm(n) with the coefficients U_lm of the lighting, the
     harmonics Y_lm and the normal n. The factor of degree l is
     B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, with Legendre polynomials P_l.
-    With E = 1, these are the factors π, 2π/3, π/4, ... of a Lambertian surface.
+    If E(μ) were 1, these would be the factors π, 2π/3, π/4, ... of a Lambertian
+    surface.
 
     Args:
         degree: Largest degree l of the spherical harmonics.
@@ -1054,9 +1055,9 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
     azimuth = math.pi * steps / AZIMUTH_COUNT
     alpha = roughness**2
     sines = (1 - cosines**2).sqrt()
-    # In the plane of the normal and the azimuth φ, the camera leans away from
-    # the half vectors by this angle. The mirrored light leans by this angle
-    # plus twice the polar angle, shape (N, azimuths).
+    # The camera leans away from the half vectors by this angle, in the plane of
+    # the normal and the azimuth φ. The mirrored light leans from the normal by
+    # this angle plus twice the polar angle. Shape (N, azimuths).
     camera_lean = torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])
     largest_polar = (math.pi / 2 - camera_lean) / 2
     # Shape (N, 1, azimuths).

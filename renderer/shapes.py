@@ -210,11 +210,15 @@ def _handle(end_radii: np.ndarray) -> np.ndarray:
     x_axis = [1, 0, 0]
     y_axis = [0, 1, 0]
     z_axis = [0, 0, 1]
-    # Angle of the tube from -90° to 90°. The first and the last one are
-    # repeated for the closed ends.
-    bend = np.pad(np.linspace(-np.pi / 2, np.pi / 2, 17), 1, mode="edge")[:, None, None]
-    radius = np.pad(np.full(17, 0.07), 1)[:, None, None]
-    around = np.linspace(0, 2 * np.pi, 12, endpoint=False)[None, :, None]
+    open_ring_count = 17
+    points_per_ring = 12
+    tube_radius = 0.07
+    # Angle of each ring about the y-axis, from -90° to 90°. The first and the
+    # last angle are repeated for the closed ends.
+    bend = np.linspace(-np.pi / 2, np.pi / 2, open_ring_count)
+    bend = np.pad(bend, 1, mode="edge")[:, None, None]
+    radius = np.pad(np.full(open_ring_count, tube_radius), 1)[:, None, None]
+    around = np.linspace(0, 2 * np.pi, points_per_ring, endpoint=False)[None, :, None]
     outward = np.cos(bend) * x_axis + np.sin(bend) * z_axis
     center = np.interp(np.sin(bend), [-1, 1], end_radii) * x_axis + outward * [0.4, 0, 0.4]
     return center + radius * (np.cos(around) * outward + np.sin(around) * y_axis)
@@ -568,7 +572,7 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
     phases = rng.uniform(0, 2 * np.pi, WAVES)
     # The cosine takes much longer in NumPy than in torch.
     waves = torch.from_numpy(points @ wave_vectors + phases).cos().numpy()
-    # The variance of a cosine is 1/2, and that of the sum is 16.
+    # A cosine has the variance 1/2, so the sum of WAVES cosines has the variance 16.
     return waves.sum(axis=1) / 4
 
 

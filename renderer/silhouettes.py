@@ -209,7 +209,9 @@ class _MovingView:
     background: Tensor
 
     def gradient_by_surface(self, positions: Tensor, upstream: Tensor) -> Tensor:
-        """Compute the gradient by surfaces that continue from one sample to the next.
+        """Compute the gradient by the positions of surfaces, without silhouettes.
+
+        A force is the gradient by the position of a sample in the image.
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
@@ -224,7 +226,7 @@ class _MovingView:
         weighted_image = fragments.image_of_samples(weighted, torch.nan)
         right = self._forces_along(X, weighted_image, at_samples)
         down = self._forces_along(Y, weighted_image, at_samples)
-        # Most samples lie within faces of one color, and have no force.
+        # Most samples have neighbors of the same color, and therefore no force.
         moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
         part = fragments.select(moving)
         forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
@@ -252,7 +254,7 @@ class _MovingView:
         """
         dim = 1 - axis
         steps = len(self.sample_grid) - 1
-        # Difference of each sample and the next one.
+        # Difference of each sample and the next one along the axis.
         jump = torch.zeros_like(weighted_image)
         torch.sub(
             weighted_image.narrow(dim, 0, steps),
@@ -291,7 +293,9 @@ class _MovingView:
         jump[before].masked_scatter_(is_covered, (difference * both).sum(0) / 2)
 
     def gradient_by_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the gradient by the ends of silhouette edges.
+        """Compute the gradient by the positions of the ends of silhouette edges.
+
+        A force is the gradient by the position of an edge in the image.
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
@@ -620,7 +624,7 @@ def _edges(faces: bytes) -> _Edges:
     low = np.minimum(first, second).ravel()
     high = np.maximum(first, second).ravel()
     vertex_count = int(high.max()) + 1
-    # One number for both ends sorts faster than pairs.
+    # np.unique sorts one number per side faster than a pair of vertices.
     keys, edge_of_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )

@@ -52,7 +52,8 @@ class Skin:
         Returns:
             Displacements of the vertices, shape (V, 3).
         """
-        # Matrix of each joint, for rows (x, y, z, 1), shape (4, 3).
+        # One matrix for each joint so far, which multiplies rows (x, y, z, 1) from
+        # the right, shape (4, 3) each.
         matrices: list[Tensor] = []
         pivots = torch.from_numpy(self.pivots).to(rotations)
         for parent, pivot, rotation in zip(self.parents, pivots, rotations, strict=True):

@@ -108,7 +108,7 @@ def as_integers(name: str, value: object) -> Tensor:
 def _as_numbers(value: object) -> np.ndarray | None:
     """Convert a value to an array of real numbers that torch can read.
 
-    Returns None if the value has other entries, or rows of unequal lengths.
+    Returns None if the value contains anything else, or rows of unequal lengths.
     """
     try:
         array = np.asarray(value)

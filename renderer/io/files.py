@@ -106,7 +106,8 @@ def _require_replaceable(target: Path) -> None:
     if not target.is_file():
         number = errno.EISDIR if target.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number))
-    # Moving a file to a read-only file would replace it.
+    # The disk would replace even a read-only file. Opening it for writing raises
+    # the error.
     with target.open("ab"):
         pass
 

@@ -352,7 +352,7 @@ def write_mitsuba_scene(
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Append an entry of a dictionary to an XML element. An empty name is left out."""
+    """Append an entry of a scene dictionary to an XML element, without a name if it is empty."""
     named = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", named)
@@ -454,7 +454,7 @@ class _PartWriter:
             part.positions.reshape(-1, 3),
             np.arange(len(corners)).reshape(-1, 3),
             vertex_normals=part.normals.reshape(-1, 3),
-            # Names of texture coordinates and colors in .ply files.
+            # Texture coordinates (u, v) and colors (r, g, b) of the .ply file.
             vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
             process=False,
         )

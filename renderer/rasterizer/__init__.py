@@ -44,7 +44,7 @@ SPAN = 2**21
 
 @dataclass(frozen=True)
 class Rasterizer:
-    """Rasterizer that was chosen for a program.
+    """One of the rasterizers of this package.
 
     Attributes:
         name: Name of its module in this package.

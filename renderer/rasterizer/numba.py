@@ -89,7 +89,7 @@ def _covered_range(
 
 @_njit
 def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort three corners from the top to the bottom."""
+    """Sort the corners (ax, ay), (bx, by) and (cx, cy) by y, from the top to the bottom."""
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     if by > cy:
@@ -140,7 +140,8 @@ def _draw(
         left, right = _covered_range(x, i, j, k, bits, resolution)
         if top >= bottom or left >= right:
             continue
-        # Sorted corners give duplicate faces the same depth, so that they tie.
+        # Duplicate faces with sorted corners have exactly the same depth. The first
+        # one stays.
         a = min(i, j, k)
         c = max(i, j, k)
         b = i + j + k - a - c

@@ -79,7 +79,8 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
     for begin in range(0, len(faces), FACES):
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
         drawn = _cull(positions.take(block, axis=1), resolution, closed)
-        # Sorted corners give duplicate faces the same depth, so that they tie.
+        # Duplicate faces with sorted corners have exactly the same depth. The lower
+        # index wins.
         corners = _sort(block.take(drawn.triangle_index, axis=1))
         triangles = positions.take(corners, axis=1)
         edges = _edges(triangles)
@@ -123,7 +124,7 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
     half = resolution / 2
     window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
     window += half
-    # The products are float64, so this rounds once.
+    # The window is float64 until here, so that its values are rounded once.
     snapped = window.astype(np.float32)
     snapped *= SUBSAMPLES
     positions = np.rint(snapped, out=snapped).astype(np.int64)
@@ -216,8 +217,10 @@ class _EdgeLines(NamedTuple):
 def _edges(triangles: np.ndarray) -> _EdgeLines:
     """Find the lines of the edges of triangles, shape (2, 3, T)."""
     x, y = triangles
-    # Numbers that hold y in the upper half and x in the lower half sort corners
-    # from the top to the bottom. Their sums may wrap around, and wrap back.
+    # One number per corner holds y in its upper 32 bits and x in its lower 32
+    # bits. Sorting these numbers sorts the corners from the top to the bottom.
+    # Sums of three numbers in `_sort` may overflow, and their differences wrap
+    # back.
     downward = _sort((y << 32) + x)
     x = ((downward + 2**31) & (2**32 - 1)) - 2**31
     y = (downward - x) >> 32

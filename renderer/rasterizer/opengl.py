@@ -71,8 +71,8 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
         InputError: If there is no EGL device, or if the driver fails or renders
             wrong ids.
     """
-    # If duplicate faces begin with the same vertex, they have the same depth,
-    # so that they tie. A cyclic permutation keeps the orientation.
+    # Duplicate faces that begin with the same vertex have exactly the same depth.
+    # The first one stays. A cyclic permutation keeps the orientation.
     if closed:
         lowest = faces.argmin(axis=1)[:, None]
         ordered = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
