@@ -377,7 +377,18 @@ class _Interpolation(torch.autograd.Function):
 def _distribute(
     values: Tensor, face: Tensor, weights: Tensor, corners_shape: Sequence[int]
 ) -> Tensor:
-    """Add values (D, S) of samples, times their weights (3, S), to corners of shape (3 D, G)."""
+    """Add weighted values of samples to the corners of their faces.
+
+    Args:
+        values: D values for each sample, shape (D, S).
+        face: Index of the seen face at each sample, shape (S,).
+        weights: Barycentric weights of each sample, shape (3, S).
+        corners_shape: Shape (3 D, G) of the result.
+
+    Returns:
+        Sums for the corners of the seen faces, with all values of the first
+        corner first, shape (3 D, G).
+    """
     at_corners = values.new_zeros(corners_shape)
     for value, index, weight in _blocks(values, face, weights.to(values)):
         at_corners.index_add_(1, index, (weight[:, None] * value).flatten(0, 1))

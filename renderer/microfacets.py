@@ -1031,10 +1031,10 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
 
     The half vectors have azimuths φ and polar angles θ_h. The substitution
     tan θ_h = α tan ψ spreads the lobe evenly over ψ. Nodes are equally spaced
-    in φ and are those of Gauss-Legendre quadrature in ψ. They end at the polar
-    angle from which the mirrored light would come from below the horizon. The
-    lobe is symmetric about the plane of n and v, so azimuths on one side of
-    this plane are enough.
+    in φ and are those of Gauss-Legendre quadrature in ψ. Half vectors with
+    larger polar angles are left out, because the light that they mirror to the
+    camera would come from below the horizon. The lobe is symmetric about the
+    plane of n and v, so azimuths on one side of this plane are enough.
 
     Args:
         cosines: Cosine n·v in (0, 1) of N camera directions, float64,

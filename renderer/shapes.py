@@ -213,6 +213,7 @@ def _handle(end_radii: np.ndarray) -> np.ndarray:
     open_ring_count = 17
     points_per_ring = 12
     tube_radius = 0.07
+    bend_radius = 0.4
     # Angle of each ring about the y-axis, from -90° to 90°. The first and the
     # last angle are repeated for the closed ends.
     bend = np.linspace(-np.pi / 2, np.pi / 2, open_ring_count)
@@ -220,7 +221,8 @@ def _handle(end_radii: np.ndarray) -> np.ndarray:
     radius = np.pad(np.full(open_ring_count, tube_radius), 1)[:, None, None]
     around = np.linspace(0, 2 * np.pi, points_per_ring, endpoint=False)[None, :, None]
     outward = np.cos(bend) * x_axis + np.sin(bend) * z_axis
-    center = np.interp(np.sin(bend), [-1, 1], end_radii) * x_axis + outward * [0.4, 0, 0.4]
+    between_ends = np.interp(np.sin(bend), [-1, 1], end_radii) * x_axis
+    center = between_ends + outward * bend_radius
     return center + radius * (np.cos(around) * outward + np.sin(around) * y_axis)
 
 

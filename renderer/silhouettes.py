@@ -321,22 +321,23 @@ class _MovingView:
     def _silhouette_forces(self, upstream: Tensor) -> Tensor:
         """Compute the gradient by the movement of silhouettes across samples, shape (K,)."""
         pixels = _pixels_of_cells(self.crossings.cells, self.fragments)
-        # Column in `upstream` of each pixel of the image.
+        # Column in `upstream` of each pixel of the image, or -1.
         column_of_pixel = torch.full((self.fragments.size**2,), -1, device=pixels.device)
         changed_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
         column_of_pixel[changed_pixels] = torch.arange(upstream.shape[1], device=pixels.device)
         force = self.radiance.new_zeros(pixels.shape[1])
         first_samples, second_samples = self.crossings.samples
         # The two samples may lie in two pixels, which gain half each.
-        for pixel in pixels:
-            first = self._seen_radiance(first_samples, pixel)
-            second = self._seen_radiance(second_samples, pixel)
-            force += (upstream[:, column_of_pixel[pixel]] * (first - second)).sum(0)
+        for pixels_of_side in pixels:
+            first = self._seen_radiance(first_samples, pixels_of_side)
+            second = self._seen_radiance(second_samples, pixels_of_side)
+            gradient = upstream[:, column_of_pixel[pixels_of_side]]
+            force += (gradient * (first - second)).sum(0)
         return force
 
-    def _seen_radiance(self, samples: Tensor, pixel: Tensor) -> Tensor:
-        """Return the radiance at samples, or the background of a pixel if they show no mesh."""
-        return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixel])
+    def _seen_radiance(self, samples: Tensor, pixels: Tensor) -> Tensor:
+        """Return the radiance at K samples, or the background of K pixels if they show no mesh."""
+        return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
 def _by_homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:

@@ -55,8 +55,8 @@ def export_mesh(
         normals: Normals with which the renderer shades the mesh, "smooth" or
             "flat".
         cameras: Cameras to write as nodes of the file, in this order.
-        first: Number of faces that are written before all others. None does not
-            separate faces.
+        first: Number of faces at the beginning of the mesh that are written
+            before all other faces. None orders all faces by texture and gloss.
 
     Raises:
         InputError: If an argument is invalid, or if the file cannot be written.

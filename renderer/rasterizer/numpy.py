@@ -37,9 +37,10 @@ FACE_BITS = 32
 # Key of samples without a face. It is less than any key at the far plane, and
 # its index is -1.
 EMPTY = (FAR << FACE_BITS) - 1
-# Number of faces, and number of rows or samples, that are processed at once. Their
-# arrays stay in the cache of the processor.
+# Number of faces that are processed at once, so that their arrays stay in the
+# cache of the processor.
 FACES = 2**14
+# Number of rows, or of samples, that are processed at once, for the same reason.
 PARTS = 2**13
 
 
