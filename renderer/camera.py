@@ -1,6 +1,6 @@
 """Orthographic and perspective cameras that look at the origin, and orbits of them.
 
-World axes are right-handed with z up.
+World axes are right-handed, and z points up.
 """
 
 import math
@@ -16,20 +16,40 @@ from renderer.errors import LARGEST, InputError, describe, is_number, require_ra
 from renderer.settings import MAX_VIEWS
 from renderer.validation import require_whole
 
-REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
-MOST_TURN = 4 * math.pi  # radians: larger angles are taken for degrees
-NEAREST = 0.01  # of its distance: a mesh that comes nearer to the camera is refused
+# Default of `Camera.reach`. A normalized mesh has a radius of at most √3.
+REACH = 2.0
+# Largest angle in radians, two turns. Larger angles are probably in degrees.
+MOST_TURN = 4 * math.pi
+# Distance of the near plane from a perspective camera is at least this fraction
+# of the distance of the camera. A mesh that comes nearer raises an error.
+NEAREST = 0.01
 
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """A square image from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
+    """Camera that looks at the origin and takes square images.
 
-    width: width of the image in world units, at the origin; a normalized mesh spans at most [-1, 1] per axis.
-    right, up: the origin's position in the image, in world units from the middle. reach: the depth along the view, in
-    world units to either side of the origin, within which surfaces are visible. distance: of the camera from the
-    origin. Fields may be tensors, arrays or lists of one number. InputError: a width or distance that is not positive,
-    values that are not finite or too large, a polar angle beyond two turns.
+    The camera lies at a polar angle from +z and at an azimuth from +x toward
+    +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
+    are differentiable with respect to fields that are tensors.
+
+    Attributes:
+        polar: Polar angle in radians, within two turns.
+        azimuth: Azimuth in radians.
+        width: Width of the image at the origin in world units. A normalized
+            mesh spans at most [-1, 1] along each axis.
+        right: Position of the origin in the image, to the right of the center
+            in world units.
+        up: Position of the origin in the image, above the center in world
+            units.
+        reach: Surfaces are visible if their depth differs from the depth of the
+            origin by at most this, in world units.
+        distance: Distance of the camera from the origin in world units.
+
+    Raises:
+        InputError: If `width`, `reach` or `distance` is not positive, if
+            `polar` is beyond two turns, or if a value is not one number, not
+            finite or too large.
     """
 
     polar: float
@@ -42,6 +62,7 @@ class Camera(ABC):
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
+        """Convert and check the fields."""
         for name, value in vars(self).items():
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
@@ -53,153 +74,277 @@ class Camera(ABC):
 
     @property
     def near(self) -> float:
-        """Distance from the camera at which visible surface begins."""
+        """Depth of the near plane: the smallest visible depth in world units."""
         return max(self.distance - self.reach, NEAREST * self.distance)
 
     @property
     def far(self) -> float:
-        """Distance from the camera at which visible surface ends."""
+        """Depth of the far plane: the largest visible depth in world units."""
         return self.distance + self.reach
 
     def seeing(self, radius: float) -> Self:
-        """The same camera, with a reach that contains a ball around the origin."""
-        return self if radius <= self.reach else replace(self, reach=math.floor(radius) + 1.0)
+        """Return a camera that shows a ball around the origin in its full depth.
+
+        Args:
+            radius: Radius of the ball in world units.
+
+        Returns:
+            This camera if its reach suffices, and otherwise a copy with a
+            larger reach.
+        """
+        if radius <= self.reach:
+            return self
+        return replace(self, reach=math.floor(radius) + 1.0)
 
     def fixed(self) -> Self:
-        """The same camera with numbers in place of tensors, if it has any."""
-        numbers = {name: value.item() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        """Return a camera with numbers instead of tensors.
+
+        Returns:
+            This camera if it has no tensors, and otherwise a copy.
+        """
+        numbers: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                numbers[name] = value.item()
         return replace(self, **numbers) if numbers else self
 
     def moved(self, polar: Tensor, azimuth: Tensor, log_distance: Tensor) -> Self:
-        """Turned by angles and, with the same field of view, farther by a factor exp(log_distance); without
-        perspective, its image is wider by that factor. Its fields are tensors."""
+        """Return a camera that is turned about the origin and moved away from it.
+
+        The field of view stays the same, so the width of the image at the
+        origin grows with the distance. An orthographic camera only changes its
+        width.
+
+        Args:
+            polar: Angle to add to the polar angle in radians, shape ().
+            azimuth: Angle to add to the azimuth in radians, shape ().
+            log_distance: Natural logarithm of the factor for the distance,
+                shape ().
+
+        Returns:
+            Camera whose changed fields are tensors.
+        """
         factor = log_distance.exp()
         moved: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
-        moved |= {name: getattr(self, name) * factor for name in ("width", "distance") if name in vars(self)}
+        # The distance of an orthographic camera is no field.
+        for name in ("width", "distance"):
+            if name in vars(self):
+                moved[name] = getattr(self, name) * factor
         return replace(self, **moved)
 
     def axes(self) -> np.ndarray:
-        """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
-        sin_polar, cos_polar = math.sin(self.polar), math.cos(self.polar)
-        sin_azimuth, cos_azimuth = math.sin(self.azimuth), math.cos(self.azimuth)
-        back = [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar]
+        """Return the axes of the camera in world coordinates.
+
+        Returns:
+            Unit vectors to the right, up and back (from the origin to the
+            camera) as rows, float64, shape (3, 3).
+        """
+        sin_polar = math.sin(self.polar)
+        cos_polar = math.cos(self.polar)
+        sin_azimuth = math.sin(self.azimuth)
+        cos_azimuth = math.cos(self.azimuth)
+        back_x = sin_polar * cos_azimuth
+        back_y = sin_polar * sin_azimuth
+        # This is the sine of the polar angle.
+        up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
-        up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, back[0] * cos_azimuth + back[1] * sin_azimuth]
+        up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
+        back = [back_x, back_y, cos_polar]
         return np.array([right, up, back])
 
     def pose(self) -> np.ndarray:
-        """(4, 4) the axes and, last, the position of the camera, as columns in world coordinates."""
-        axes, position = self.axes(), np.array([-self.right, -self.up, self.distance])
-        return np.vstack([np.column_stack([axes.T, position @ axes]), [0, 0, 0, 1]])
+        """Return the matrix that maps camera coordinates to world coordinates.
+
+        Returns:
+            The axes right, up and back and the position of the camera as
+            columns, float64, shape (4, 4). The last row is (0, 0, 0, 1).
+        """
+        axes = self.axes()
+        position = np.array([-self.right, -self.up, self.distance])
+        columns = np.column_stack([axes.T, position @ axes])
+        return np.vstack([columns, [0, 0, 0, 1]])
 
     def eye(self) -> np.ndarray:
-        """(4,) homogeneous: the direction to the camera and 0."""
+        """Return where the camera is, in homogeneous world coordinates.
+
+        Returns:
+            For an orthographic camera, the unit vector to the camera and 0. For
+            a perspective camera, its position and 1. Float64, shape (4,).
+        """
         return np.append(self.axes()[2], 0.0)
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
-        """World points (V, 3) to normalized device coordinates (V, 3): x right, y up, z depth.
+        """Project points to normalized device coordinates.
 
-        The image is [-1, 1]² in x and y. Depth is smaller where nearer, from -1 at `near` to 1 at `far`, and planes
-        stay planes in it.
+        Depth is -1 at the near plane and 1 at the far plane. A plane in world
+        coordinates is a plane in normalized device coordinates, too.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            x to the right, y up and depth, shape (V, 3). The image is [-1, 1]
+            in x and y.
+
+        Raises:
+            InputError: If a perspective camera lies in or behind the points.
         """
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Image positions (V, 3) of world points (V, 3) as (x w, y w, w), and how near these are (V,), which is linear
-        in the image. Differentiable in the points, and in the camera's fields if they are tensors."""
-        polar, azimuth = (torch.as_tensor(angle).to(points) for angle in (self.polar, self.azimuth))
-        (sin_polar, cos_polar), (sin, cos) = ((angle.sin(), angle.cos()) for angle in (polar, azimuth))
-        rows = (
-            [-sin, cos, 0 * sin],
-            [-cos_polar * cos, -cos_polar * sin, sin_polar],
-            [sin_polar * cos, sin_polar * sin, cos_polar],
+        """Project points to homogeneous image coordinates.
+
+        The result is differentiable with respect to the points, and with
+        respect to fields of the camera that are tensors.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            A tuple of
+            - (x w, y w, w) for the image position (x, y), shape (V, 3). The
+              number w is 1 for an orthographic camera, and the depth over
+              `distance` for a perspective camera;
+            - the nearness of each point, shape (V,). It is larger for nearer
+              points, and linear in the image on a plane.
+        """
+        polar = torch.as_tensor(self.polar).to(points)
+        azimuth = torch.as_tensor(self.azimuth).to(points)
+        sin_polar = polar.sin()
+        cos_polar = polar.cos()
+        sin_azimuth = azimuth.sin()
+        cos_azimuth = azimuth.cos()
+        axes = (
+            [-sin_azimuth, cos_azimuth, 0 * sin_azimuth],
+            [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, sin_polar],
+            [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar],
         )
-        right, up, back = torch.stack([torch.stack(row) for row in rows]) @ points.T
-        w, nearness = self._w(back)
+        right, up, back = torch.stack([torch.stack(axis) for axis in axes]) @ points.T
+        w, nearness = self._w_and_nearness(back)
         scale = 2 / self.width
-        return torch.stack([(right + self.right) * scale, (up + self.up) * scale, w]).T, nearness
+        x = (right + self.right) * scale
+        y = (up + self.up) * scale
+        return torch.stack([x, y, w]).T, nearness
 
     @abstractmethod
-    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """(w, nearness) of points so far (V,) from the origin to the camera."""
+    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute w and the nearness of points, see `homogeneous`.
+
+        Args:
+            back: Coordinate of the points along the axis from the origin to the
+                camera, in world units, shape (V,).
+
+        Returns:
+            A tuple of w and the nearness, shape (V,) each.
+        """
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
-        """(V,) along the view from the camera to world points (V, 3), by which an image with perspective is divided;
-        None of one without."""
+        """Compute the depths of points, by which a perspective camera divides.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            Distance from the camera along the viewing direction, in world
+            units, shape (V,). None for an orthographic camera.
+
+        Raises:
+            InputError: If a point lies behind a perspective camera or very near
+                to it.
+        """
         return None
 
 
 @dataclass(frozen=True)
 class OrthographicCamera(Camera):
-    """A parallel projection; its angles and lengths are `Camera`'s.
+    """Camera with parallel projection.
 
-    >>> camera = OrthographicCamera(polar=math.pi / 2, azimuth=0.0, width=2.0)  # on +x
-    >>> camera.project(np.array([[0.0, 1.0, 0.5]]))[:, :2].round(6).tolist()  # x right, y up
+    The attributes are those of `Camera`.
+
+    >>> camera = OrthographicCamera(polar=math.pi / 2, azimuth=0.0, width=2.0)  # It lies on +x.
+    >>> camera.project(np.array([[0.0, 1.0, 0.5]]))[:, :2].round(6).tolist()  # x and y
     [[1.0, 0.5]]
     """
 
     @property
     def distance(self) -> float:  # type: ignore[override]
-        """In files; images do not depend on it."""
+        """Distance that files store. Images do not depend on it."""
         return 2 * self.reach
 
     def project(self, points: np.ndarray) -> np.ndarray:
+        """Project points to normalized device coordinates, see `Camera.project`."""
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
-        rows = (self.axes() * scale[:, None]) @ points.T
-        rows += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
-        return rows.T
+        coordinates = (self.axes() * scale[:, None]) @ points.T
+        coordinates += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
+        return coordinates.T
 
-    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
+    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ones and the coordinate toward the camera."""
         return torch.ones_like(back), back
 
 
 @dataclass(frozen=True)
 class PerspectiveCamera(Camera):
-    """A pinhole at a distance; from far away, an orthographic camera of the same field of view sees the same.
+    """Pinhole camera at a distance from the origin.
+
+    The attributes are those of `Camera`. From a large distance, the image is
+    the same as the image of an orthographic camera of the same width.
 
     >>> camera = PerspectiveCamera(polar=math.pi / 2, azimuth=0.0, width=2.0, distance=4.0)
-    >>> camera.project(np.array([[2.0, 0.5, 0.0]]))[0, 0].round(6).item()  # half as far away, so twice as large
+    >>> point = np.array([[2.0, 0.5, 0.0]])  # It has half the distance of the origin.
+    >>> camera.project(point)[0, 0].round(6).item()
     1.0
     """
 
-    distance: float = field(kw_only=True)  # type: ignore[misc]  # each has its own, where orthographic cameras share one
+    # A perspective camera stores its distance. An orthographic camera derives it.
+    distance: float = field(kw_only=True)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
+        """Convert and check the fields."""
         super().__post_init__()
         require_range("distance", self.distance, 1 / LARGEST, LARGEST)
 
     def eye(self) -> np.ndarray:
-        """(4,) homogeneous: the position and 1."""
+        """Return the position of the camera and 1, float64, shape (4,)."""
         return self.pose()[:, 3]
 
     @property
     def angle(self) -> float:
-        """Between opposite sides of the image, in radians."""
+        """Field of view: the angle between opposite sides of the image in radians."""
         return 2 * math.atan(self.width / 2 / self.distance)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """InputError: as `depths`."""
-        depths, (right, up, back) = self.depths(points), self.axes() @ points.T
+        """Project points to normalized device coordinates, see `Camera.project`."""
+        depths = self.depths(points)
+        right, up, back = self.axes() @ points.T
         scale = 2 / self.width * (self.distance / depths)
-        before = self.distance - self.near
-        depth = 2 * self.far / (self.far - self.near) * ((before - back) / depths) - 1
-        return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth]).T
+        x = (right + self.right) * scale
+        y = (up + self.up) * scale
+        # Coordinate of the near plane along the axis from the origin to the
+        # camera.
+        near_back = self.distance - self.near
+        depth_scale = 2 * self.far / (self.far - self.near)
+        normalized_depth = depth_scale * ((near_back - back) / depths) - 1
+        return np.stack([x, y, normalized_depth]).T
 
-    def _w(self, back: Tensor) -> tuple[Tensor, Tensor]:
+    def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the depth over the distance of the camera, and the inverse of this ratio."""
         w = 1 - back / self.distance
         return w, 1 / w
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """InputError where a point lies behind the camera or as good as there."""
+        """Compute the depths of points, see `Camera.depths`."""
         depths = self.distance - points @ self.axes()[2]
         if not (depths >= NEAREST * self.distance).all():
-            advice = "give a larger distance (a smaller fov or a larger width), or normalize the mesh"
-            raise InputError(f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: {advice}")
+            raise InputError(
+                f"the mesh reaches the camera at distance {self.distance:g} or extends beyond it: "
+                "increase the distance (by a smaller fov or a larger width), or normalize the mesh"
+            )
         return depths
 
 
 def _as_scalar(name: str, value: Any) -> Any:
-    """Convert a camera's field to one number, or to a tensor () that gradients flow to."""
+    """Convert a field of a camera to one number, or to a tensor () that gradients flow to."""
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.reshape(())
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
@@ -210,18 +355,39 @@ def _as_scalar(name: str, value: Any) -> Any:
 
 
 def _require_radians(name: str, angle: float) -> None:
-    """Check that an angle is within two turns, which angles in degrees usually exceed."""
+    """Raise InputError if an angle is beyond two turns, as angles in degrees usually are."""
     if not -MOST_TURN <= angle <= MOST_TURN:
-        raise InputError(f"{name}={float(angle):g}: give radians, such as math.radians({float(angle):g})")
+        given = f"{float(angle):g}"
+        raise InputError(
+            f"{name}={given} is more than two turns: give radians, such as math.radians({given})"
+        )
 
 
 def orbit_cameras(
-    views: int, width: float, polar: float = math.pi / 3, azimuth: float = 0.0, fov: float | None = None
+    views: int,
+    width: float,
+    polar: float = math.pi / 3,
+    azimuth: float = 0.0,
+    fov: float | None = None,
 ) -> list[Camera]:
-    """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10).
+    """Create cameras at equally spaced azimuths and the same polar angle.
 
-    width: of the image at the origin, in world units. fov: the angle between opposite sides of the image, in radians,
-    which sets the distance of perspective cameras; None for orthographic ones. InputError: values out of range.
+    The paper uses the default polar angle and 10 views (appendix C).
+
+    Args:
+        views: Number of cameras.
+        width: Width of the images at the origin in world units.
+        polar: Polar angle in radians.
+        azimuth: Azimuth of the first camera in radians.
+        fov: Field of view: the angle between opposite sides of the image in
+            radians. It sets the distance of perspective cameras. None creates
+            orthographic cameras.
+
+    Returns:
+        Cameras in ascending order of the azimuth.
+
+    Raises:
+        InputError: If a value is out of range.
 
     >>> [round(math.degrees(camera.azimuth)) for camera in orbit_cameras(views=4, width=2.0)]
     [0, 90, 180, 270]
@@ -230,7 +396,9 @@ def orbit_cameras(
     """
     require_whole("views", views)
     require_range("views", views, 1, MAX_VIEWS)
-    width, polar, azimuth = _as_scalar("width", width), _as_scalar("polar", polar), _as_scalar("azimuth", azimuth)
+    width = _as_scalar("width", width)
+    polar = _as_scalar("polar", polar)
+    azimuth = _as_scalar("azimuth", azimuth)
     _require_radians("azimuth", azimuth)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
     if fov is None:

@@ -1,7 +1,9 @@
-"""The exception for errors that a user can fix, and the checks that keep NaN and values out of range out.
+"""Error class for mistakes that a user can fix, and checks of numbers, names, files and tensors.
 
-Settings are checked here, too, before torch and NumPy are imported. Functions that need torch
-therefore import it themselves.
+`renderer.validation` converts arguments and checks their types.
+
+Commands check their settings with this module before they import torch and
+NumPy. Functions that need torch therefore import it themselves.
 """
 
 from __future__ import annotations
@@ -11,52 +13,72 @@ import reprlib
 from collections.abc import Collection, Sequence, Set
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-FACTOR = 1e5  # the largest that multiplies a light or an albedo, so that it stays below LARGEST
-OUT_OF_MEMORY = "out of memory", "can't allocate memory", "ALLOC", "unable to find an engine"
-LARGEST = 1e12  # products of three such float32 values do not overflow; infinity minus infinity would be NaN
+# Largest magnitude in tensors that `require_bounded` accepts. The product of
+# three such float32 values does not overflow. An overflow would lead to infinity
+# minus infinity, which is NaN.
+LARGEST = 1e12
+# Largest factor for a light or an albedo in settings. Products then stay below
+# LARGEST.
+FACTOR = 1e5
+# Parts of error messages of torch, CUDA, cuDNN and cuBLAS if memory runs out.
+OUT_OF_MEMORY = (
+    "out of memory",
+    "can't allocate memory",
+    "ALLOC",
+    "unable to find an engine",
+)
 
 
 class InputError(ValueError):
-    """Bad input. The message is one sentence that names what is wrong and says what to do.
+    """Error that a user can fix by other arguments, settings or files.
 
-    Commands print it without a traceback and exit with status 2.
+    The message is one sentence. It names the argument or file, says what is
+    wrong, and says what to do. Commands print it without a traceback and exit
+    with status 2.
 
     Args:
         message: The sentence.
-        argument: Name of the Python argument or field with which the sentence begins. Commands put
-            the key of the settings that hold it in front. Empty if the sentence begins otherwise.
+        argument: Name of the Python argument or field with which the sentence
+            begins. Commands put the key of the settings that contain this
+            argument before it. Empty if the sentence begins with something
+            else.
+
+    Attributes:
+        argument: The same name.
 
     >>> require_range("samples", 0, 1, 64)
     Traceback (most recent call last):
     renderer.errors.InputError: samples=0 must be at least 1 and at most 64
     """
 
-    def __init__(self, message: str, argument: str = ""):
+    def __init__(self, message: str, argument: str = "") -> None:
         super().__init__(message)
         self.argument = argument
 
     def within(self, key: str, names: Collection[str]) -> InputError:
-        """Name the settings that hold the argument.
+        """Return an error that names the settings that contain the argument.
 
         Args:
-            key: Key of the settings, such as "scene". Empty for settings at the top.
-            names: Names of their fields. A sentence about anything else gets the whole key in
-                front.
+            key: Key of the settings, such as "scene". Empty for settings at the
+                top, which changes nothing.
+            names: Names of their fields. If the sentence is about something
+                else, the key comes before the whole sentence.
 
         Returns:
-            The same error with a sentence that begins with the key.
+            Error whose sentence begins with the key.
 
         >>> InputError("views=0 must be at least 1", "views").within("scene", ["views", "light"])
         InputError('scene.views=0 must be at least 1')
         """
         if not key:
             return self
+        # "light" for an argument such as "light.turbidity" or "light[0]".
         field = self.argument.partition(".")[0].partition("[")[0]
         if field and field in names:
             return InputError(f"{key}.{self}", f"{key}.{self.argument}")
@@ -64,137 +86,266 @@ class InputError(ValueError):
 
 
 def in_one_line(error: Exception) -> str:
-    """The message of an error in one line, or its type where it has none."""
+    """Return the message of an error in one line.
+
+    Args:
+        error: Error of any class.
+
+    Returns:
+        Message without line breaks, or the name of the class if there is none.
+    """
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether memory ran out: a GPU's, as torch, CUDA, cuDNN and cuBLAS say it, torch's on the CPU, or Python's."""
+    """Tell whether an error says that memory ran out, on a GPU or on the CPU.
+
+    Args:
+        error: Error of any class.
+
+    Returns:
+        True if memory ran out.
+    """
     import torch
 
-    recognized = any(words in str(error) for words in OUT_OF_MEMORY)
-    return recognized or isinstance(error, torch.OutOfMemoryError | MemoryError)
+    has_known_message = any(words in str(error) for words in OUT_OF_MEMORY)
+    return has_known_message or isinstance(error, torch.OutOfMemoryError | MemoryError)
 
 
 def as_device(device: torch.device | str) -> torch.device:
-    """InputError where it is not a device, or not one of this machine."""
+    """Convert a device name to a device of this machine.
+
+    Args:
+        device: Device or its name, such as "cpu" or "cuda".
+
+    Returns:
+        Device with its index.
+
+    Raises:
+        InputError: If the name is unknown, or if the machine has no such device.
+    """
     import torch
 
     try:
         return torch.empty(0, device=device).device
-    except (RuntimeError, AssertionError, TypeError) as error:  # torch without CUDA asserts
+    except (RuntimeError, AssertionError, TypeError) as error:
+        # torch without CUDA raises AssertionError.
         raise InputError(
-            f"device={_short(device)} is not available here: use cpu, or cuda where there is a GPU", "device"
+            f"device={_short(device)} is not available here: "
+            "use cpu, or cuda on a machine with a GPU",
+            "device",
         ) from error
 
 
 def require_file(path: str | Path, advice: str) -> None:
-    """InputError naming a path that is not a regular file: a pipe would block."""
-    if not os.path.isfile(path):  # False, too, for an invalid name or a folder without permission
-        raise InputError(f"{path} {'is not a regular file' if os.path.exists(path) else 'does not exist'}: {advice}")
+    """Check that a path is a regular file. Reading a pipe would block.
+
+    Args:
+        path: Path of the file.
+        advice: What to do otherwise, for the error.
+
+    Raises:
+        InputError: If the path is not a regular file.
+    """
+    # isfile also returns False for invalid names and unreadable folders.
+    if os.path.isfile(path):
+        return
+    problem = "is not a regular file" if os.path.exists(path) else "does not exist"
+    raise InputError(f"{path} {problem}: {advice}")
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """InputError naming a value outside of its range, NaN, or what is no number; None means not set."""
+    """Check that a number lies in a range.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: Number to check. None is accepted and means that the argument is
+            not set.
+        least: Smallest allowed value.
+        most: Largest allowed value.
+
+    Raises:
+        InputError: If the value is outside the range, NaN, or not a number.
+    """
     if value is None:
         return
     try:
-        inside = bool(least <= value <= most)
-    except (TypeError, ValueError, RuntimeError) as error:  # strings, complex numbers, arrays of several numbers
+        is_inside = bool(least <= value <= most)
+    except (TypeError, ValueError, RuntimeError) as error:
+        # Strings, complex numbers and arrays of several numbers cannot be compared.
         raise InputError(f"{name}={_short(value)} must be a number", name) from error
-    if not inside:
+    if not is_inside:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """InputError naming a value that is not one of its choices."""
+    """Check that a value is one of several names.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: Value to check.
+        choices: Allowed names.
+
+    Raises:
+        InputError: If the value is not one of them.
+    """
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"{name}={_short(value)}: choose one of {', '.join(choices)}", name)
 
 
 def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:
-    """InputError naming limits that are not [low, high] with both in range."""
+    """Check that limits are a lower and an upper number in a range.
+
+    Args:
+        name: Name of the argument, for the error.
+        limits: Lower and upper limit.
+        least: Smallest allowed value.
+        most: Largest allowed value.
+
+    Raises:
+        InputError: If there are not two numbers, if they are in the wrong order,
+            or if one is outside the range.
+    """
     try:
         low, high = limits
-        inside = bool(least <= low <= high <= most)
-    except (TypeError, ValueError, RuntimeError):  # no two numbers
-        inside = False
-    if not inside:
-        raise InputError(f"{name}={_short(limits)}: give [least, most], both from {least:g} to {most:g}", name)
+        is_inside = bool(least <= low <= high <= most)
+    except (TypeError, ValueError, RuntimeError):
+        # The value does not consist of two numbers.
+        is_inside = False
+    if not is_inside:
+        raise InputError(
+            f"{name}={_short(limits)}: give [least, most], both from {least:g} to {most:g}", name
+        )
 
 
 def require_finite(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that holds NaN or infinity."""
+    """Check that tensors have no NaN and no infinite values.
+
+    Args:
+        **tensors: Floating-point tensors by the names of the arguments.
+
+    Raises:
+        InputError: If a tensor has NaN or infinite values.
+    """
     import torch
 
     for name, tensor in tensors.items():
-        if not _largest(tensor) <= torch.finfo(tensor.dtype).max:
+        # The comparison is False for NaN.
+        if not _largest_magnitude(tensor) <= torch.finfo(tensor.dtype).max:
             raise InputError(f"{name} holds NaN or infinity: give finite values", name)
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that is not of floating-point numbers, or holds NaN, infinity or magnitudes
-    beyond 1e12."""
+    """Check that tensors hold floating-point numbers of at most the magnitude LARGEST.
+
+    Args:
+        **tensors: Tensors by the names of the arguments.
+
+    Raises:
+        InputError: If a value is not a floating-point tensor, or if it has NaN,
+            infinite or too large values.
+    """
     from torch import Tensor
 
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers", name)
-        if not _largest(tensor) <= LARGEST:
-            raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values", name)
+        # The comparison is False for NaN.
+        if not _largest_magnitude(tensor) <= LARGEST:
+            raise InputError(
+                f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values",
+                name,
+            )
 
 
 def is_whole(value: object) -> bool:
-    """Tell whether a value is a whole number, of Python or NumPy; True and False are none."""
+    """Tell whether a value is a whole number of Python or NumPy.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        True for whole numbers. False for everything else, also for True and
+        False themselves.
+    """
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a value is one real number, of Python, NumPy or torch; True and False are none."""
-    if getattr(value, "ndim", None) == 0:  # an array or a tensor without axes
+    """Tell whether a value is one real number of Python, NumPy or torch.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        True for numbers, and for tensors and arrays of shape () with a real
+        number. False for everything else, also for True and False themselves.
+    """
+    if getattr(value, "ndim", None) == 0:
+        # A tensor or an array of shape (), or a number of NumPy.
         value = value.item()  # type: ignore[attr-defined]
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def is_flag(value: object) -> bool:
-    """Tell whether a value is True or False, or 1 or 0 in their place."""
+    """Tell whether a value is True or False, or the number 1 or 0.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        True for these values of Python or NumPy, and False for all others.
+    """
     if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():
         value = value.item()  # type: ignore[attr-defined]
     return isinstance(value, bool) or (is_whole(value) and value in (0, 1))
 
 
-def describe(value: object) -> str:
+def describe(value: Any) -> str:
     """Describe a value for an error.
 
+    Args:
+        value: Any value.
+
     Returns:
-        The shape of a tensor or an array, a short text of a plain value, otherwise its type.
+        Type and shape of a tensor or array, a short text of a plain value, and
+        the type of any other value.
     """
     if value is None or isinstance(value, str | bytes | bool | int | float | complex):
-        return " ".join(reprlib.repr(value).split())
+        return _short_repr(value)
     if isinstance(value, list | tuple | dict | Set):
-        return f"the {type(value).__name__} " + " ".join(reprlib.repr(value).split())
+        return f"the {type(value).__name__} {_short_repr(value)}"
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    if hasattr(value, "dtype") and hasattr(value, "shape"):
-        if not hasattr(value, "__setitem__"):  # a number of NumPy
-            return " ".join(reprlib.repr(value).split())
-        noun = "a tensor" if type(value).__module__.partition(".")[0] == "torch" else "an array"
-        return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
-    return f"of type {type(value).__name__}"
+    if not hasattr(value, "dtype") or not hasattr(value, "shape"):
+        return f"of type {type(value).__name__}"
+    # Numbers of NumPy have a type and a shape, but no items that can be set.
+    if not hasattr(value, "__setitem__"):
+        return _short_repr(value)
+    is_tensor = type(value).__module__.partition(".")[0] == "torch"
+    noun = "a tensor" if is_tensor else "an array"
+    return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
 
 
 def _short(value: object) -> str:
-    """The value as text of one short line."""
-    text = str(value) if isinstance(value, str) else reprlib.repr(value)
-    return " ".join(text.split())
+    """Return a short text of one line for a value, without quotes around strings."""
+    return " ".join(value.split()) if isinstance(value, str) else _short_repr(value)
 
 
-def _largest(tensor: Tensor) -> float:
+def _short_repr(value: object) -> str:
+    """Return a short representation of a value in one line."""
+    return " ".join(reprlib.repr(value).split())
+
+
+def _largest_magnitude(tensor: Tensor) -> float:
+    """Return the largest magnitude of a tensor, or NaN if it has one."""
     if not tensor.numel():
         return 0.0
     values = tensor.detach()
+    # aminmax copies a tensor that is not contiguous. The transpose of one whose
+    # columns are contiguous needs no copy.
     if values.ndim == 2 and not values.is_contiguous():
-        values = values.T  # which aminmax would otherwise copy, where its columns lie side by side in memory
-    low, high = values.aminmax()  # both are NaN where anything is
-    return max(-low.item(), high.item())
+        values = values.T
+    lowest, highest = values.aminmax()
+    return max(-lowest.item(), highest.item())

@@ -1,4 +1,8 @@
-"""Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
+"""Conversion of radiance to image values: background, clamping and encoding.
+
+These steps come last, after all sums of radiance, because clamping is not
+linear.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,10 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
 
-SRGB_KNEE = 0.0031308  # linear value at which the curve of sRGB changes from a line to a power
+# Linear value and encoded value at which the sRGB curve changes from a line to a
+# power.
+SRGB_KNEE = 0.0031308
+SRGB_ENCODED_KNEE = 0.04045
 
 
 def tonemap(
@@ -24,13 +31,27 @@ def tonemap(
     background: Float[Tensor, "*#batch channels #P"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 P"]:
-    """Image values in [0, 1] as a classifier sees them.
+    """Convert the radiance of pixels to image values, as a classifier sees them.
 
-    radiance: linear, already weighted with coverage. coverage: in [0, 1].
-    background: image values behind the surface, of three channels or one. InputError: NaN.
+    Args:
+        radiance: Linear radiance of P pixels, already multiplied by the
+            coverage, shape (..., 3, P).
+        coverage: Fraction of each pixel that shows the mesh, in [0, 1],
+            shape (..., 1, P).
+        background: Image values in [0, 1] behind the mesh, with three channels
+            or one, shape (..., 3 or 1, P or 1).
+        encoding: Encoding of image values, "linear" or "srgb".
+
+    Returns:
+        Image values in [0, 1], shape (..., 3, P).
+
+    Raises:
+        InputError: If a tensor has NaN, infinite or too large values, or if the
+            encoding is unknown.
     """
     require_bounded(radiance=radiance)
-    return encode(clamp(radiance + background_term(coverage, background, encoding)), encoding)
+    linear = radiance + background_term(coverage, background, encoding)
+    return encode(clamp(linear), encoding)
 
 
 def composite(
@@ -40,71 +61,171 @@ def composite(
     background: Float[Tensor, "*#batch 3 size size"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 size size"]:
-    """Whole images: `tonemap` at the covered pixels, the background elsewhere. pixels: row-major."""
-    behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
-    covered = tonemap(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
-    return behind_all.scatter(-1, pixels.expand(covered.shape), covered).unflatten(-1, background.shape[-2:])
+    """Put the radiance of covered pixels in front of a background.
+
+    Args:
+        radiance: Linear radiance of the P covered pixels, already multiplied by
+            the coverage, shape (..., 3, P).
+        coverage: Fraction of each covered pixel that shows the mesh, in [0, 1],
+            shape (P,).
+        pixels: Row-major indices of the covered pixels, shape (P,).
+        background: Image values in [0, 1] behind the mesh,
+            shape (..., 3, size, size).
+        encoding: Encoding of image values, "linear" or "srgb".
+
+    Returns:
+        Images in [0, 1], shape (..., 3, size, size).
+
+    Raises:
+        InputError: If a tensor has NaN, infinite or too large values, or if the
+            encoding is unknown.
+    """
+    batch_shape = radiance.shape[:-2]
+    # Shape (..., 3, size²).
+    background_pixels = background.expand(*batch_shape, *background.shape[-3:]).flatten(-2)
+    behind = background_pixels.index_select(-1, pixels)
+    covered = tonemap(radiance, coverage[None], behind, encoding)
+    images = background_pixels.scatter(-1, pixels.expand(covered.shape), covered)
+    return images.unflatten(-1, background.shape[-2:])
 
 
 def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
-    """A gray value, a color (3,) or images (..., 3, size, size), in [0, 1], as images of the dtype and device of
-    `like`. InputError: another shape, values beyond [0, 1]."""
+    """Convert a background to images.
+
+    Args:
+        background: Gray value, color of shape (3,), or images of shape
+            (..., 3, size, size), with values in [0, 1].
+        size: Width and height of the images in pixels.
+        like: Tensor with the dtype and device of the result.
+
+    Returns:
+        Images, shape (..., 3, size, size).
+
+    Raises:
+        InputError: If the shape is another one, or a value is outside [0, 1].
+    """
     values = as_tensor("background", background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
-    advice = f"give a gray value, a color (3,) or images (3, {size}, {size}), in [0, 1]"
+    expected = f"a gray value, a color (3,) or images (3, {size}, {size}), in [0, 1]"
     if values.ndim < 3 or values.shape[-3:] not in ((1, size, size), (3, size, size)):
-        raise InputError(f"background of shape {tuple(values.shape)} is none: {advice}")
+        raise InputError(f"background has shape {tuple(values.shape)}: give {expected}")
     if not (values.min() >= 0 and values.max() <= 1):
-        raise InputError(f"background holds values beyond [0, 1]: {advice}")
+        raise InputError(f"background has values outside [0, 1]: give {expected}")
     return values.expand(*values.shape[:-3], 3, size, size)
 
 
 def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `tonemap`.
-    InputError: NaN."""
+    """Compute the linear values that a background adds to the radiance in front of it.
+
+    Args:
+        coverage: Fraction of each of P pixels that shows the mesh, in [0, 1],
+            shape (..., 1, P).
+        background: Image values in [0, 1], shape (..., 3 or 1, P or 1).
+        encoding: Encoding of the background, "linear" or "srgb".
+
+    Returns:
+        Linear values, shape (..., 3 or 1, P).
+
+    Raises:
+        InputError: If a tensor has NaN, infinite or too large values, or if the
+            encoding is unknown.
+    """
     require_bounded(coverage=coverage, background=background)
     return (1 - coverage) * decode(background, encoding)
 
 
 def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
-    """To [0, ceiling]; differentiable in the values.
+    """Clamp values to [0, ceiling], with a gradient at the limits.
 
-    At the bounds themselves the gradient passes, so that a light of zero on black can grow, unlike that of
-    `torch.clamp`, whose versions differ there.
+    The gradient passes through values at the limits themselves, so that a light
+    of zero on black can grow. `torch.clamp` differs between versions there.
+
+    Args:
+        values: Values to clamp, shape (...).
+        ceiling: Upper limit, a number or a tensor that broadcasts to `values`.
+            It gets no gradient.
+
+    Returns:
+        Clamped values, same shape as `values`.
     """
     return _Clamp.apply(values, ceiling)
 
 
 class _Clamp(torch.autograd.Function):
+    """Clamping to [0, ceiling] whose gradient passes at the limits."""
+
     @staticmethod
     def forward(ctx: Any, values: Tensor, ceiling: Tensor | float) -> Tensor:
+        """Clamp the values.
+
+        Args:
+            ctx: Context of autograd.
+            values: Values to clamp.
+            ceiling: Upper limit.
+
+        Returns:
+            Clamped values.
+        """
         clamped = values.clamp(min=0).clamp_(max=ceiling)
-        # As numbers: with booleans, comparison and product take several times as long.
-        ctx.save_for_backward(torch.eq(values, clamped, out=torch.empty_like(values)))
+        # 1 for values that are unchanged, and 0 for the others. Booleans would
+        # make the comparison and the product several times slower.
+        passes = torch.eq(values, clamped, out=torch.empty_like(values))
+        ctx.save_for_backward(passes)
         return clamped
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        (passing,) = ctx.saved_tensors
-        return upstream * passing, None
+        """Pass the gradient through unchanged values.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the clamped values.
+
+        Returns:
+            Gradient by the values, and None for the ceiling.
+        """
+        (passes,) = ctx.saved_tensors
+        return upstream * passes, None
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:
-    """Linear values in [0, 1] to image values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
+    """Encode linear values as image values.
+
+    Args:
+        linear: Linear values in [0, 1], shape (...).
+        encoding: "linear" returns the values unchanged. "srgb" applies the sRGB
+            transfer function (IEC 61966-2-1).
+
+    Returns:
+        Image values in [0, 1], same shape.
+
+    Raises:
+        InputError: If the encoding is unknown.
+    """
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
-    # The power's derivative is infinite at 0, in the branch that is not taken; the floor keeps it finite.
+    # The power would have an infinite derivative at 0, where `where` does not
+    # even select it. The lower limit keeps the derivative finite.
     curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 
 
 def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
-    """Compute the gradient by the linear values from that by the encoded values, without a graph.
+    """Compute the gradient by linear values from the gradient by encoded values.
 
-    The operations and their order are those of the gradient of `encode` by autograd, so the bits are equal, too.
+    This needs no graph. The operations and their order are those of autograd
+    for `encode`, so the results are equal to the bit.
+
+    Args:
+        linear: Linear values in [0, 1], shape (...).
+        upstream: Gradient by the encoded values, same shape.
+        encoding: Encoding, "linear" or "srgb".
+
+    Returns:
+        Gradient by the linear values, same shape.
     """
     if encoding == "linear":
         return upstream
@@ -113,19 +234,46 @@ def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
 
 
 def decode(image: Tensor, encoding: str) -> Tensor:
-    """Inverse of `encode`. Under "linear" a texture's values are taken as the albedo as they stand."""
+    """Decode image values to linear values. This is the inverse of `encode`.
+
+    Args:
+        image: Image values in [0, 1], shape (...).
+        encoding: "linear" returns the values unchanged. "srgb" applies the
+            inverse of the sRGB transfer function (IEC 61966-2-1).
+
+    Returns:
+        Linear values in [0, 1], same shape.
+
+    Raises:
+        InputError: If the encoding is unknown.
+    """
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return image
-    curve = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
-    return torch.where(image <= 0.04045, image / 12.92, curve)
+    curve = ((image.clamp(min=SRGB_ENCODED_KNEE) + 0.055) / 1.055) ** 2.4
+    return torch.where(image <= SRGB_ENCODED_KNEE, image / 12.92, curve)
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
-    """Image values in [0, 1] to 8 bits, rounded."""
-    return (image * 255).round_().to(torch.uint8)  # in place: of many renders, a copy less
+    """Round image values to 8 bits.
+
+    Args:
+        image: Image values in [0, 1], shape (...).
+
+    Returns:
+        Whole numbers from 0 to 255, uint8, same shape.
+    """
+    # Rounding in place saves a copy, which matters for many renders.
+    return (image * 255).round_().to(torch.uint8)
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
-    """8-bit images to RGB in [0, 1]."""
+    """Convert 8-bit values to values in [0, 1].
+
+    Args:
+        images: Whole numbers from 0 to 255, uint8, shape (...).
+
+    Returns:
+        Values in [0, 1], float32, same shape.
+    """
     return images.float() / 255

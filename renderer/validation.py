@@ -1,16 +1,17 @@
-"""Conversion and checks of the arguments of public functions.
+"""Conversion of arguments of public functions, and checks of their types.
 
-Errors are one sentence that starts with the argument's name, says what was given and what is expected. Ranges of
-numbers and choices of names are checked in `renderer.errors`.
+Errors are one sentence that begins with the name of the argument and says what
+was given and what is expected. `renderer.errors` checks ranges of numbers and
+choices of names.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -18,24 +19,29 @@ from torch import Tensor
 
 from renderer.errors import InputError, describe, is_flag, is_number
 
-_NUMBERS = "fiu"  # NumPy's letters for the types of floating-point numbers and of integers
+# Letters of NumPy for floating-point numbers, and signed and unsigned integers.
+_NUMBERS = "fiu"
+# Largest size of a floating-point number in torch, in bytes.
+_LARGEST_FLOAT_BYTES = 8
 
 
 def as_tensor(name: str, value: object) -> Tensor:
     """Convert an argument to a tensor of floating-point numbers.
 
-    A tensor of floating-point numbers comes back as it is. NumPy arrays of floating-point numbers keep their
-    precision; integers, numbers and lists become float32. Lists of tensors are stacked and stay differentiable.
+    A floating-point tensor is returned unchanged. A floating-point NumPy array
+    keeps its precision. Integers, numbers and lists become float32. Lists of
+    tensors are stacked and stay differentiable.
 
     Args:
         name: Name of the argument, for the error.
         value: Tensor, NumPy array, number, or nested lists of numbers.
 
     Returns:
-        Tensor of the value's shape.
+        Tensor with the shape of the value.
 
     Raises:
-        InputError: If the value is anything else, such as complex numbers, strings, None or lists of unequal lengths.
+        InputError: If the value is anything else, such as complex numbers,
+            strings, None or lists of unequal lengths.
 
     >>> as_tensor("light", [[1, 2, 3]])
     tensor([[1., 2., 3.]])
@@ -48,60 +54,86 @@ def as_tensor(name: str, value: object) -> Tensor:
             return value
         if not value.is_complex() and value.dtype != torch.bool:
             return value.to(torch.get_default_dtype())
-    elif isinstance(value, list | tuple) and value and all(isinstance(item, Tensor) for item in value):
+    elif _is_list_of_tensors(value):
         rows = [as_tensor(name, item) for item in value]
-        if len({row.shape for row in rows}) == 1:
-            return torch.stack([row.to(rows[0]) for row in rows])
+        first = rows[0]
+        if all(row.shape == first.shape for row in rows):
+            return torch.stack([row.to(first) for row in rows])
     else:
         array = _as_numbers(value)
         if array is not None:
             keeps_precision = isinstance(value, np.ndarray) and array.dtype.kind == "f"
             dtype = None if keeps_precision else torch.get_default_dtype()
             return torch.as_tensor(array, dtype=dtype)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name
+    )
+
+
+def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
+    """Tell whether a value is a list or tuple of at least one tensor, and of tensors only."""
+    if not isinstance(value, list | tuple) or not value:
+        return False
+    return all(isinstance(item, Tensor) for item in value)
 
 
 def as_integers(name: str, value: object) -> Tensor:
-    """Convert an argument, such as labels or indices, to a tensor int64.
+    """Convert an argument, such as labels or indices, to an int64 tensor.
 
     Args:
         name: Name of the argument, for the error.
-        value: Tensor or NumPy array of integers, a whole number, or nested lists of them.
+        value: Tensor or NumPy array of integers, a whole number, or nested
+            lists of whole numbers. An empty tensor or list may have any type.
+
+    Returns:
+        int64 tensor with the shape of the value.
 
     Raises:
         InputError: If the value is anything else.
     """
     if isinstance(value, Tensor):
-        integers = not (value.is_floating_point() or value.is_complex() or value.dtype == torch.bool)
-        if integers or not value.numel():
+        is_real = not value.is_complex() and value.dtype != torch.bool
+        has_integers = is_real and not value.is_floating_point()
+        if has_integers or not value.numel():
             return value.long()
     else:
         array = _as_numbers(value)
         if array is not None and (array.dtype.kind in "iu" or not array.size):
             return torch.as_tensor(array, dtype=torch.int64)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name
+    )
 
 
 def _as_numbers(value: object) -> np.ndarray | None:
-    """Convert a value to an array of real numbers that torch can take; None if it has others, or unequal rows."""
+    """Convert a value to an array of real numbers that torch can read.
+
+    Returns None if the value contains anything else, or rows of unequal lengths.
+    """
     try:
         array = np.asarray(value)
-    except Exception:  # NumPy calls methods of the value, which may raise anything
+    except Exception:  # NumPy calls methods of the value, which can raise any error.
         return None
     if array.dtype.kind not in _NUMBERS:
         return None
-    if array.dtype.kind == "f" and array.dtype.itemsize > 8:  # torch has no long double
+    if array.dtype.kind == "f" and array.dtype.itemsize > _LARGEST_FLOAT_BYTES:
         array = array.astype(np.float64)
-    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("=")).reshape(array.shape)
+    native_dtype = array.dtype.newbyteorder("=")
+    # ascontiguousarray gives a number the shape (1,), which reshape restores.
+    return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
 
 
 def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
-    """Convert an argument to a NumPy array of numbers, without a copy of an array that is one.
+    """Convert an argument to a NumPy array of numbers.
 
     Args:
         name: Name of the argument, for the error.
         value: NumPy array, tensor, number, or nested lists of numbers.
-        kinds: NumPy's letters for the permitted types.
+        kinds: Letters of NumPy for the allowed types, such as "iu" for
+            integers.
+
+    Returns:
+        The value itself if it is an array, and otherwise a new array.
 
     Raises:
         InputError: If the value is anything else.
@@ -116,6 +148,13 @@ def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
 def as_path(name: str, value: object) -> Path:
     """Convert a path, given as a string or as a `Path`.
 
+    Args:
+        name: Name of the argument, for the error.
+        value: The path.
+
+    Returns:
+        The path.
+
     Raises:
         InputError: If the value is anything else.
     """
@@ -125,15 +164,29 @@ def as_path(name: str, value: object) -> Path:
 
 
 def as_folder(name: str, value: object) -> Path:
-    """Convert the path of a folder, which may be missing yet.
+    """Convert the path of a folder that exists or can be created.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: The path, as a string or as a `Path`.
+
+    Returns:
+        The path.
 
     Raises:
-        InputError: If the value is no path, or if a file is in its place.
+        InputError: If the value is not a path, or if it or a folder above it is
+            a file.
     """
     path = as_path(name, value)
-    existing = next((parent for parent in (path, *path.absolute().parents) if os.path.lexists(parent)), path)
-    if existing.exists() and not existing.is_dir():
-        raise InputError(f"{name}={path}: {existing} is a file, give the path of a folder", name)
+    for existing in (path, *path.absolute().parents):
+        if not os.path.lexists(existing):
+            continue
+        # A broken link exists for lexists alone.
+        if existing.exists() and not existing.is_dir():
+            raise InputError(
+                f"{name}={path}: {existing} is a file, give the path of a folder", name
+            )
+        break
     return path
 
 
@@ -142,15 +195,21 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
 
     Args:
         name: Name of the argument, for the error.
-        value: List, tuple or another ordered iterable, but no string, mapping or set.
+        value: List, tuple or another ordered iterable, but not a string, mapping
+            or set.
         kind: Type of the items, or a tuple of types.
         expected: What to give, for the error.
 
+    Returns:
+        List of the items.
+
     Raises:
-        InputError: If the value is no list, or an item is of another type.
+        InputError: If the value is not a list, or an item has another type.
     """
-    without_items = isinstance(value, Tensor | np.ndarray) and not value.ndim
-    if without_items or isinstance(value, str | bytes | Mapping | Set) or not isinstance(value, Iterable):
+    # A tensor or array with shape () is iterable by its type, but has no items.
+    is_scalar = isinstance(value, Tensor | np.ndarray) and not value.ndim
+    is_unordered_or_text = isinstance(value, str | bytes | Mapping | Set)
+    if is_scalar or is_unordered_or_text or not isinstance(value, Iterable):
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
     items = list(value)
     for index, item in enumerate(items):
@@ -164,12 +223,12 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
 
     Args:
         name: Name of the argument, for the error.
-        value: The argument.
-        kind: Its type, or a tuple of types.
+        value: Value of the argument.
+        kind: Required type, or a tuple of types.
         expected: What to give, for the error.
 
     Raises:
-        InputError: If the value is of another type.
+        InputError: If the value has another type.
     """
     if not isinstance(value, kind):
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
@@ -178,8 +237,12 @@ def require_kind(name: str, value: object, kind: Any, expected: str) -> None:
 def require_whole(name: str, value: object) -> None:
     """Check that an argument is a whole number.
 
+    Args:
+        name: Name of the argument, for the error.
+        value: Value of the argument.
+
     Raises:
-        InputError: If it is of another type, such as a float or a bool.
+        InputError: If the value has another type, such as float or bool.
     """
     require_kind(name, value, Integral, "a whole number")
     if isinstance(value, bool):
@@ -189,18 +252,26 @@ def require_whole(name: str, value: object) -> None:
 def require_number(name: str, value: object) -> None:
     """Check that an argument is one real number.
 
+    Args:
+        name: Name of the argument, for the error.
+        value: Value of the argument.
+
     Raises:
-        InputError: If it is of another type, such as a string, a bool or None.
+        InputError: If the value has another type, such as str, bool or None.
     """
     if not is_number(value):
         raise InputError(f"{name} is {describe(value)}: give a number", name)
 
 
 def require_flag(name: str, value: object) -> None:
-    """Check that an argument is True or False: a string such as "no" would count as True.
+    """Check that an argument is True or False. A string such as "no" would count as True.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: Value of the argument.
 
     Raises:
-        InputError: If it is anything else.
+        InputError: If the value is anything else.
     """
     if not is_flag(value):
         raise InputError(f"{name} is {describe(value)}: give True or False", name)
@@ -209,8 +280,12 @@ def require_flag(name: str, value: object) -> None:
 def require_seed(name: str, value: object) -> None:
     """Check that an argument can seed a random stream.
 
+    Args:
+        name: Name of the argument, for the error.
+        value: Value of the argument.
+
     Raises:
-        InputError: If it is not a whole number from 0.
+        InputError: If the value is not a whole number of at least 0.
     """
     require_whole(name, value)
     if int(value) < 0:  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Joints that carry the vertices of a mesh: linear blend skinning, as glTF 2.0 has it (section 3.7.3)."""
+"""Joints that carry the vertices of a mesh: linear blend skinning (glTF 2.0, section 3.7.3)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,26 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+# Index of the parent of joints without a parent.
+NO_PARENT = -1
+
 
 @dataclass(frozen=True)
 class Skin:
-    """J joints of a mesh of V vertices, in the pose that the mesh has.
+    """J joints of a mesh with V vertices, in the pose of the mesh.
 
-    names      J strings
-    parents    (J,) int64, of each joint; -1 for none; they come before their children
-    pivots     (J, 3) float64, the joints' positions, in the mesh's coordinates
-    carried    (V, J, 4) float32, the weight of each joint times the position (x, y, z, 1) to which it carries the
-               vertex: their sum is the vertex, or 0 for one that no joint carries
+    `load_mesh` reads the skin of a file into `Mesh.skin`. Functions that move or
+    divide a mesh change its skin accordingly, or remove it.
 
-    `Mesh.skin` has it, from `load_mesh`. Whatever moves or divides a mesh does so to its skin, or drops it.
+    Attributes:
+        names: Names of the joints.
+        parents: Index of the parent of each joint, or NO_PARENT, int64,
+            shape (J,). Parents come before their children.
+        pivots: Positions of the joints in the coordinates of the mesh, float64,
+            shape (J, 3).
+        carried: Position (x, y, z, 1) to which each joint carries each vertex,
+            times the weight of the joint, float32, shape (V, J, 4). The sum over
+            joints is the position of the vertex, or 0 if no joint carries it.
     """
 
     names: tuple[str, ...]
@@ -32,19 +40,46 @@ class Skin:
     carried: np.ndarray
 
     def displacements(self, rotations: Float[Tensor, "J 3 3"]) -> Float[Tensor, "V 3"]:
-        """How the vertices move as each joint, and with it what hangs on it, turns about its position by a rotation
-        matrix in the mesh's axes; differentiable. Of several, the parents' are applied last."""
-        turned: list[Tensor] = []
+        """Compute how the vertices move if joints rotate about their positions.
+
+        A joint also moves its children. The rotation of a child is applied
+        before the rotation of its parent. The result is differentiable.
+
+        Args:
+            rotations: Rotation matrix of each joint in the axes of the mesh,
+                shape (J, 3, 3).
+
+        Returns:
+            Displacements of the vertices, shape (V, 3).
+        """
+        # One matrix for each joint so far, which multiplies rows (x, y, z, 1) from
+        # the right, shape (4, 3) each.
+        matrices: list[Tensor] = []
         pivots = torch.from_numpy(self.pivots).to(rotations)
         for parent, pivot, rotation in zip(self.parents, pivots, rotations, strict=True):
-            matrix = torch.cat([rotation.T, (pivot - rotation @ pivot)[None]])  # of rows (x, y, z, 1)
-            if parent >= 0:
-                matrix = matrix @ turned[parent][:3] + torch.nn.functional.pad(turned[parent][3:], (0, 0, 3, 0))
-            turned.append(matrix)
-        still = torch.eye(4, 3).to(rotations)
-        return torch.from_numpy(self.carried).to(rotations).flatten(1) @ (torch.stack(turned) - still).flatten(0, 1)
+            translation = pivot - rotation @ pivot
+            matrix = torch.cat([rotation.T, translation[None]])
+            if parent != NO_PARENT:
+                parent_rotation = matrices[parent][:3]
+                parent_translation = matrices[parent][3:]
+                # Three rows of zeros stand above the translation.
+                added = torch.nn.functional.pad(parent_translation, (0, 0, 3, 0))
+                matrix = matrix @ parent_rotation + added
+            matrices.append(matrix)
+        identity = torch.eye(4, 3).to(rotations)
+        # Shape (4 J, 3).
+        changes = (torch.stack(matrices) - identity).flatten(0, 1)
+        return torch.from_numpy(self.carried).to(rotations).flatten(1) @ changes
 
     def transformed(self, matrix: np.ndarray) -> Skin:
-        """Under an affine matrix (4, 4)."""
+        """Return the skin of a mesh that is moved by an affine transform.
+
+        Args:
+            matrix: Matrix of the transform, shape (4, 4).
+
+        Returns:
+            Skin with moved joints and positions.
+        """
         pivots = self.pivots @ matrix[:3, :3].T + matrix[:3, 3]
-        return replace(self, pivots=pivots, carried=(self.carried @ matrix.T).astype(np.float32))
+        carried = (self.carried @ matrix.T).astype(np.float32)
+        return replace(self, pivots=pivots, carried=carried)

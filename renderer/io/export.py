@@ -1,6 +1,7 @@
 """Meshes as .glb files with colors, textures, normals and cameras."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,23 +20,46 @@ from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 
 if TYPE_CHECKING:
-    import trimesh  # takes half a second: imported where it is used
+    import trimesh  # It takes half a second, so functions import it where they use it.
+    from trimesh.visual.material import PBRMaterial
 
-# glTF's names for colors and normals after an underscore, under which trimesh writes any attribute.
-_COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
-SPECULAR = "specularFactor"  # in the name of a material, since trimesh does not write it elsewhere
+# Names of vertex colors and normals while trimesh writes them. trimesh writes
+# every attribute whose name begins with an underscore without conversion.
+_COLOR = "_COLOR_0"
+_NORMAL = "_NORMAL"
+# Name of the specular factor in glTF. It is passed in the name of a material,
+# because trimesh does not write it elsewhere.
+SPECULAR = "specularFactor"
+# Roughness and metallic of a mesh without gloss.
+MATTE = (1.0, 0.0)
 
 
 def export_mesh(
-    mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = (), first: int | None = None
+    mesh: Mesh,
+    path: str | Path,
+    normals: str = "smooth",
+    cameras: Sequence[Camera] = (),
+    first: int | None = None,
 ) -> None:
-    """Write a mesh to a .glb file. A vertex whose corners differ in color, uv or normal is written for each.
+    """Write a mesh to a .glb file.
 
-    `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture and gloss; a material
-    that is seen from both sides, diffuse if the mesh is matte. A mesh of several has its faces ordered by texture and
-    gloss, the `first` so many of them before the others.
-    normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
-    InputError where the suffix is another or the file cannot be written.
+    `load_mesh` returns the same surface from the file, with float32 precision.
+    In the file, y points up and colors are linear. The mesh has one part for
+    each combination of texture and gloss, in ascending order, so the order of
+    the faces can change. Materials are visible from both sides. A vertex is
+    repeated if its corners differ in color, texture coordinates or normal.
+
+    Args:
+        mesh: Mesh to write.
+        path: File to write, with the suffix .glb. Its folder is created.
+        normals: Normals with which the renderer shades the mesh, "smooth" or
+            "flat".
+        cameras: Cameras to write as nodes of the file, in this order.
+        first: Number of faces at the beginning of the mesh that are written
+            before all other faces. None orders all faces by texture and gloss.
+
+    Raises:
+        InputError: If an argument is invalid, or if the file cannot be written.
 
     >>> apple, cameras = renderer.normalize(renderer.solid("apple")), renderer.orbit_cameras(views=3, width=2.2)
     >>> export_mesh(apple, "apple.glb", cameras=cameras)
@@ -47,10 +71,12 @@ def export_mesh(
     if first is not None:
         require_whole("first", first)
         require_range("first", first, 0, len(mesh.faces))
-    shaded = corner_normals(mesh.vertices, mesh.faces, normals)
+    normals_of_corners = corner_normals(mesh.vertices, mesh.faces, normals)
     if path.suffix.lower() != ".glb":
-        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb")
-    content = _glb(mesh, shaded, cameras, first)
+        raise InputError(
+            f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
+        )
+    content = _glb(mesh, normals_of_corners, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
@@ -59,80 +85,162 @@ def export_mesh(
 
 
 def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
+    """Return the content of a .glb file. The normals are those of corners, shape (F, 3, 3)."""
     import trimesh
 
-    later = np.arange(len(mesh.faces)) >= (len(mesh.faces) if first is None else first)
-    order = np.stack([later, mesh.texture_ids], axis=1)
+    first_count = len(mesh.faces) if first is None else first
+    is_later = np.arange(len(mesh.faces)) >= first_count
+    # One row for each face. Faces with equal rows are one part. float64 holds
+    # indices and gloss exactly.
+    keys = np.stack([is_later, mesh.texture_ids], axis=1)
     if mesh.gloss is not None:
-        order = np.concatenate([order, mesh.gloss], axis=1)  # float64, which holds either exactly
-    parts = [_textured_part(mesh, normals, part, (order == part).all(1)) for part in np.unique(order, axis=0)]
-    finish = partial(_as_one_mesh, cameras=cameras)
-    return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
+        keys = np.concatenate([keys, mesh.gloss], axis=1)
+    parts = []
+    for key in np.unique(keys, axis=0):
+        is_in_part = (keys == key).all(1)
+        surface = _PartSurface(texture_id=int(key[1]), gloss=key[2:].tolist())
+        parts.append(_write_part(mesh, normals, surface, is_in_part))
+    return trimesh.Scene(parts).export(
+        file_type="glb",
+        include_normals=False,
+        tree_postprocessor=partial(_as_one_mesh, cameras=cameras),
+    )
 
 
-def _textured_part(mesh: Mesh, normals: np.ndarray, part: np.ndarray, selected: np.ndarray) -> "trimesh.Trimesh":
-    """The selected faces (F,) bool, y up. part: 0 or 1, their texture or -1 and their gloss, if any."""
+@dataclass(frozen=True)
+class _PartSurface:
+    """Texture and gloss of a part.
+
+    Attributes:
+        texture_id: Index of the texture, or -1.
+        gloss: Roughness, metallic and strength. Empty if the mesh has no gloss.
+    """
+
+    texture_id: int
+    gloss: list[float]
+
+
+def _write_part(
+    mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
+) -> "trimesh.Trimesh":
+    """Convert the faces of a part to a mesh of trimesh, with y up.
+
+    Args:
+        mesh: Mesh with F faces.
+        normals: Normals of all corners, shape (F, 3, 3).
+        surface: Texture and gloss of the part.
+        is_in_part: True for faces of the part, shape (F,).
+
+    Returns:
+        Mesh of the part.
+    """
     import trimesh
-    from trimesh.visual.material import PBRMaterial
     from trimesh.visual.texture import TextureVisuals
 
-    corners = np.concatenate([mesh.corner_colors[selected], mesh.corner_uvs[selected], normals[selected]], axis=-1)
-    ids, values, faces = _split(mesh.faces[selected], corners)
-    colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
-    texture_id, gloss = int(part[1]), part[2:].tolist()
-    roughness, metallic = gloss[:2] or (1.0, 0.0)
-    factors = mesh.gloss_textures[texture_id] if mesh.gloss_textures and texture_id >= 0 else None
-    material = PBRMaterial(  # trimesh would take images of the same bytes and other sizes for one, but for the name
-        name=", ".join([f"texture {texture_id}", *(f"{SPECULAR} {strength}" for strength in gloss[2:])]),
-        baseColorTexture=Image.fromarray(mesh.textures[texture_id]) if texture_id >= 0 else None,
-        metallicRoughnessTexture=None if factors is None else Image.fromarray(np.insert(factors, 0, 0, axis=2)),
-        metallicFactor=metallic,
-        roughnessFactor=roughness,
-        doubleSided=True,
-    )
+    colors = mesh.corner_colors[is_in_part]
+    uvs = mesh.corner_uvs[is_in_part]
+    # Eight values for each corner.
+    corners = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
+    vertex_ids, values, faces = _split(mesh.faces[is_in_part], corners)
+    linear_colors = decode(torch.from_numpy(values[:, :3]), "srgb")
+    # Multiplying rows by a rotation matrix applies the inverse rotation.
+    to_y_up = Y_UP_TO_Z_UP[:3, :3]
     return trimesh.Trimesh(
-        mesh.vertices[ids] @ Y_UP_TO_Z_UP[:3, :3],  # the inverse, since it multiplies rows
+        mesh.vertices[vertex_ids] @ to_y_up,
         faces,
-        visual=TextureVisuals(uv=uvs, material=material),
+        visual=TextureVisuals(uv=values[:, 3:5], material=_material(mesh, surface)),
         vertex_attributes={
-            _COLOR: decode(torch.from_numpy(colors), "srgb").float().numpy(),
-            _NORMAL: (normals @ Y_UP_TO_Z_UP[:3, :3]).astype(np.float32),
+            _COLOR: linear_colors.float().numpy(),
+            _NORMAL: (values[:, 5:] @ to_y_up).astype(np.float32),
         },
         process=False,
     )
 
 
+def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
+    """Return the material of a part."""
+    from trimesh.visual.material import PBRMaterial
+
+    texture = None
+    gloss_texture = None
+    if surface.texture_id >= 0:
+        texture = Image.fromarray(mesh.textures[surface.texture_id])
+        if mesh.gloss_textures:
+            factors = mesh.gloss_textures[surface.texture_id]
+            # glTF stores roughness in green and metallic in blue. Red is unused.
+            gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
+    # trimesh would merge two images with the same bytes and different sizes if
+    # their materials had the same name.
+    name = f"texture {surface.texture_id}"
+    roughness, metallic = MATTE
+    if surface.gloss:
+        roughness, metallic, strength = surface.gloss
+        name = f"{name}, {SPECULAR} {strength}"
+    return PBRMaterial(
+        name=name,
+        baseColorTexture=texture,
+        metallicRoughnessTexture=gloss_texture,
+        metallicFactor=metallic,
+        roughnessFactor=roughness,
+        doubleSided=True,
+    )
+
+
 def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
-    """One node with the parts as primitives, in order, and colors of full precision: trimesh's own have 8 bits, too
-    few for dark linear ones. A node for each camera."""
+    """Join the parts of a glTF tree in one mesh and add the cameras, in place.
+
+    The colors and normals get their names in glTF. trimesh itself would write
+    colors with 8 bits, which is too coarse for dark linear colors.
+    """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
-        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_COLOR)
-        primitive["attributes"]["NORMAL"] = primitive["attributes"].pop(_NORMAL)
-    tree["meshes"], tree["nodes"] = [{"primitives": primitives}], [{"mesh": 0}]
+        attributes = primitive["attributes"]
+        attributes["COLOR_0"] = attributes.pop(_COLOR)
+        attributes["NORMAL"] = attributes.pop(_NORMAL)
+    tree["meshes"] = [{"primitives": primitives}]
+    tree["nodes"] = [{"mesh": 0}]
     for material in tree["materials"]:
-        _, strength = f"{material['name']}, {SPECULAR} ".split(f", {SPECULAR} ")[:2]
-        if strength:
-            material["extensions"] = {"KHR_materials_specular": {"specularFactor": float(strength)}}
+        _, found, strength = material["name"].partition(f", {SPECULAR} ")
+        if found:
+            material["extensions"] = {"KHR_materials_specular": {SPECULAR: float(strength)}}
             tree["extensionsUsed"] = ["KHR_materials_specular"]
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
     for index, camera in enumerate(cameras):
-        pose = Y_UP_TO_Z_UP.T @ camera.pose()  # looks along its own -z; stored by columns (glTF 2.0, 3.10)
-        tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": pose.T.ravel().tolist()})
+        # Cameras of glTF look along their -z, as ours do, and matrices are
+        # stored by columns (glTF 2.0, section 3.10).
+        pose = Y_UP_TO_Z_UP.T @ camera.pose()
+        matrix = pose.T.ravel().tolist()
+        tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": matrix})
     tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
-    planes, half = {"znear": camera.near, "zfar": camera.far}, camera.width / 2
+    """Return the glTF description of a camera."""
+    planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
-        return {"type": "perspective", "perspective": {"yfov": camera.angle, "aspectRatio": 1.0, **planes}}
-    return {"type": "orthographic", "orthographic": {"xmag": half, "ymag": half, **planes}}
+        perspective = {"yfov": camera.angle, "aspectRatio": 1.0, **planes}
+        return {"type": "perspective", "perspective": perspective}
+    half_width = camera.width / 2
+    orthographic = {"xmag": half_width, "ymag": half_width, **planes}
+    return {"type": "orthographic", "orthographic": orthographic}
 
 
 def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One row for each vertex of faces (F, 3) and each of the values (F, 3, D) that its corners have.
-    Returns the vertices (N,), the values (N, D) and the faces in terms of these rows, by vertex."""
-    rows = np.concatenate([faces[..., None], corners], axis=-1)  # float64, which holds either exactly
-    rows, index = np.unique(rows.reshape(-1, rows.shape[-1]), axis=0, return_inverse=True)
-    return rows[:, 0].astype(np.int64), rows[:, 1:], index.reshape(-1, 3)
+    """Repeat each vertex for each combination of values that its corners have.
+
+    Args:
+        faces: Vertex indices of F faces, shape (F, 3).
+        corners: D values of each corner, shape (F, 3, D).
+
+    Returns:
+        A tuple of
+        - the original vertex of each of N new vertices, shape (N,);
+        - the values of the new vertices, shape (N, D);
+        - the faces with indices of new vertices, shape (F, 3).
+    """
+    # float64 holds vertex indices and values exactly.
+    rows = np.concatenate([faces[..., None], corners], axis=-1)
+    flat_rows = rows.reshape(-1, rows.shape[-1])
+    distinct, index = np.unique(flat_rows, axis=0, return_inverse=True)
+    return distinct[:, 0].astype(np.int64), distinct[:, 1:], index.reshape(-1, 3)

@@ -1,4 +1,8 @@
-"""Files that are replaced as a whole: a reader, or a crash, meets the old content or the new one, never a part."""
+"""Files that are replaced as a whole.
+
+A reader finds the old content or the new content, and never a part of it. The
+same holds after a crash.
+"""
 
 import errno
 import os
@@ -8,25 +12,33 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-TEMPORARY = ".pnb-*.tmp"  # the names of unfinished files, in the folder of the file that they will replace
+# Pattern of the names of unfinished files. They lie in the folder of the file
+# that they will replace.
+TEMPORARY = ".pnb-*.tmp"
 
 
 @contextmanager
-def replacing(path: str | Path, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
-    """Give a temporary path to write to, and move the file from there to `path` when the block ends without an error.
+def replacing(
+    path: str | Path, durable: bool = False, previous: Path | None = None
+) -> Iterator[Path]:
+    """Give a temporary path to write to, and move the file to `path` at the end of the block.
 
-    Otherwise the temporary file is removed, and the old file stays as it was.
+    If the block raises an error, the temporary file is removed, and the old
+    file stays as it was.
 
     Args:
-        path: The file to replace or to make. Its folder exists. A link stays one: the file that it names is replaced.
-        durable: Whether to wait until the disk has the file, so that it outlives a loss of power: some 20 ms.
-        previous: Where the old file is kept, or None.
+        path: File to replace or to create. Its folder exists. A symbolic link
+            stays, and the file that it points to is replaced.
+        durable: Whether to wait until the disk holds the file, so that it
+            survives a loss of power. This takes about 20 ms.
+        previous: Path to which the old file is moved. None deletes it.
 
     Yields:
-        The path to write to, in the folder of the file.
+        Temporary path in the folder of the file.
 
     Raises:
-        OSError: The disk refuses the file, which may not be written, or is a folder. The error names `path`.
+        OSError: If the file cannot be written, or is a folder or a device. The
+            error names `path`.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(TEMPORARY.replace("*", uuid4().hex))
@@ -40,10 +52,12 @@ def replacing(path: str | Path, durable: bool = False, previous: Path | None = N
         if previous and target.exists():
             os.replace(target, previous)
         os.replace(temporary, target)
-        if durable and os.name == "posix":  # the renaming is an entry of the folder
+        # The new name is an entry of the folder. Only POSIX can flush folders.
+        if durable and os.name == "posix":
             _flush(target.parent)
     except OSError as error:
-        if error.errno is None:  # a library's error, in its own words
+        # Libraries raise errors without a number. Their texts are kept.
+        if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
@@ -52,11 +66,23 @@ def replacing(path: str | Path, durable: bool = False, previous: Path | None = N
 
 
 def write_whole(
-    path: str | Path, content: bytes | memoryview | str, durable: bool = False, previous: Path | None = None
+    path: str | Path,
+    content: bytes | memoryview | str,
+    durable: bool = False,
+    previous: Path | None = None,
 ) -> None:
-    """Write a file as a whole. Arguments and errors are those of `replacing`.
+    """Write a file as a whole, see `replacing`.
 
-    Text becomes UTF-8. Characters that it lacks, as file names in another encoding have, are written as escapes.
+    Args:
+        path: File to replace or to create.
+        content: New content. Text is encoded as UTF-8. Characters that UTF-8
+            lacks, which file names in other encodings can have, are written as
+            escapes.
+        durable: Whether to wait until the disk holds the file.
+        previous: Path to which the old file is moved. None deletes it.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     with replacing(path, durable, previous) as temporary:
@@ -64,23 +90,30 @@ def write_whole(
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files that a killed process left in a folder which no other process writes to."""
-    for left in folder.glob(TEMPORARY):
-        left.unlink(missing_ok=True)
+    """Remove the temporary files that a killed process left in a folder.
+
+    Args:
+        folder: Folder to which no other process writes.
+    """
+    for unfinished in folder.glob(TEMPORARY):
+        unfinished.unlink(missing_ok=True)
 
 
 def _require_replaceable(target: Path) -> None:
-    """Raise OSError for a folder, a device or a file that may not be written, which a renaming would replace."""
-    if target.exists() and not target.is_file():
+    """Raise OSError for a folder, a device, or a file that is read-only."""
+    if not target.exists():
+        return
+    if not target.is_file():
         number = errno.EISDIR if target.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number))
-    if target.exists():
-        with target.open("ab"):
-            pass
+    # The disk would replace even a read-only file. Opening it for writing raises
+    # the error.
+    with target.open("ab"):
+        pass
 
 
 def _flush(path: Path) -> None:
-    """Wait until the disk has a file, or the entries of a folder."""
+    """Wait until the disk holds a file, or the entries of a folder."""
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""Image files, as a classifier sees them, and arrays of numbers as .npy files."""
+"""Image files as a classifier sees them, and arrays of numbers as .npy files."""
 
 import io
 import math
@@ -13,31 +13,44 @@ from torch import Tensor
 from renderer.errors import InputError, require_file
 from renderer.io.files import write_whole
 
+# Suffixes of image files that can be read.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
+# JPEG files are decoded with at least this multiple of the final size.
+DECODED_SIZES = 16
 
 
 def read_image(path: str | Path, size: int) -> Tensor:
-    """`read_square` as (3, size, size) float32 in [0, 1]. InputError where the file cannot be read."""
+    """Read the central square of an image file.
+
+    Args:
+        path: Image file.
+        size: Width and height of the result in pixels.
+
+    Returns:
+        RGB values in [0, 1], float32, shape (3, size, size).
+
+    Raises:
+        InputError: If the file does not exist or cannot be read.
+    """
     require_file(path, "give an image file")
     try:
         square = read_square(path, size)
-    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+    except Exception as error:  # Pillow raises many classes for damaged files.
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
 def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
-    """Make a gray image, or read the center square of an image file.
+    """Create a gray image, or read the central square of an image file.
 
     Args:
-        name: Name of the argument that holds the choice, for messages.
-        choice: Gray value in [0, 1], also as text, or the path of an image file.
-        size: Pixels per side.
+        name: Name of the argument that holds the choice, for errors.
+        choice: Gray value in [0, 1], also as text, or path of an image file.
+        size: Width and height of the result in pixels.
 
     Returns:
-        Values in [0, 1], shape (1, size, size) for gray and (3, size, size) for a
-        file.
+        Values in [0, 1], shape (1, size, size) for gray, and (3, size, size)
+        for a file.
 
     Raises:
         InputError: If the choice is neither, or the file cannot be read.
@@ -50,8 +63,9 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
     if isinstance(choice, bool):
         raise InputError(f"{name}={choice}: {expected}")
     try:
-        gray = float(choice)  # type: ignore[arg-type]  # Of a path it raises.
+        gray = float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
+        # The choice is not a number, so it may be a path.
         gray = math.nan
     if math.isnan(gray) and isinstance(choice, str | Path):
         try:
@@ -64,50 +78,97 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
 
 
 def read_square(path: str | Path, size: int) -> np.ndarray:
-    """The center square of an image as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
-    return np.asarray(central_square(read_rgb(path, DECODED_SIZES * size), size))
+    """Read the central square of an image file as bytes.
+
+    Args:
+        path: Image file.
+        size: Width and height of the result in pixels.
+
+    Returns:
+        RGB values, uint8, shape (size, size, 3).
+
+    Raises:
+        Exception: If the file is damaged. The class depends on the format.
+    """
+    image = read_rgb(path, DECODED_SIZES * size)
+    return np.asarray(central_square(image, size))
 
 
 def read_rgb(path: str | Path, least: int) -> Image.Image:
-    """An image, upright, alpha over white. least: a large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times
-    faster, but to no fewer pixels per side. Raises whatever Pillow does at a broken file."""
+    """Read an image file upright, with transparent parts in front of white.
+
+    Args:
+        path: Image file.
+        least: Smallest width and height in pixels that are needed. A large JPEG
+            file is decoded at 1/2, 1/4 or 1/8 of its size if the result is not
+            smaller than this, which is several times faster.
+
+    Returns:
+        RGB image with 8 bits per channel.
+
+    Raises:
+        Exception: If the file is damaged. The class depends on the format.
+    """
     with Image.open(path) as image:
         image.draft(None, (least, least))
         upright = eight_bits(ImageOps.exif_transpose(image))
     if upright.has_transparency_data:
         upright = upright.convert("RGBA")
-        upright = Image.alpha_composite(Image.new("RGBA", upright.size, "white"), upright)
+        white = Image.new("RGBA", upright.size, "white")
+        upright = Image.alpha_composite(white, upright)
     return upright.convert("RGB")
 
 
 def central_square(image: Image.Image, size: int) -> Image.Image:
-    """The center square of an image, size × size."""
+    """Cut out the central square of an image and resize it.
+
+    Args:
+        image: Image of any size.
+        size: Width and height of the result in pixels.
+
+    Returns:
+        Image of size × size pixels.
+    """
     return ImageOps.fit(image, (size, size), Image.Resampling.LANCZOS)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """The image with channels of 8 bits. ValueError where its white is unknown; whatever Pillow raises at damage."""
+    """Convert an image to 8 bits per channel.
+
+    Args:
+        image: Image with 8, 16 or 32 bits per channel.
+
+    Returns:
+        Image with 8 bits per channel.
+
+    Raises:
+        ValueError: If the pixels are floating-point numbers.
+        Exception: If the file is damaged. The class depends on the format.
+    """
     if image.mode == "F":
-        raise ValueError("floating-point pixels have no agreed white")
-    if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow would clip rather than scale
-        return Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
+        raise ValueError("its pixels are floating-point numbers, whose white is unknown")
+    if image.mode.startswith("I"):
+        # Such an image has 16 bits per pixel. Pillow would clip them to 8 bits.
+        scaled = np.clip(np.asarray(image) // 256, 0, 255)
+        return Image.fromarray(scaled.astype(np.uint8))
     image.load()
     return image
 
 
 def write_image(path: Path, image: Image.Image, **options: object) -> None:
-    """Write an image as a whole, in the format of the path's suffix.
+    """Write an image file as a whole, in the format of its suffix.
 
     Args:
-        path: The file to replace or to make.
-        image: The image.
-        **options: Those of Pillow's `Image.save`.
+        path: File to replace or to create.
+        image: Image to write.
+        **options: Options of Pillow's `Image.save`.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: If the file cannot be written.
     """
     content = io.BytesIO()
-    image.save(content, Image.registered_extensions()[path.suffix.lower()], **options)
+    image_format = Image.registered_extensions()[path.suffix.lower()]
+    image.save(content, image_format, **options)
     write_whole(path, content.getbuffer())
 
 
@@ -115,11 +176,11 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
     """Write an array as an .npy file, as a whole.
 
     Args:
-        path: The file to replace or to make.
-        numbers: The array.
+        path: File to replace or to create.
+        numbers: Array to write.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: If the file cannot be written.
     """
     content = io.BytesIO()
     np.save(content, numbers)
@@ -127,8 +188,21 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """The real numbers of an .npy file as float32; larger ones become infinite. Reads no more than the file holds,
-    whatever its header says. ValueError: no numbers; whatever NumPy raises at a damaged header."""
+    """Read real numbers from an .npy file.
+
+    The file is mapped into memory first. A damaged header can therefore not
+    request more memory than the file has.
+
+    Args:
+        path: .npy file.
+
+    Returns:
+        Numbers, float32. Larger numbers become infinite.
+
+    Raises:
+        ValueError: If the file holds no real numbers.
+        Exception: If the header is damaged. NumPy decides about the class.
+    """
     array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind not in "fiu" or not array.size:
         raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")

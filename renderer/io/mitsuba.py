@@ -1,13 +1,23 @@
-"""Scenes for Mitsuba 3, as files of their own or in memory.
+"""Scenes for Mitsuba 3, as files or in memory.
 
-A scene is a dictionary of `mitsuba_entries`. `load` gives it to Mitsuba, and `write_mitsuba_scene` writes it as
-scene.xml with .ply parts and textures beside it, which needs no Mitsuba.
+A scene is a dictionary of `renderer.io.mitsuba_entries`. `load` passes it to
+Mitsuba. `write_mitsuba_scene` writes it as scene.xml, with .ply files and
+textures beside it, which needs no Mitsuba.
 
-Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
-and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
-here, a concave mesh has dark places there. Gloss is its `principled`, with the same lobe; its diffuse part is Disney's,
-which loses nothing to the coat: the color is scaled by what ours keeps on average, and 1 to 3 % are left. Its
-radiance is premultiplied with alpha, as ours with the coverage.
+The renderers differ in these ways:
+
+- Diffuse surfaces of Mitsuba reflect albedo / π of the irradiance, and our
+  surfaces reflect albedo times the irradiance. The scale of the lights
+  compensates for this. It also contains the albedo scale, because a bounce
+  would otherwise apply that scale again.
+- Mitsuba always has shadows. If our render has none, a concave mesh is darker in
+  Mitsuba.
+- Gloss is the plugin `principled`, with the same lobe. Its diffuse part does not
+  lose the light that the coat reflects. The color is therefore scaled by the
+  fraction that our diffuse part keeps on average. A difference of 1 to 3%
+  remains.
+
+Both renderers return radiance that is premultiplied with the coverage.
 """
 
 import math
@@ -37,81 +47,162 @@ from renderer.light.harmonics import equirectangular
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.surface.microfacets import coat_mean
 
+# Name of the scene file in its folder.
 SCENE = "scene.xml"
-SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
-VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
+# Number of samples per pixel, which are spread evenly. The noise in smooth
+# lighting is then below 1/255.
+SAMPLES = 256
+# Default variant of Mitsuba. It needs no LLVM, and renders the same bits on any
+# number of threads.
+VARIANT = "scalar_rgb"
+# Variant of Mitsuba that computes gradients.
 DIFFERENTIABLE = "llvm_ad_rgb"
+# XML tag of each type of value in a scene file.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
-PLUGINS = {  # by the tags that they have in files
-    "integrator": ("path", "direct"),
-    "emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot"),
-    "shape": ("ply", "disk"),
-    "sensor": ("perspective", "orthographic"),
-    "bsdf": ("twosided", "diffuse", "principled"),
-    "texture": ("bitmap", "mesh_attribute"),
-    "film": ("hdrfilm",),
-    "rfilter": ("box",),
-    "sampler": ("multijitter",),
+# XML tag of each plugin in a scene file.
+PLUGIN_TAGS = {
+    "path": "integrator",
+    "direct": "integrator",
+    "area": "emitter",
+    "constant": "emitter",
+    "directional": "emitter",
+    "envmap": "emitter",
+    "point": "emitter",
+    "projector": "emitter",
+    "spot": "emitter",
+    "ply": "shape",
+    "disk": "shape",
+    "perspective": "sensor",
+    "orthographic": "sensor",
+    "twosided": "bsdf",
+    "diffuse": "bsdf",
+    "principled": "bsdf",
+    "bitmap": "texture",
+    "mesh_attribute": "texture",
+    "hdrfilm": "film",
+    "box": "rfilter",
+    "multijitter": "sampler",
 }
+# Smallest albedo scale by which the strength of a coat is divided.
+SMALLEST_SCALE = 1e-6
 
 
 @contextmanager
 def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
-    """The module under a variant; that of before, if any, comes back. InputError: it, or its LLVM, is not installed."""
+    """Give the module of Mitsuba with a variant, and restore the previous variant at the end.
+
+    Args:
+        variant: Variant of Mitsuba, such as VARIANT or DIFFERENTIABLE.
+
+    Yields:
+        The module.
+
+    Raises:
+        InputError: If Mitsuba is not installed, or if the variant needs LLVM
+            and LLVM is not installed.
+    """
     try:
         import drjit
         import mitsuba as module
     except ImportError as error:
         raise InputError("Mitsuba is not installed: pip install '.[lab]'") from error
-    before = module.variant()
+    previous = module.variant()
     try:
         module.set_variant(variant)
     except ImportError as error:
-        raise InputError(f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})") from error
-    drjit.set_thread_count(max(2, drjit.thread_count()))  # with one, of one core, its reader of .exr waits forever
+        raise InputError(
+            f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})"
+        ) from error
+    # Mitsuba waits forever for an .exr file if it has a single thread.
+    drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
         yield module
     finally:
-        if before:
-            module.set_variant(before)
+        if previous:
+            module.set_variant(previous)
 
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
-    """Mitsuba's object of a dictionary, with its arrays as transforms and bitmaps."""
-    scene = dict(scene)
+    """Create the Mitsuba object of a dictionary.
+
+    Args:
+        module: Module of Mitsuba.
+        scene: Dictionary of the object, with arrays for transforms and images.
+
+    Returns:
+        Object of Mitsuba.
+    """
+    converted = dict(scene)
     for name, value in scene.items():
         if isinstance(value, dict) and value["type"] != "rgb":
-            scene[name] = load(module, value)
+            converted[name] = load(module, value)
         elif isinstance(value, np.ndarray):
-            scene[name] = module.ScalarTransform4f(value) if value.shape == (4, 4) else module.Bitmap(value)
-    return module.load_dict(scene)
+            is_transform = value.shape == (4, 4)
+            convert = module.ScalarTransform4f if is_transform else module.Bitmap
+            converted[name] = convert(value)
+    return module.load_dict(converted)
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """(views, 4, size, size) float32 linear radiance and coverage of a scene's .xml file, a sensor each.
-    InputError: Mitsuba is not installed, or refuses the file."""
+    """Render the first cameras of a scene file with Mitsuba.
+
+    Args:
+        path: Scene file (.xml).
+        views: Number of cameras.
+
+    Returns:
+        Linear radiance and coverage, float32, shape (views, 4, size, size).
+
+    Raises:
+        InputError: If Mitsuba is not installed or cannot render the file.
+    """
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
             images = [np.array(module.render(scene, sensor=view)) for view in range(views)]
         except RuntimeError as error:
-            raise InputError(f"{path} is not rendered by Mitsuba: {str(error).splitlines()[0]}") from error
+            reason = str(error).splitlines()[0]
+            raise InputError(f"Mitsuba cannot render {path}: {reason}") from error
     return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
-    """Radiance (height, 2 · height, 3) float64 of a light's coefficients at the texels as Mitsuba's `envmap` places
-    them: its outermost rows are the poles. At 256 rows those of `to_map` would be taken for light 0.2 % dimmer."""
-    around, _ = equirectangular(1, 2 * height)  # z is 0, the mean
+    """Evaluate lighting at the texels of an environment map of Mitsuba.
+
+    The first and the last row of its maps are the poles. With 256 rows, the
+    texels of `to_map` would make the light 0.2% dimmer.
+
+    Args:
+        coefficients: Spherical-harmonic coefficients of the lighting,
+            shape (K, 3).
+        height: Number of rows of the map.
+
+    Returns:
+        Radiance, float64, shape (height, 2 · height, 3).
+    """
+    # The single row lies on the equator, at z = 0.
+    horizontal, _ = equirectangular(1, 2 * height)
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
-    return light_radiance(coefficients, polar.sin() * around + polar.cos() * torch.tensor([0.0, 0.0, 1.0]))
+    up = torch.tensor([0.0, 0.0, 1.0])
+    directions = polar.sin() * horizontal + polar.cos() * up
+    return light_radiance(coefficients, directions)
 
 
 @dataclass(frozen=True)
 class Part:
-    """F faces of one texture (H, W, 3) uint8, or of none, and of one gloss, if any, with corners of their own.
-    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), and gloss: (3,), as in `Mesh`. factors: the
-    gloss texture (H, W, 2)."""
+    """F faces of a mesh with one texture and one gloss.
+
+    Attributes:
+        positions: Positions of the corners, shape (F, 3, 3).
+        normals: Normals of the corners, shape (F, 3, 3).
+        uvs: Texture coordinates of the corners as in `Mesh`, shape (F, 3, 2).
+        colors: Linear colors of the corners, shape (F, 3, 3).
+        texture: Texture, uint8, shape (H, W, 3). None if there is none.
+        gloss: Roughness, metallic and strength, shape (3,). None if the mesh
+            has none.
+        factors: Gloss texture with roughness and metallic, uint8,
+            shape (H, W, 2). None if there is none.
+    """
 
     positions: np.ndarray
     normals: np.ndarray
@@ -123,21 +214,44 @@ class Part:
 
 
 def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
-    """The faces of each texture and gloss, and those of none. normals: (F, 3, 3), of the corners.
+    """Split a mesh into parts with one texture and one gloss each.
 
-    Textures are on white corners: where they are on others they are painted anew, since Mitsuba has no product of the
-    two.
+    Mitsuba cannot multiply a texture by corner colors. If textured corners are
+    not white, the textures are painted anew.
+
+    Args:
+        mesh: Mesh with F faces.
+        normals: Normals of the corners, shape (F, 3, 3).
+        encoding: Encoding of colors and textures, "linear" or "srgb".
+
+    Returns:
+        Parts in ascending order of the texture and the gloss.
     """
-    if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
+    textured_colors = mesh.corner_colors[mesh.texture_ids >= 0]
+    if (textured_colors != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    parts, kinds = [], mesh.texture_ids[:, None]
-    kinds = kinds if mesh.gloss is None else np.concatenate([kinds, mesh.gloss], axis=1)
-    for kind in np.unique(kinds, axis=0):
-        faces, index = (kinds == kind).all(axis=1), int(kind[0])
-        texture, factors = (of[index] if of and index >= 0 else None for of in (mesh.textures, mesh.gloss_textures))
-        corners, gloss = mesh.vertices[mesh.faces[faces]], None if mesh.gloss is None else kind[1:]
-        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture, gloss, factors))
+    # One row for each face. Faces with equal rows are one part.
+    keys = mesh.texture_ids[:, None]
+    if mesh.gloss is not None:
+        keys = np.concatenate([keys, mesh.gloss], axis=1)
+    parts = []
+    for key in np.unique(keys, axis=0):
+        is_in_part = (keys == key).all(axis=1)
+        texture_id = int(key[0])
+        has_texture = texture_id >= 0
+        part = Part(
+            positions=mesh.vertices[mesh.faces[is_in_part]],
+            normals=normals[is_in_part],
+            uvs=mesh.corner_uvs[is_in_part],
+            colors=colors[is_in_part],
+            texture=mesh.textures[texture_id] if has_texture else None,
+            gloss=None if mesh.gloss is None else key[1:],
+            factors=mesh.gloss_textures[texture_id]
+            if has_texture and mesh.gloss_textures
+            else None,
+        )
+        parts.append(part)
     return parts
 
 
@@ -150,18 +264,42 @@ def shape(
     uvs: np.ndarray | None = None,
     colors: np.ndarray | None = None,
 ) -> Any:
-    """A mesh in memory of vertices (V, 3) with normals (V, 3), uvs (V, 2), as in `Mesh`, and linear colors (V, 3) as
-    the attribute "vertex_color"; shaded flat without normals. surface: the dictionary of its bsdf."""
+    """Create a mesh of Mitsuba in memory.
+
+    Args:
+        module: Module of Mitsuba.
+        surface: Dictionary of its bsdf.
+        positions: Positions of the vertices, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        normals: Normals of the vertices, shape (V, 3). None shades each face
+            flat.
+        uvs: Texture coordinates of the vertices as in `Mesh`, shape (V, 2).
+            None leaves them out.
+        colors: Linear colors of the vertices, shape (V, 3), for the attribute
+            "vertex_color". None leaves them out.
+
+    Returns:
+        Mesh of Mitsuba.
+    """
     properties = module.Properties()
-    properties["bsdf"], properties["face_normals"] = load(module, surface), normals is None
-    has = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uvs is not None}
-    mesh = module.Mesh("mesh", len(positions), len(faces), props=properties, **has)
+    properties["bsdf"] = load(module, surface)
+    properties["face_normals"] = normals is None
+    mesh = module.Mesh(
+        "mesh",
+        len(positions),
+        len(faces),
+        props=properties,
+        has_vertex_normals=normals is not None,
+        has_vertex_texcoords=uvs is not None,
+    )
     if colors is not None:
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)
     buffers["faces"] = faces.astype(np.uint32).ravel()
+    # Mitsuba has v = 0 at the upper edge of a texture.
     texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
-    for name, values in (("positions", positions), ("normals", normals), ("texcoords", texcoords)):
+    values_by_name = {"positions": positions, "normals": normals, "texcoords": texcoords}
+    for name, values in values_by_name.items():
         if values is not None:
             buffers[f"vertex_{name}"] = values.astype(np.float32).ravel()
     buffers.update()
@@ -177,100 +315,211 @@ def write_mitsuba_scene(
     light: str,
     local_lights: Sequence[tuple[LocalBasis, torch.Tensor]] = (),
 ) -> None:
-    """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
-    there. local_lights: with their coefficients (size, 3)."""
+    """Write a scene file for Mitsuba, with the files that it refers to.
+
+    Args:
+        folder: Folder for the files. It is created.
+        mesh: Mesh to show.
+        albedo_scale: Factor for the albedo of the mesh.
+        cameras: Cameras, which become the sensors of the scene.
+        settings: Size, normals, encoding and bounces of the images.
+        light: Path of the environment map, relative to `folder`.
+        local_lights: Local lights with their coefficients, shape (N, 3) each.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     emitters = _local_emitters(folder, local_lights, albedo_scale)
-    # Surfaces find the sky by themselves, with less noise.
-    sky = environment({"filename": light}, math.pi * albedo_scale) | {"sampling_weight": 0.0 if emitters else 1.0}
-    sampler = {"type": "multijitter", "sample_count": SAMPLES}
-    sensors = [sensor_of(camera, settings.size) | {"sampler": sampler} for camera in cameras]
-    scene = xml.Element("scene", version="3.0.0")
-    for entry in (integrator(settings.bounces, int(bool(emitters))), sky, *emitters, *sensors):
-        _append(scene, "", entry)
+    sky = environment({"filename": light}, math.pi * albedo_scale)
+    # Rays from surfaces find the environment with less noise than rays to it.
+    sky["sampling_weight"] = 0.0 if emitters else 1.0
+    sensors = []
+    for camera in cameras:
+        sampler = {"type": "multijitter", "sample_count": SAMPLES}
+        sensors.append({**sensor_of(camera, settings.size), "sampler": sampler})
+    emitter_samples = 1 if emitters else 0
+    objects = [integrator(settings.bounces, emitter_samples), sky, *emitters, *sensors]
     normals = corner_normals(mesh.vertices, mesh.faces, settings.normals)
     for number, part in enumerate(split_parts(mesh, normals, settings.encoding)):
-        _append(scene, "", _write_part(folder, number, part, settings.encoding, albedo_scale))
+        writer = _PartWriter(folder, number, part, settings.encoding, albedo_scale)
+        objects.append(writer.write())
+    scene = xml.Element("scene", version="3.0.0")
+    for entry in objects:
+        _append(scene, "", entry)
     xml.indent(scene, "    ")
     write_whole(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Write an entry of a dictionary below an element."""
+    """Append an entry of a scene dictionary to an XML element, without a name if it is empty."""
     named = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", named)
-        xml.SubElement(transform, "matrix", value=" ".join(f"{entry:.17g}" for entry in value.ravel()))
+        text = " ".join(f"{entry:.17g}" for entry in value.ravel())
+        xml.SubElement(transform, "matrix", value=text)
     elif not isinstance(value, dict):
-        text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-        xml.SubElement(parent, VALUE_TAGS[type(value)], named, value=text.lower() if isinstance(value, bool) else text)
+        xml.SubElement(parent, VALUE_TAGS[type(value)], named, value=_as_text(value))
     elif value["type"] == "rgb":
-        xml.SubElement(parent, "rgb", named, value=" ".join(map(str, value["value"])))
+        xml.SubElement(parent, "rgb", named, value=_as_text(value["value"]))
     else:
-        [tag] = [tag for tag, plugins in PLUGINS.items() if value["type"] in plugins]
-        element = xml.SubElement(parent, tag, named, type=value["type"])
+        plugin = value["type"]
+        element = xml.SubElement(parent, PLUGIN_TAGS[plugin], named, type=plugin)
         for key, entry in value.items():
             if key != "type":
                 _append(element, key, entry)
 
 
+def _as_text(value: Any) -> str:
+    """Write a number, a flag, a string or a list of numbers as in a scene file."""
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _local_emitters(
     folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
 ) -> list[Scene]:
-    """Describe local lights for a scene file, and write their bitmaps beside it as .exr files."""
-    emitters = []
+    """Return the emitters of local lights, and write their patterns as .exr files.
+
+    Args:
+        folder: Folder for the files.
+        lights: Local lights with their coefficients, shape (N, 3) each.
+        albedo_scale: Factor for the albedo of the mesh, which the lights
+            contain.
+
+    Returns:
+        Dictionary of each emitter, with names of files instead of bitmaps.
+    """
+    emitters: list[Scene] = []
     for basis, coefficients in lights:
         emitters += basis.mitsuba_emitters(coefficients, albedo_scale)
     projectors = [emitter for emitter in emitters if emitter["type"] == "projector"]
     for number, emitter in enumerate(projectors):
-        file = f"pattern_{number}.exr" if number else "pattern.exr"
-        options = dict(emitter["irradiance"])
-        write_map(folder / file, torch.from_numpy(options.pop("bitmap")))
-        emitter["irradiance"] = {"type": options.pop("type"), "filename": file, **options}
+        name = f"pattern_{number}.exr" if number else "pattern.exr"
+        pattern = dict(emitter["irradiance"])
+        write_map(folder / name, torch.from_numpy(pattern.pop("bitmap")))
+        emitter["irradiance"] = {"type": pattern.pop("type"), "filename": name, **pattern}
     return emitters
 
 
-def _write_part(folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> Scene:
-    """A shape of part_0.ply and so on, with its texture_0.png."""
-    import trimesh
+class _PartWriter:
+    """Writer of the files of one part: part_0.ply, texture_0.png, and so on."""
 
-    file, texture = f"part_{number}.ply", f"texture_{number}.png"
-    gloss = part.gloss if part.gloss is not None and part.gloss[1:].any() else None  # of a matte part
-    kept = 1.0 if gloss is None else _kept(gloss)
-    corners = np.concatenate([part.uvs, kept * part.colors], axis=-1).reshape(-1, 5).astype(np.float32)
-    surface = trimesh.Trimesh(
-        part.positions.reshape(-1, 3),
-        np.arange(len(corners)).reshape(-1, 3),
-        vertex_normals=part.normals.reshape(-1, 3),
-        vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
-        process=False,
-    )
-    write_whole(folder / file, surface.export(file_type="ply", vertex_normal=True))
-    albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
-    if part.texture is not None:
-        scaled = to_bytes(encode(kept * decode(torch.from_numpy(part.texture) / 255, encoding), encoding))
-        write_image(folder / texture, Image.fromarray(scaled.numpy()))
-        albedo = {"type": "bitmap", "filename": texture, "raw": encoding == "linear"}
-    material: Scene = {"type": "diffuse", "reflectance": albedo}
-    if gloss is not None:
-        roughness, metallic, strength = (gloss / [1, kept, 1]).tolist()
-        # The light's scale has the albedo's. F0 is 0.08 × specular, and 0.04 for a refractive index of 1.5.
-        specular = min(strength / 2 / max(albedo_scale, 1e-6), 1.0)
-        material = {"type": "principled", "base_color": albedo, "specular": specular}
-        factors = (("roughness", roughness, MIN_ROUGHNESS), ("metallic", metallic, 0.0))
-        for index, (name, factor, least) in enumerate(factors):
-            material[name] = max(factor, least)
-            if part.factors is not None:
-                image = np.maximum(part.factors[..., index] * factor, 255 * least).round().astype(np.uint8)
-                write_image(folder / f"{name}_{number}.png", Image.fromarray(image))
-                material[name] = {"type": "bitmap", "filename": f"{name}_{number}.png", "raw": True}
-    bsdf = {"type": "twosided", "material": material}
-    return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": bsdf}
+    def __init__(
+        self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
+    ) -> None:
+        """Prepare to write a part.
+
+        Args:
+            folder: Folder for the files.
+            number: Number of the part in their names.
+            part: Part to write.
+            encoding: Encoding of its texture, "linear" or "srgb".
+            albedo_scale: Factor for the albedo, which the lights contain.
+        """
+        self._folder = folder
+        self._number = number
+        self._part = part
+        self._encoding = encoding
+        self._albedo_scale = albedo_scale
+        is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
+        # A part without metallic and strength is matte.
+        self._gloss = part.gloss if is_glossy else None
+        # Fraction of the albedo that the surface keeps below its coat.
+        self._kept = 1.0 if self._gloss is None else _kept_fraction(self._gloss)
+
+    def write(self) -> Scene:
+        """Write the files of the part.
+
+        Returns:
+            Dictionary of the shape.
+        """
+        mesh_file = self._write_mesh()
+        albedo = self._albedo()
+        material = {"type": "diffuse", "reflectance": albedo}
+        if self._gloss is not None:
+            material = self._glossy_material(self._gloss, albedo)
+        bsdf = {"type": "twosided", "material": material}
+        return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
+
+    def _write_mesh(self) -> str:
+        """Write the .ply file, in which each corner is a vertex, and return its name."""
+        import trimesh
+
+        part = self._part
+        values = np.concatenate([part.uvs, self._kept * part.colors], axis=-1)
+        corners = values.reshape(-1, 5).astype(np.float32)
+        surface = trimesh.Trimesh(
+            part.positions.reshape(-1, 3),
+            np.arange(len(corners)).reshape(-1, 3),
+            vertex_normals=part.normals.reshape(-1, 3),
+            # Texture coordinates (u, v) and colors (r, g, b) of the .ply file.
+            vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
+            process=False,
+        )
+        name = f"part_{self._number}.ply"
+        write_whole(self._folder / name, surface.export(file_type="ply", vertex_normal=True))
+        return name
+
+    def _albedo(self) -> Scene:
+        """Write the texture, if there is one, and return the dictionary of the albedo."""
+        texture = self._part.texture
+        if texture is None:
+            return {"type": "mesh_attribute", "name": "vertex_color"}
+        kept_albedo = self._kept * decode(torch.from_numpy(texture) / 255, self._encoding)
+        image = to_bytes(encode(kept_albedo, self._encoding))
+        name = f"texture_{self._number}.png"
+        write_image(self._folder / name, Image.fromarray(image.numpy()))
+        return {"type": "bitmap", "filename": name, "raw": self._encoding == "linear"}
+
+    def _glossy_material(self, gloss: np.ndarray, albedo: Scene) -> Scene:
+        """Write the gloss texture, if there is one, and return the dictionary of the material."""
+        # The metallic part of the color is scaled like the diffuse part.
+        roughness, metallic, strength = (gloss / [1, self._kept, 1]).tolist()
+        # F0 is 0.08 · specular, and 0.04 for a refractive index of 1.5. The
+        # lights contain the albedo scale, which the coat must not have.
+        specular = min(strength / 2 / max(self._albedo_scale, SMALLEST_SCALE), 1.0)
+        return {
+            "type": "principled",
+            "base_color": albedo,
+            "specular": specular,
+            "roughness": self._gloss_value("roughness", roughness, minimum=MIN_ROUGHNESS),
+            "metallic": self._gloss_value("metallic", metallic, minimum=0.0),
+        }
+
+    def _gloss_value(self, name: str, factor: float, minimum: float) -> Scene | float:
+        """Return roughness or metallic as a number, or write it as an image.
+
+        Args:
+            name: "roughness" or "metallic".
+            factor: Value, or factor for the gloss texture.
+            minimum: Smallest value that the renderer uses.
+
+        Returns:
+            Number, or dictionary of a bitmap.
+        """
+        factors = self._part.factors
+        if factors is None:
+            return max(factor, minimum)
+        channel = factors[..., 0 if name == "roughness" else 1]
+        image = np.maximum(channel * factor, 255 * minimum).round().astype(np.uint8)
+        file_name = f"{name}_{self._number}.png"
+        write_image(self._folder / file_name, Image.fromarray(image))
+        return {"type": "bitmap", "filename": file_name, "raw": True}
 
 
-def _kept(gloss: np.ndarray) -> float:
-    """Compute the fraction of the albedo that a gloss (3,) reflects of an even sky, as metal or below the coat, on
-    average over all directions."""
+def _kept_fraction(gloss: np.ndarray) -> float:
+    """Compute the fraction of uniform lighting times albedo that a glossy surface reflects.
+
+    A metal reflects all of it, and a dielectric reflects what passes its coat.
+
+    Args:
+        gloss: Roughness, metallic and strength, shape (3,).
+
+    Returns:
+        Fraction in [0, 1].
+    """
     roughness, metallic, strength = torch.from_numpy(gloss).double()[:, None]
-    below = 1 - strength * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))
-    return float(metallic + (1 - metallic) * below)
+    below_coat = 1 - strength * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))
+    return float(metallic + (1 - metallic) * below_coat)

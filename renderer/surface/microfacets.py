@@ -1,21 +1,36 @@
-"""Glossy reflection by microfacets: GGX (Walter et al. 2007), Smith's masking and Fresnel's term.
+"""Specular reflection by rough surfaces, modeled with microfacets.
 
-With the half vector h between the directions to the light l and to the camera v, and α = roughness²,
+A surface of roughness r and normal n reflects light from direction l toward the
+camera in direction v. With the half vector h = (l + v) / |l + v| and α = r²,
+the reflectance (BRDF) is
 
-    f = F D G / (4 (n·l)(n·v)),    D = α² / (π ((n·h)² (α² - 1) + 1)²),
+    f = F D G / (4 (n·l) (n·v))                     (equation 20)
+    D = α² / (π ((n·h)² (α² - 1) + 1)²)             (GGX, equation 33)
+    G = G₁(n·l) G₁(n·v)                             (Smith, equation 23)
+    G₁(c) = 2 c / (c + √(α² + (1 - α²) c²)),        (equation 34)
 
-and G is the product of 2 (n·x) / ((n·x) + √(α² + (1 - α²) (n·x)²)) over x = l and v, as in glTF 2.0 and Mitsuba. F of
-a dielectric is Fresnel's of the refractive index 1.5; of a metal, Schlick's F0 + (F90 - F0) (1 - v·h)⁵. Both are linear
-in few numbers of the surface, and so is all reflected light (the split sum of Karis 2013).
+as in glTF 2.0 and Mitsuba. The equations are those of Walter et al. (2007). The
+Fresnel term F depends on the material. A dielectric has the Fresnel term of an
+interface with refractive index 1.5. A metal has Schlick's approximation
+F0 + (F90 - F0) (1 - v·h)⁵, which is F0 at normal incidence and F90 at grazing
+incidence. Reflected light is therefore a linear combination of three terms:
+`SCHLICK`, `EDGE` and `DIELECTRIC`. Karis (2013) splits the reflectance in the
+same way.
 
-Of environment light a surface reflects ∫ L f (n·l) dl, linear in the light's coefficients U. Seen from v, the lobe
-f (n·l) is symmetric about the plane of n and v. In harmonics about the axis v, where n has polar angle θ and azimuth φ,
+Environment lighting has the radiance L(l), with spherical-harmonic coefficients
+U_lm of degree l and order m. The camera sees the reflected radiance
+∫ L f (n·l) dl. The function f (n·l) of the direction l is called the lobe. It
+is symmetric about the plane of n and v. In axes whose z-axis is v, the normal
+has a polar angle θ and an azimuth φ. The reflected radiance then is
 
-    ∫ L f (n·l) dl = Σ_l Σ_m≥0 c_lm(cos θ, α) sin^m θ (U_lm cos mφ + U_l-m sin mφ).
+    Σ_l Σ_m≥0 c_lm(cos θ, r) sin^m θ (U_lm cos mφ + U_l,-m sin mφ).
 
-The functions c are polynomials, found once by quadrature. So the harmonics of the lobe cost one small product of
-matrices and K multiplications for each sample. Under perspective, v is not the same for all samples of a view: the
-lobes are then turned to a common axis (`turned`).
+The functions c_lm(cos θ, r) are called lobe functions. There is one for each
+Fresnel term, degree l and order m = 0, ..., l. They are smooth. `_table`
+computes them once by quadrature and stores them as polynomials in cos θ and r.
+The lobe of a sample then costs one small matrix product (`lobe_functions`) and
+one multiplication per harmonic. In a perspective view, every sample has its own
+direction v. `ViewFrame` rotates the lobes to axes that all samples share.
 """
 
 from __future__ import annotations
@@ -30,221 +45,703 @@ import torch
 from torch import Tensor
 
 from renderer.light.environment import FEWEST_ROWS, to_map
-from renderer.light.harmonics import bands, lambertian_factors, per_degree, rotate, select_rows
+from renderer.light.harmonics import (
+    bands,
+    lambertian_factors,
+    per_degree,
+    rotate,
+    select_rows,
+)
 from renderer.light.window import best_window
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.vectors import unit
 
-AMPLITUDE = 0.1  # of a highlight, that the band of a light's degree may have
-NARROWER = 0.7  # times α, of the lobe whose highlights must not ring
-IRRADIANCE = 10.0  # weight of irradiance beside that of highlights, in the choice of a window
-SMALLEST = 1e-4  # amplitude of a band in `_spectrum`, which is divided by
-NEGLIGIBLE = 1e-3  # amplitude of bands that tables leave out
-INDEX = 1.5  # of refraction, as of varnish
-SCHLICK, EDGE, DIELECTRIC = range(3)  # F0 = 1 and F90 = 0; F0 = 0 and F90 = 1; Fresnel's of INDEX
-USUAL = 6  # degree: lower ones take the first functions of its table
-NODES = 12  # Chebyshev's, in the roughness; in the cosine 2 degree + 4, since mirrors turn by twice the angle
-AT_ONCE = 16  # cosines, in the quadrature of lobes: bounds the memory
-QUADRATURE = (32, 24)  # half vectors: by their distribution, and by azimuth on one side of the plane
+# Default amplitude in `degree_for`: degrees whose amplitude in a highlight is
+# at most this fraction of the amplitude of degree 0 are not needed.
+AMPLITUDE = 0.1
+# Factor for α that gives the narrower lobe in `window_without_ringing`. Lobes
+# at grazing angles are narrower than the lobe along the normal.
+NARROWER = 0.7
+# Weight of an error of irradiance, relative to an error of a highlight, with
+# which `highlight_window` chooses its window.
+IRRADIANCE = 10.0
+# Smallest relative amplitude that `_spectrum` returns, because windows are
+# divided by it.
+SMALLEST = 1e-4
+# Relative amplitude below which `_fit` sets the lobe functions of a degree to
+# zero.
+NEGLIGIBLE = 1e-3
+# Refractive index that `fresnel` uses for dielectrics. It is typical of
+# varnish.
+INDEX = 1.5
+
+# Indices of the three Fresnel terms along the first axis of tensors. SCHLICK
+# has F0 = 1 and F90 = 0, EDGE has F0 = 0 and F90 = 1, and DIELECTRIC has the
+# exact term for the refractive index INDEX.
+SCHLICK, EDGE, DIELECTRIC = range(3)
+
+# `lobe_functions` takes functions of degree up to USUAL from one common table.
+USUAL = 6
+# Number of Chebyshev polynomials in the roughness, with which `_table`
+# approximates the lobe functions. It is also the number of values of the
+# roughness at which `_table` computes them.
+NODES = 12
+# Number of polynomials in the cosine that `_fit` uses beyond the 2 degree + 1
+# that a perfect mirror would need.
+MARGIN = 3
+# Number of cosines for which `_fit` integrates lobes at once. It limits the
+# memory.
+COSINES_AT_ONCE = 16
+# Number of polar angles and number of azimuths of the half vectors over which
+# `_lobe_integrals` sums. The azimuths are those on one side of the plane of n
+# and v.
+POLAR_NODE_COUNT = 32
+AZIMUTH_COUNT = 24
+
+# The x, y and z components of S vectors, each of shape (S,).
+Components = tuple[Tensor, Tensor, Tensor]
 
 
 def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: Tensor) -> Tensor:
-    """π f (3, ...) with the terms SCHLICK, EDGE and DIELECTRIC: radiance per irradiance, as diffuse surfaces have
-    albedo.
+    """Evaluate π f, the reflectance times π, for light from single directions.
 
-    normals, toward, directions: (..., 3) unit, the latter two to the camera and to the light. roughness: (...).
-    Differentiable. Where a normal faces away from the camera, n·v counts as 0.
+    It is the reflected radiance per irradiance, which for a diffuse surface is
+    its albedo. The result is differentiable with respect to all arguments.
+
+    Args:
+        normals: Unit surface normals n, shape (..., 3). If a normal faces away
+            from the camera or the light, n·v or n·l counts as 0.
+        toward: Unit vectors v to the camera, shape (..., 3).
+        directions: Unit vectors l to the light, shape (..., 3).
+        roughness: Roughness in (0, 1], shape (...).
+
+    Returns:
+        π f with each of the three Fresnel terms SCHLICK, EDGE and DIELECTRIC,
+        shape (3, ...).
     """
+    # `unit` takes the components of vectors along the first axis.
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
-    squared, cosine = roughness**4, (half * normals).sum(-1)
-    value = squared / (cosine**2 * (squared - 1) + 1) ** 2
+    alpha_squared = roughness**4
+    without_fresnel = _distribution((half * normals).sum(-1), alpha_squared)
     for direction in (toward, directions):
-        along = (direction * normals).sum(-1).clamp(min=0)
-        value = value / (along + (squared + (1 - squared) * along**2).sqrt())
-    return torch.stack([value * term for term in fresnel((half * toward).sum(-1).clamp(0, 1))])
+        cosine = (direction * normals).sum(-1)
+        without_fresnel = without_fresnel / _masking_denominator(cosine, alpha_squared)
+    fresnel_terms = fresnel((half * toward).sum(-1).clamp(0, 1))
+    return torch.stack([without_fresnel * term for term in fresnel_terms])
+
+
+def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+    """Evaluate π D, the density of half vectors times π, at the cosine n·h."""
+    return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
+
+
+def _masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+    """Evaluate the denominator of G₁ at the cosine n·l or n·v.
+
+    The numerators 2 (n·l) and 2 (n·v) of the two factors of G cancel with the
+    denominator 4 (n·l) (n·v) of f. Without them, the reflectance stays finite
+    at grazing angles.
+    """
+    facing_cosine = cosine.clamp(min=0)
+    return facing_cosine + (alpha_squared + (1 - alpha_squared) * facing_cosine**2).sqrt()
 
 
 def fresnel(cosine: Tensor) -> Tensor:
-    """F (3, ...): SCHLICK, EDGE and DIELECTRIC, by the cosine v·h (...)."""
+    """Evaluate the three Fresnel terms.
+
+    The term of the dielectric is equation 22 of Walter et al. (2007), for
+    unpolarized light.
+
+    Args:
+        cosine: Cosine v·h of the angle of incidence, in [0, 1], shape (...).
+
+    Returns:
+        F for SCHLICK, EDGE and DIELECTRIC, in [0, 1], shape (3, ...).
+    """
+    # Snell's law gives INDEX times the cosine of the refracted ray.
     refracted = (INDEX**2 - 1 + cosine**2).sqrt()
+    # These are the reflected fractions of the amplitude, for light that is
+    # polarized perpendicular and parallel to the plane of incidence.
     perpendicular = (refracted - cosine) / (refracted + cosine)
-    parallel = perpendicular * (cosine * (refracted + cosine) - 1) / (cosine * (refracted - cosine) + 1)
+    numerator = cosine * (refracted + cosine) - 1
+    denominator = cosine * (refracted - cosine) + 1
+    parallel = perpendicular * numerator / denominator
     edge = (1 - cosine) ** 5
-    return torch.stack([1 - edge, edge, (perpendicular**2 + parallel**2) / 2])
+    dielectric = (perpendicular**2 + parallel**2) / 2
+    return torch.stack([1 - edge, edge, dielectric])
 
 
 class ViewFrame(NamedTuple):
-    """Axes of a view and of its S samples; the third of a sample's is the direction to the camera.
+    """Surface normals in axes that face the camera, and the rotations back to world axes.
 
-    normals: (3, S), along the axes of the sample. tilt: (4, S), sine and cosine of the angle about y and then of that
-    about x that turn the view's axes into the sample's; None where all samples have the view's. axis: sine and cosine
-    of polar angle and azimuth of the view's third axis in the world.
+    A view of S samples has three sets of axes:
+
+    - world axes;
+    - view axes, common to all samples, whose z-axis is the mean direction to
+      the camera;
+    - sample axes, whose z-axis is the direction from the sample to the camera.
+      `lobe_functions` describes lobes in these axes.
+
+    Attributes:
+        normals: Unit normals of the samples in sample axes, shape (3, S).
+        tilt: Rotations from sample axes to view axes. None if both are the same
+            at all samples.
+        axis: Direction of the z-axis of the view in world axes.
     """
 
     normals: Tensor
-    tilt: Tensor | None
-    axis: Tensor
+    tilt: Tilt | None
+    axis: ViewAxis
 
     @staticmethod
     def of(normals: Tensor, toward: Tensor) -> ViewFrame:
-        """Of unit normals (S, 3) and directions to the camera (S, 3), or (1, 3) of all. Differentiable in both."""
-        x, y, z = unit(toward.detach().mean(0))
-        across = torch.hypot(x, y)
-        azimuth = torch.atan2(y, x)
-        axis = torch.stack([across, z, azimuth.sin(), azimuth.cos()])
-        inward = _in_view(normals, axis)
+        """Create the frame of a view.
+
+        The result is differentiable with respect to both arguments.
+
+        Args:
+            normals: Unit surface normals of the S samples in world axes,
+                shape (S, 3).
+            toward: Unit vectors to the camera in world axes, shape (S, 3), or
+                (1, 3) if all samples share one direction.
+
+        Returns:
+            Normals in sample axes, and the rotations from there to world axes.
+        """
+        # The choice of view axes does not change the reflected light, so it
+        # needs no gradient.
+        mean_toward = unit(toward.detach().mean(0))
+        axis = ViewAxis.along(mean_toward)
+        normals_in_view = axis.to_view(normals)
+        # A direction that all samples share is the z-axis of the view itself.
+        # If it is differentiated, its gradient must go through a tilt, because
+        # `axis` is constant.
         if len(toward) == 1 and not toward.requires_grad:
-            return ViewFrame(torch.stack(inward), None, axis)
-        (x, y, z), (ahead_x, ahead_y, ahead_z) = inward, _in_view(toward, axis)
-        cosine = (1 - ahead_x**2).sqrt()
-        tilt = torch.stack([ahead_x, cosine, -ahead_y / cosine, ahead_z / cosine])
-        y, z = _turned(y, z, -tilt[2], tilt[3])
-        z, x = _turned(z, x, -tilt[0], tilt[1])
-        return ViewFrame(torch.stack([x, y, z]), tilt, axis)
+            return ViewFrame(normals=torch.stack(normals_in_view), tilt=None, axis=axis)
+        toward_in_view = axis.to_view(toward)
+        tilt = Tilt.along(toward_in_view)
+        normals_in_sample = tilt.to_sample(normals_in_view)
+        return ViewFrame(normals=torch.stack(normals_in_sample), tilt=tilt, axis=axis)
 
     @property
     def cosine(self) -> Tensor:
-        """n·v (S,), taken for 0 below."""
+        """Cosine n·v at the samples, shape (S,). Negative values count as 0."""
+        # The direction v is the z-axis of the sample axes.
         return self.normals[2].clamp(0, 1)
 
     def harmonics(self, lobes: Tensor) -> Tensor:
-        """(K, S) coefficients of lobes (M, S), as of `lobe_functions`, for light in the view's axes (`to_world`)."""
-        degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
-        function, m = (index.to(lobes.device) for index in _functions(degree))
-        rows = lobes.index_select(0, function) * _circular(self.normals[0], self.normals[1], degree).index_select(
-            0, degree + m
-        )
+        """Compute the spherical-harmonic coefficients of the lobe at each sample.
+
+        The coefficients are in intermediate axes: the view axes or, with a
+        tilt, the view axes in the order y, z, x. The coefficients in world axes
+        are `frame.to_world(frame.harmonics(lobes))`.
+
+        Args:
+            lobes: Values of the M lobe functions of one Fresnel term at the S
+                samples, from `lobe_functions`, shape (M, S).
+
+        Returns:
+            Coefficients of the K = (degree + 1)² harmonics, shape (K, S).
+        """
+        degree = _degree_of_lobes(lobes)
+        coefficients = self._harmonics_in_sample_axes(lobes, degree)
         if self.tilt is None:
-            return rows
-        cycle, (sine_y, cosine_y, sine_x, cosine_x) = _cycle(degree), self.tilt
-        rows = _about_z(_by_band(cycle, rows), sine_y, cosine_y)
-        return _about_z(_by_band(cycle, rows), sine_x, cosine_x)
+            return coefficients
+        # The tilt is R_x(a) R_y(b), with a rotation R_x about the x-axis and so
+        # on. Harmonics are easy to rotate about z, but not about x and y. The
+        # cyclic exchange C of the axes (x to y, y to z, z to x) turns one
+        # rotation into another: C R_y(b) = R_z(b) C and C² R_x(a) = R_z(a) C².
+        # Therefore R_z(a) C R_z(b) C = C² R_x(a) R_y(b). This is the tilt,
+        # followed by two exchanges.
+        exchange = _exchange(degree)
+        for angle in (self.tilt.about_y, self.tilt.about_x):
+            coefficients = _rotate_harmonics(_multiply_bands(exchange, coefficients), angle)
+        return coefficients
 
-    def to_world(self, rows: Tensor) -> Tensor:
-        """Turn coefficients (K, P) along the axes of `harmonics` into those along the world's axes."""
-        cycle = _cycle(math.isqrt(len(rows)) - 1)
+    def _harmonics_in_sample_axes(self, lobes: Tensor, degree: int) -> Tensor:
+        """Compute the coefficients of the lobe in the axes of each sample, shape (K, S).
+
+        They are c_lm sin^m θ cos mφ for the harmonics of order m ≥ 0, and
+        c_lm sin^m θ sin mφ for those of order -m < 0.
+        """
+        function_of_harmonic, order = _functions_and_orders(degree)
+        function_of_harmonic = function_of_harmonic.to(lobes.device)
+        order = order.to(lobes.device)
+        # The normal is (sin θ cos φ, sin θ sin φ, cos θ), so the factors are
+        # the real and imaginary parts of (x + iy)^m.
+        normal_x, normal_y, _ = self.normals
+        factors = _complex_powers(normal_x, normal_y, degree).index_select(0, degree + order)
+        return lobes.index_select(0, function_of_harmonic) * factors
+
+    def to_world(self, coefficients: Tensor) -> Tensor:
+        """Rotate coefficients from the axes of `harmonics` to world axes.
+
+        Args:
+            coefficients: Coefficients of one function per column, shape (K, P)
+                with K = (degree + 1)².
+
+        Returns:
+            Coefficients of the same functions in world axes, shape (K, P).
+        """
+        exchange = _exchange(math.isqrt(len(coefficients)) - 1)
+        axis = self.axis.for_columns(coefficients)
+        # If there is a tilt, `harmonics` exchanges the axes twice. A third
+        # exchange restores them.
         if self.tilt is not None:
-            rows = _by_band(cycle, rows)
-        sine, cosine, *azimuth = self.axis[:, None].to(rows)
-        rows = _about_z(_by_band(cycle, rows), sine, cosine)
-        return _about_z(_by_band(cycle.T, rows), *azimuth)
+            coefficients = _multiply_bands(exchange, coefficients)
+        # The rotation is R_z(azimuth) R_y(polar). Its second factor is
+        # R_y(polar) = Cᵀ R_z(polar) C, with the exchange C as in `harmonics`.
+        exchanged = _rotate_harmonics(_multiply_bands(exchange, coefficients), axis.polar)
+        return _rotate_harmonics(_multiply_bands(exchange.T, exchanged), axis.azimuth)
 
-    def from_world(self, rows: Tensor) -> Tensor:
-        """Turn coefficients (K, P) along the world's axes into those along the axes of `harmonics`."""
-        cycle = _cycle(math.isqrt(len(rows)) - 1)
-        sine, cosine, sine_azimuth, cosine_azimuth = self.axis[:, None].to(rows)
-        rows = _by_band(cycle, _about_z(rows, -sine_azimuth, cosine_azimuth))
-        rows = _by_band(cycle.T, _about_z(rows, -sine, cosine))
-        return rows if self.tilt is None else _by_band(cycle.T, rows)
+    def from_world(self, coefficients: Tensor) -> Tensor:
+        """Rotate coefficients from world axes to the axes of `harmonics`.
+
+        This is the inverse of `to_world`.
+
+        Args:
+            coefficients: Coefficients of one function per column in world axes,
+                shape (K, P) with K = (degree + 1)².
+
+        Returns:
+            Coefficients of the same functions in the axes of `harmonics`,
+            shape (K, P).
+        """
+        exchange = _exchange(math.isqrt(len(coefficients)) - 1)
+        axis = self.axis.for_columns(coefficients)
+        without_azimuth = _rotate_harmonics(coefficients, axis.azimuth.reversed())
+        exchanged = _multiply_bands(exchange, without_azimuth)
+        without_polar = _rotate_harmonics(exchanged, axis.polar.reversed())
+        in_view = _multiply_bands(exchange.T, without_polar)
+        # The inverse of one exchange equals two exchanges, as in `harmonics`.
+        return in_view if self.tilt is None else _multiply_bands(exchange.T, in_view)
+
+
+class ViewAxis(NamedTuple):
+    """Spherical coordinates of the z-axis of a view in world axes.
+
+    The rotation R_z(azimuth) R_y(polar) takes view axes to world axes. It first
+    rotates about the y-axis and then about the z-axis.
+
+    Attributes:
+        polar: Angle from the z-axis of the world. Its tensors have shape ().
+        azimuth: Angle about the z-axis of the world, from x toward y. Its
+            tensors have shape ().
+    """
+
+    polar: Angle
+    azimuth: Angle
+
+    @staticmethod
+    def along(direction: Tensor) -> ViewAxis:
+        """Return the spherical coordinates of a unit vector of shape (3,)."""
+        x, y, z = direction
+        polar = Angle(sine=torch.hypot(x, y), cosine=z)
+        # x / sin(polar) would divide by 0 at the poles. atan2 gives the azimuth
+        # 0 there.
+        azimuth = torch.atan2(y, x)
+        return ViewAxis(polar, Angle(sine=azimuth.sin(), cosine=azimuth.cos()))
+
+    def for_columns(self, coefficients: Tensor) -> ViewAxis:
+        """Return the angles as `_rotate_harmonics` takes them for these coefficients."""
+        return ViewAxis(
+            polar=self.polar.for_columns(coefficients),
+            azimuth=self.azimuth.for_columns(coefficients),
+        )
+
+    def to_view(self, vectors: Tensor) -> Components:
+        """Rotate vectors of shape (S, 3) from world axes to view axes."""
+        x, y, z = vectors.T
+        without_azimuth = _rotate_about_z((x, y, z), self.azimuth.reversed())
+        return _rotate_about_y(without_azimuth, self.polar.reversed())
+
+
+class Tilt(NamedTuple):
+    """Rotation from sample axes to view axes, one for each sample.
+
+    It is R_x(a) R_y(b): first about the y-axis by the angle b, then about the
+    x-axis by the angle a.
+
+    Attributes:
+        values: Rows sin b, cos b, sin a and cos a, shape (4, S), or (4, 1) if
+            all samples share one rotation.
+    """
+
+    values: Tensor
+
+    @property
+    def about_y(self) -> Angle:
+        """Angle b about the y-axis, from z toward x. This rotation comes first."""
+        return Angle(sine=self.values[0], cosine=self.values[1])
+
+    @property
+    def about_x(self) -> Angle:
+        """Angle a about the x-axis, from y toward z. This rotation comes second."""
+        return Angle(sine=self.values[2], cosine=self.values[3])
+
+    @staticmethod
+    def along(directions: Components) -> Tilt:
+        """Return the rotations that take (0, 0, 1) to the given unit vectors.
+
+        R_x(a) R_y(b) takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The
+        angle b is chosen such that cos b ≥ 0.
+        """
+        x, y, z = directions
+        sine_b = x
+        cosine_b = (1 - x**2).sqrt()
+        sine_a = -y / cosine_b
+        cosine_a = z / cosine_b
+        return Tilt(torch.stack([sine_b, cosine_b, sine_a, cosine_a]))
+
+    def to_sample(self, vectors: Components) -> Components:
+        """Rotate one vector per sample from view axes to sample axes."""
+        without_x = _rotate_about_x(vectors, self.about_x.reversed())
+        return _rotate_about_y(without_x, self.about_y.reversed())
+
+
+class Angle(NamedTuple):
+    """Sine and cosine of a rotation angle. Rotations need nothing else of the angle.
+
+    Attributes:
+        sine: Sine, shape (), or (S,) for one angle per sample.
+        cosine: Cosine, same shape.
+    """
+
+    sine: Tensor
+    cosine: Tensor
+
+    def reversed(self) -> Angle:
+        """Return the angle of the inverse rotation."""
+        return Angle(sine=-self.sine, cosine=self.cosine)
+
+    def for_columns(self, coefficients: Tensor) -> Angle:
+        """Return an angle of shape () in shape (1,), on the device and in the dtype given."""
+        return Angle(
+            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
+        )
+
+
+def _rotate_about_x(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the x-axis, from y toward z."""
+    x, y, z = vectors
+    rotated_y, rotated_z = _rotate_in_plane(y, z, angle)
+    return x, rotated_y, rotated_z
+
+
+def _rotate_about_y(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the y-axis, from z toward x."""
+    x, y, z = vectors
+    rotated_z, rotated_x = _rotate_in_plane(z, x, angle)
+    return rotated_x, y, rotated_z
+
+
+def _rotate_about_z(vectors: Components, angle: Angle) -> Components:
+    """Rotate vectors about the z-axis, from x toward y."""
+    x, y, z = vectors
+    rotated_x, rotated_y = _rotate_in_plane(x, y, angle)
+    return rotated_x, rotated_y, z
+
+
+def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tensor, Tensor]:
+    """Rotate vectors in the plane of two axes, from the first axis toward the second.
+
+    Args:
+        first: Components along the first axis, shape (S,).
+        second: Components along the second axis, shape (S,).
+        angle: Rotation angle.
+
+    Returns:
+        Rotated components along the first and the second axis, shape (S,) each.
+    """
+    rotated_first = first * angle.cosine - second * angle.sine
+    rotated_second = first * angle.sine + second * angle.cosine
+    return rotated_first, rotated_second
+
+
+def _degree_of_lobes(lobes: Tensor) -> int:
+    """Return the degree of M lobe functions: M = (degree + 1) (degree + 2) / 2."""
+    return (math.isqrt(8 * len(lobes) + 1) - 3) // 2
+
+
+@per_degree
+def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
+    """Find the lobe function and the order of each of the K = (degree + 1)² harmonics.
+
+    The harmonic of degree l and order m has the index l² + l + m. The lobe
+    function c_l|m| has the index l (l + 1) / 2 + |m|.
+
+    Returns:
+        A tuple of
+        - the index of the lobe function of each harmonic, shape (K,);
+        - the order m of each harmonic, from -l to l, shape (K,).
+    """
+    l = bands(degree)
+    m = torch.arange(len(l)) - l * (l + 1)
+    function_of_harmonic = l * (l + 1) // 2 + m.abs()
+    return function_of_harmonic, m
+
+
+def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
+    """Compute the powers of x + iy, split into real and imaginary parts.
+
+    For x = s cos φ and y = s sin φ, they are s^m cos mφ and s^m sin mφ.
+
+    Args:
+        x: Real part, shape (...).
+        y: Imaginary part, shape (...).
+        degree: Largest exponent.
+
+    Returns:
+        In row degree + m, for m from -degree to degree: Im (x + iy)^|m| for
+        m < 0 and Re (x + iy)^m for m ≥ 0, shape (2 degree + 1, ...).
+    """
+    real_parts: list[Tensor] = []
+    imaginary_parts: list[Tensor] = []
+    real = x
+    imaginary = y
+    for _ in range(degree):
+        real_parts.append(real)
+        imaginary_parts.append(imaginary)
+        next_real = real * x - imaginary * y
+        next_imaginary = real * y + imaginary * x
+        real = next_real
+        imaginary = next_imaginary
+    return torch.stack([*reversed(imaginary_parts), torch.ones_like(x), *real_parts])
+
+
+def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
+    """Rotate functions, given by their harmonics, about the z-axis, from x toward y.
+
+    A rotation by the angle a mixes only the coefficients u of orders m and -m:
+    u'_m = cos(ma) u_m - sin(ma) u_-m.
+
+    Args:
+        coefficients: Coefficients of one function per column, shape (K, S).
+        angle: Angle a for each column, shape (S,), or (1,) if all columns share
+            one angle.
+
+    Returns:
+        Coefficients of the rotated functions, shape (K, S).
+    """
+    degree = math.isqrt(len(coefficients)) - 1
+    _, order = _functions_and_orders(degree)
+    order = order.to(coefficients.device)
+    # Row degree + m holds cos(ma) for m ≥ 0 and sin(|m| a) for m < 0.
+    powers = _complex_powers(angle.cosine, angle.sine, degree)
+    sines = powers[:degree]
+    # Row degree + m holds sin(ma), which is odd in m.
+    signed_sines = torch.cat([-sines, 0 * powers[:1], sines.flip(0)])
+    # The harmonic of order -m comes 2 m rows before that of order m.
+    opposite_harmonic = torch.arange(len(order), device=coefficients.device) - 2 * order
+    kept = coefficients * powers.index_select(0, degree + order.abs())
+    mixed_in = coefficients.index_select(0, opposite_harmonic)
+    mixed_in = mixed_in * signed_sines.index_select(0, degree + order)
+    return kept - mixed_in
+
+
+def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
+    """Multiply a rotation matrix of harmonics by coefficients, one degree l at a time.
+
+    A rotation does not mix coefficients of different degrees, so the matrix is
+    zero outside the blocks on its diagonal.
+
+    Args:
+        rotation: Rotation matrix, shape (K, K).
+        coefficients: Coefficients of one function per column, shape (K, S).
+
+    Returns:
+        Coefficients of the rotated functions, shape (K, S).
+    """
+    products: list[Tensor] = []
+    for l in range(math.isqrt(len(coefficients))):
+        # Harmonics of degree l.
+        band = slice(l * l, (l + 1) * (l + 1))
+        products.append(rotation[band, band].to(coefficients) @ coefficients[band])
+    return torch.cat(products)
+
+
+@per_degree
+def _exchange(degree: int) -> Tensor:
+    """Compute the matrix of harmonics that exchanges the axes: x to y, y to z and z to x.
+
+    Returns:
+        Orthogonal matrix, float64, shape (K, K) with K = (degree + 1)².
+    """
+    identity = torch.eye((degree + 1) ** 2, dtype=torch.float64)
+    exchange_of_axes = torch.eye(3, dtype=torch.float64).roll(1, 0)
+    return rotate(identity, exchange_of_axes)
 
 
 def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequence[int]) -> Tensor:
-    """π c (T, M, S) for each of T terms: of the functions c_lm with 0 ≤ m ≤ l, in ascending order of l and then m.
+    """Evaluate the lobe functions π c_lm, defined at the top of this module.
 
-    cosine: n·v (S,). roughness: (S,) or (1,), at least MIN_ROUGHNESS. Differentiable.
+    The result is differentiable with respect to both tensors.
+
+    Args:
+        cosine: Cosine n·v = cos θ in [0, 1] at the S samples, shape (S,).
+        roughness: Roughness r in [MIN_ROUGHNESS, 1], shape (S,), or (1,) if all
+            samples share one roughness.
+        degree: Largest degree l of the spherical harmonics.
+        terms: T Fresnel terms among SCHLICK, EDGE and DIELECTRIC.
+
+    Returns:
+        Values of the M = (degree + 1) (degree + 2) / 2 functions with
+        0 ≤ m ≤ l, in ascending order of l and then of m, shape (T, M, S).
     """
-    functions = (degree + 1) * (degree + 2) // 2
-    if degree > USUAL and len(roughness) == 1 and not roughness.requires_grad:
-        of_roughness = _table_at(degree, float(roughness)).to(cosine)[list(terms)]
-        return of_roughness @ _across(cosine, of_roughness.shape[-1])
-    table = _table(max(degree, USUAL)).to(cosine)[list(terms), :functions]
-    across = _across(cosine, table.shape[-1])
-    of_roughness = along(roughness)
-    if len(roughness) == 1:
-        return torch.einsum("tmrc,r->tmc", table, of_roughness[:, 0]) @ across
-    return table.flatten(2) @ (of_roughness[:, None] * across).flatten(0, 1)
+    term_indices = list(terms)
+    has_one_roughness = len(roughness) == 1
+    # If no gradient is needed, a table for this one roughness takes less time
+    # than the table for all values of the roughness.
+    if degree > USUAL and has_one_roughness and not roughness.requires_grad:
+        table_at_roughness = _table_at(degree, float(roughness)).to(cosine)
+        # Shape (T, M, P), with P Chebyshev polynomials in the cosine.
+        cosine_coefficients = table_at_roughness[term_indices]
+        return cosine_coefficients @ _cosine_polynomials(cosine, cosine_coefficients.shape[-1])
+    function_count = (degree + 1) * (degree + 2) // 2
+    table = _table(max(degree, USUAL)).to(cosine)
+    # Shape (T, M, NODES, P).
+    coefficients = table[term_indices, :function_count]
+    # Shapes (P, S) and (NODES, S), or (NODES, 1) for one roughness.
+    in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
+    in_roughness = along(roughness)
+    if has_one_roughness:
+        # Shape (T, M, P).
+        cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
+        return cosine_coefficients @ in_cosine
+    # Shape (NODES, P, S).
+    products = in_roughness[:, None] * in_cosine
+    # This multiplies shapes (T, M, NODES · P) and (NODES · P, S).
+    return coefficients.flatten(2) @ products.flatten(0, 1)
 
 
 def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
-    """Compute E(μ), the fraction of a beam that a dielectric coat reflects into all directions.
+    """Compute E(μ), the fraction of a light beam that a dielectric coat reflects.
 
-    The coat is reciprocal, so E is also the fraction of an even sky that a camera sees in the coat. Differentiable.
+    A beam at the angle of incidence arccos μ is reflected into all directions.
+    The reflectance is the same for exchanged directions, so E(μ) is also the
+    radiance that a camera at this angle sees in the coat under uniform
+    environment lighting of radiance 1. The result is differentiable with
+    respect to both arguments.
 
     Args:
-        cosine: Cosine μ between normal and direction, in [0, 1], any shape.
-        roughness: Roughness of the same shape, or (1,), at least `MIN_ROUGHNESS`.
+        cosine: Cosine μ between the normal and the direction, in [0, 1], any
+            shape.
+        roughness: Roughness in [MIN_ROUGHNESS, 1], same shape or (1,).
 
     Returns:
-        E, in [0, 1], of the shape of `cosine`.
+        E(μ) in [0, 1], same shape as `cosine`.
     """
-    table = _coat_table().to(cosine)
-    across = _across(cosine.flatten(), table.shape[1])
-    return ((table.T @ along(roughness.flatten())) * across).sum(0).view_as(cosine)
+    coefficients = _coat_coefficients().to(cosine)
+    in_cosine = _cosine_polynomials(cosine.flatten(), coefficients.shape[1])
+    cosine_coefficients = coefficients.T @ along(roughness.flatten())
+    return (cosine_coefficients * in_cosine).sum(0).view_as(cosine)
 
 
 @per_degree
 def coat_bands(degree: int) -> Tensor:
-    """Return the zonal coefficients of E(μ) μ, the irradiance that a dielectric coat of strength 1 reflects.
+    """Compute the factors by which a dielectric coat reflects each degree of the lighting.
 
-    The coefficient of band l is B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, as π, 2π/3, π/4, ... are those of μ.
-    Each B_l is a polynomial of the roughness. With U_lm of the light, the coat reflects Σ B_l U_lm Y_lm(n).
+    A coat of strength 1 reflects the fraction E(μ) of the light at the cosine μ
+    (see `coat_albedo`). The irradiance that it reflects in total is
+    Σ_lm B_l U_lm Y_lm(n) with the coefficients U_lm of the lighting, the
+    harmonics Y_lm and the normal n. The factor of degree l is
+    B_l = 2π ∫ E(μ) μ P_l(μ) dμ over 0 ≤ μ ≤ 1, with Legendre polynomials P_l.
+    If E(μ) were 1, these would be the factors π, 2π/3, π/4, ... of a Lambertian
+    surface.
 
     Args:
-        degree: Degree of the light.
+        degree: Largest degree l of the spherical harmonics.
 
     Returns:
-        Coefficients in Chebyshev polynomials of the roughness (`along`), shape (degree + 1, NODES), float64.
+        Coefficients of B_l in the NODES polynomials of `along`, float64,
+        shape (degree + 1, NODES).
     """
-    node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(degree + 64))
-    cosine = (node + 1) / 2
-    table = _coat_table()
-    reflected = table @ _across(cosine, table.shape[1]) * cosine  # (NODES, N)
-    polynomials = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))  # (N, degree + 1)
-    return math.pi * (polynomials.T * weight) @ reflected.T
+    nodes, weights = np.polynomial.legendre.leggauss(degree + 64)
+    # The nodes of the quadrature lie in [-1, 1], and N cosines in [0, 1].
+    cosine = (torch.from_numpy(nodes) + 1) / 2
+    coefficients = _coat_coefficients()
+    # Shape (NODES, N).
+    reflected = coefficients @ _cosine_polynomials(cosine, coefficients.shape[1]) * cosine
+    # Shape (N, degree + 1).
+    legendre = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))
+    return math.pi * (legendre.T * torch.from_numpy(weights)) @ reflected.T
 
 
 def coat_mean(roughness: Tensor) -> Tensor:
-    """Compute E_avg = 2 ∫ E(μ) μ dμ, which a dielectric coat reflects of an even sky on average. Differentiable.
+    """Compute the fraction of uniform environment lighting that a dielectric coat reflects.
+
+    It is E_avg = 2 ∫ E(μ) μ dμ over 0 ≤ μ ≤ 1 (see `coat_albedo`). The result
+    is differentiable.
 
     Args:
-        roughness: Roughness, shape (S,), at least `MIN_ROUGHNESS`.
+        roughness: Roughness in [MIN_ROUGHNESS, 1], shape (S,).
 
     Returns:
-        E_avg, in [0, 1], shape (S,).
+        E_avg in [0, 1], shape (S,).
     """
-    return (coat_bands(0).to(roughness) @ along(roughness))[0] / math.pi
+    reflected_irradiance = (coat_bands(0).to(roughness) @ along(roughness))[0]
+    return reflected_irradiance / math.pi
 
 
-def along(roughness: Tensor) -> Tensor:
-    """Compute the Chebyshev polynomials of roughness (S,), shape (NODES, S). Differentiable."""
-    return _chebyshev((2 * roughness - 1 - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS), NODES)
+def _coat_coefficients() -> Tensor:
+    """Return the coefficients of E(μ) in products of polynomials, float64, shape (NODES, P).
+
+    The products are the same as in `_table`. E(μ) is the integral of the lobe,
+    and so √(4π) times its coefficient of degree 0.
+    """
+    return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
 
 @cache
 def degree_for(roughness: float, amplitude: float = AMPLITUDE) -> int:
-    """Find the least degree above which no band has more than a fraction of a highlight's amplitude.
+    """Find the smallest spherical-harmonic degree that shows the highlights of a material.
+
+    The highlight is the lobe of a metal for a camera that looks along the
+    normal. No higher degree has more than the given amplitude in it.
 
     Args:
-        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
-        amplitude: Fraction of the amplitude of the band 0, of a mirror's lobe seen head-on.
+        roughness: Roughness in [0, 1]. Values below MIN_ROUGHNESS count as MIN_ROUGHNESS.
+        amplitude: Largest amplitude of the degrees that are left out, as a
+            fraction of the amplitude of degree 0.
 
     Returns:
-        The degree, at most `MAX_DEGREE`.
+        Degree, at most MAX_DEGREE.
     """
-    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
-    return int(np.count_nonzero(spectrum[1:] > amplitude))
+    amplitudes = _spectrum(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
+    # The amplitudes fall with the degree, so this count is the last degree
+    # that exceeds the limit.
+    return int(np.count_nonzero(amplitudes[1:] > amplitude))
 
 
 def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
-    """Find a window under which highlights of a map's light do not ring.
+    """Find factors for the coefficients of a map, under which its highlights do not ring.
 
-    A cut-off map rings where it is concentrated, so that its highlights have dark rings around them, or are negative.
-    Of no window, the window for the surface's own lobe and the window for a lobe that is `NARROWER`, this is the first
-    under which the narrower lobe shows nowhere negative radiance. Lobes are narrower at grazing angles.
+    An environment map with few spherical harmonics oscillates around its
+    bright places. Highlights then have dark rings or negative radiance. This
+    function tries no window, then the window for the highlight of the surface,
+    and then the window for a highlight that is narrower by the factor NARROWER.
+    It returns the first one under which the narrower highlight is negative
+    nowhere.
 
     Args:
-        coefficients: Those of the map, shape ((degree + 1)², C).
-        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
+        coefficients: Spherical-harmonic coefficients of the map,
+            shape (K, C) with K = (degree + 1)² and C channels.
+        roughness: Roughness of the smoothest surface, in [0, 1]. Values below
+            MIN_ROUGHNESS count as MIN_ROUGHNESS.
 
     Returns:
-        Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
+        Factor of each coefficient, float64, shape (K,). The first is 1.
     """
     degree = math.isqrt(len(coefficients)) - 1
-    lobe = torch.from_numpy(_spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER), degree))[bands(degree)]
+    # The width of a lobe is α = roughness².
+    narrow_roughness = max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER)
+    narrow_amplitudes = torch.from_numpy(_spectrum(narrow_roughness, degree))
+    narrow_lobe = narrow_amplitudes[bands(degree)]
     window = torch.ones(len(coefficients), dtype=torch.float64)
     rows = max(FEWEST_ROWS, 2 * degree)
     for width in (1.0, NARROWER):
-        if (to_map(coefficients * (window * lobe)[:, None], rows) >= 0).all():
+        highlights = to_map(coefficients * (window * narrow_lobe)[:, None], rows)
+        if (highlights >= 0).all():
             break
         window = highlight_window(degree, roughness, width)
     return window
@@ -252,184 +749,326 @@ def window_without_ringing(coefficients: Tensor, roughness: float) -> Tensor:
 
 @cache
 def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
-    """Find the best window under which a lobe is nowhere negative (`best_window`).
+    """Find the best factors for coefficients, under which a highlight is negative nowhere.
 
-    The errors of highlights and of irradiance are weighed.
+    The window minimizes the errors of highlights and of irradiance (see
+    `best_window`). An error of irradiance weighs IRRADIANCE times as much.
 
     Args:
-        degree: Degree of the light.
-        roughness: Roughness of the smoothest surface; less than `MIN_ROUGHNESS` is taken for it.
-        width: Width of the lobe relative to that surface's, as a factor of α.
+        degree: Degree of the lighting.
+        roughness: Roughness of the smoothest surface, in [0, 1]. Values below
+            MIN_ROUGHNESS count as MIN_ROUGHNESS.
+        width: Width α of the highlight, as a fraction of the width for this
+            roughness.
 
     Returns:
-        Factors of the coefficients, shape ((degree + 1)²,), float64, 1 for the first.
+        Factor of each coefficient, float64, shape ((degree + 1)²,). The first
+        is 1.
     """
-    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
-    diffuse = lambertian_factors(degree)[torch.arange(degree + 1) ** 2].numpy() / math.pi
-    weight = np.hypot(spectrum, IRRADIANCE * diffuse)
-    return best_window(spectrum, np.sqrt(2 * np.arange(degree + 1) + 1) * weight)
+    highlight = _spectrum(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
+    # The first harmonic of degree l has the index l².
+    first_of_degree = torch.arange(degree + 1) ** 2
+    irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
+    weight = np.hypot(highlight, IRRADIANCE * irradiance)
+    harmonics_per_degree = 2 * np.arange(degree + 1) + 1
+    return best_window(highlight, np.sqrt(harmonics_per_degree) * weight)
 
 
 @cache
 def highlight_error(degree: int, roughness: float) -> float:
-    """Compute how far the highlight of a point of light is off under `highlight_window`.
+    """Compute the error of the highlight of a point light under `highlight_window`.
+
+    The highlight is the lobe of a metal for a camera that looks along the
+    normal. The window is the one for a narrower highlight (see NARROWER).
 
     Args:
-        degree: Degree of the light.
-        roughness: Roughness of the surface; less than `MIN_ROUGHNESS` is taken for it.
+        degree: Degree of the lighting.
+        roughness: Roughness of the surface, in [0, 1]. Values below MIN_ROUGHNESS count
+            as MIN_ROUGHNESS.
 
     Returns:
-        The root mean square error over that of the highlight, of a mirror's lobe seen head-on.
+        Root mean square error over all directions, as a fraction of the root
+        mean square of the highlight.
     """
-    spectrum = _spectrum(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
-    kept = np.zeros_like(spectrum)
-    kept[: degree + 1] = highlight_window(degree, roughness, NARROWER)[np.arange(degree + 1) ** 2].numpy()
-    power = (2 * np.arange(len(spectrum)) + 1) * spectrum**2
-    return math.sqrt(float(power @ (1 - kept) ** 2 / power.sum()))
+    amplitudes = _spectrum(max(roughness, MIN_ROUGHNESS), 4 * MAX_DEGREE)
+    window = highlight_window(degree, roughness, NARROWER)
+    first_of_degree = np.arange(degree + 1) ** 2
+    kept = np.zeros_like(amplitudes)
+    kept[: degree + 1] = window[first_of_degree].numpy()
+    power = (2 * np.arange(len(amplitudes)) + 1) * amplitudes**2
+    lost_power = float(power @ (1 - kept) ** 2 / power.sum())
+    return math.sqrt(lost_power)
 
 
 def _spectrum(roughness: float, degree: int) -> np.ndarray:
-    """Compute the amplitude of each band (degree + 1,), over that of band 0, in a mirror's lobe seen head-on."""
-    up = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
-    node, weight = np.polynomial.legendre.leggauss(2**9 + 4 * degree)
-    cosine = torch.from_numpy((node + 1) / 2)
-    light = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], 1)
-    lobe = reflectance(up, up, light, torch.tensor(roughness, dtype=torch.float64))[SCHLICK] * cosine
-    amplitudes = (weight * lobe.numpy()) @ np.polynomial.legendre.legvander(cosine.numpy(), degree)
+    """Compute the amplitude of each degree l in a highlight, relative to degree 0.
+
+    The highlight is the lobe with the term SCHLICK for a camera that looks
+    along the normal. It is symmetric about the normal, so its coefficient of
+    degree l is an integral with the Legendre polynomial P_l.
+
+    Args:
+        roughness: Roughness of the surface.
+        degree: Largest degree l.
+
+    Returns:
+        Amplitudes, at least SMALLEST, float64, shape (degree + 1,).
+    """
+    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    node_count = 2**9 + 4 * degree
+    nodes, weights = np.polynomial.legendre.leggauss(node_count)
+    cosine = torch.from_numpy((nodes + 1) / 2)
+    sine = (1 - cosine**2).sqrt()
+    light = torch.stack([sine, 0 * cosine, cosine], 1)
+    roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
+    lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
+    legendre = np.polynomial.legendre.legvander(cosine.numpy(), degree)
+    amplitudes = (weights * lobe.numpy()) @ legendre
     return np.maximum(amplitudes / amplitudes[0], SMALLEST)
 
 
-def _in_view(vectors: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The components (S,) of vectors (S, 3) along the view's axes."""
-    x, y, z = vectors.T
-    sine, cosine, sine_azimuth, cosine_azimuth = axis.unbind()
-    x, y = _turned(x, y, -sine_azimuth, cosine_azimuth)
-    z, x = _turned(z, x, -sine, cosine)
-    return x, y, z
+# Chebyshev polynomials have their argument in [-1, 1]. The following four
+# functions map the cosine and the roughness to arguments and back.
 
 
-def _turned(x: Tensor, y: Tensor, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    return x * cosine - y * sine, x * sine + y * cosine
+def _cosine_to_argument(cosine: Tensor) -> Tensor:
+    """Map cosines from [0, 1] to [-1, 1], with more resolution at grazing angles."""
+    return 4 * cosine / (cosine + 1) - 1
 
 
-@per_degree
-def _functions(degree: int) -> tuple[Tensor, Tensor]:
-    """(K,) of each coefficient: which of the lobe functions is its, and its order m."""
-    l = bands(degree)
-    m = torch.arange(len(l)) - l * (l + 1)
-    return l * (l + 1) // 2 + m.abs(), m
+def _argument_to_cosine(argument: Tensor) -> Tensor:
+    """Map arguments of polynomials in the cosine from [-1, 1] to [0, 1]."""
+    return (argument + 1) / (3 - argument)
 
 
-def _circular(x: Tensor, y: Tensor, degree: int) -> Tensor:
-    """(2 degree + 1, ...): Im (x + iy)^degree, ..., Im (x + iy), 1, Re (x + iy), ..., Re (x + iy)^degree."""
-    rows = [torch.ones_like(x)]
-    real, imaginary = x, y
-    for _ in range(degree):
-        rows = [imaginary, *rows, real]
-        real, imaginary = _turned(real, imaginary, y, x)
-    return torch.stack(rows)
+def _roughness_to_argument(roughness: Tensor) -> Tensor:
+    """Map roughness from [MIN_ROUGHNESS, 1] to [-1, 1]."""
+    return (2 * roughness - 1 - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS)
 
 
-def _about_z(rows: Tensor, sine: Tensor, cosine: Tensor) -> Tensor:
-    """Coefficients (K, S) turned about z by an angle for each (S,), or for all (1,)."""
-    degree = math.isqrt(len(rows)) - 1
-    m, powers = _functions(degree)[1].to(rows.device), _circular(cosine, sine, degree)
-    signed = torch.cat([-powers[:degree], 0 * powers[:1], powers[:degree].flip(0)])
-    partner = torch.arange(len(m), device=rows.device) - 2 * m
-    turned = rows * powers.index_select(0, degree + m.abs())
-    return turned - rows.index_select(0, partner) * signed.index_select(0, degree + m)
+def _argument_to_roughness(argument: Tensor) -> Tensor:
+    """Map arguments of polynomials in the roughness from [-1, 1] to [MIN_ROUGHNESS, 1]."""
+    return (argument * (1 - MIN_ROUGHNESS) + 1 + MIN_ROUGHNESS) / 2
 
 
-def _by_band(matrix: Tensor, rows: Tensor) -> Tensor:
-    """The product of a rotation (K, K), which mixes no bands, and coefficients (K, S)."""
-    ends = [l * l for l in range(math.isqrt(len(rows)) + 1)]
-    blocks = (slice(*ends[l : l + 2]) for l in range(len(ends) - 1))
-    return torch.cat([matrix[band, band].to(rows) @ rows[band] for band in blocks])
+def along(roughness: Tensor) -> Tensor:
+    """Evaluate the NODES Chebyshev polynomials of the roughness.
+
+    Tables of this module hold coefficients for them. The result is
+    differentiable.
+
+    Args:
+        roughness: Roughness in [MIN_ROUGHNESS, 1], shape (S,).
+
+    Returns:
+        Values of the polynomials, shape (NODES, S).
+    """
+    return _chebyshev(_roughness_to_argument(roughness), NODES)
 
 
-@per_degree
-def _cycle(degree: int) -> Tensor:
-    """(K, K) float64: what turns coefficients as the rotation of x to y, y to z and z to x does."""
-    return rotate(torch.eye((degree + 1) ** 2, dtype=torch.float64), torch.eye(3, dtype=torch.float64).roll(1, 0))
+def _cosine_polynomials(cosine: Tensor, count: int) -> Tensor:
+    """Evaluate Chebyshev polynomials of cosines of shape (S,), shape (count, S)."""
+    return _chebyshev(_cosine_to_argument(cosine), count)
 
 
-def _chebyshev(x: Tensor, count: int) -> Tensor:
-    """(count, S): the polynomials T_0, T_1, ... at x (S,)."""
-    rows = [torch.ones_like(x), x]
+def _chebyshev(argument: Tensor, count: int) -> Tensor:
+    """Evaluate the Chebyshev polynomials T_0, T_1, ..., T_(count - 1).
+
+    Args:
+        argument: Arguments x in [-1, 1], shape (S,).
+        count: Number of polynomials, at least 2.
+
+    Returns:
+        Values of the polynomials, shape (count, S).
+    """
+    # The recurrence is T_(k + 1) = 2 x T_k - T_(k - 1).
+    values = [torch.ones_like(argument), argument]
     for _ in range(count - 2):
-        rows.append(2 * x * rows[-1] - rows[-2])
-    return torch.stack(rows)
+        values.append(2 * argument * values[-1] - values[-2])
+    return torch.stack(values)
 
 
-def _across(cosine: Tensor, count: int) -> Tensor:
-    """Compute Chebyshev polynomials of a cosine (S,), shape (count, S), whose nodes lie closer near 0."""
-    return _chebyshev(4 * cosine / (cosine + 1) - 1, count)
-
-
-def _coat_table() -> Tensor:
-    """Return the coefficients of E in the products of `_table`, shape (NODES, 2 USUAL + 4), float64."""
-    return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
+def _chebyshev_nodes(count: int) -> Tensor:
+    """Compute the zeros of the Chebyshev polynomial T_count, float64, shape (count,)."""
+    steps = torch.arange(count, dtype=torch.float64) + 0.5
+    angles = math.pi * steps / count
+    return angles.cos()
 
 
 @per_degree
 def _table(degree: int) -> Tensor:
-    """(3 terms, M functions, NODES, 2 degree + 4) float64: coefficients of π c in products of Chebyshev polynomials of
-    the roughness and, the faster index, the cosine."""
-    angles = math.pi * (torch.arange(NODES, dtype=torch.float64) + 0.5) / NODES
-    roughness = (angles.cos() * (1 - MIN_ROUGHNESS) + 1 + MIN_ROUGHNESS) / 2
-    fits = torch.stack([_fit(degree, float(value)) for value in roughness])  # (NODES, 3, M, 2 degree + 4)
-    return torch.einsum("kr,rtmc->tmkc", torch.linalg.inv(_chebyshev(angles.cos(), NODES).T), fits).contiguous()
+    """Fit the lobe functions π c_lm(cos θ, r) by products of Chebyshev polynomials.
+
+    Each function is approximated by Σ_k Σ_p a_kp T_k(y) T_p(x) with Chebyshev
+    polynomials T. The argument y stands for the roughness r (see
+    `_roughness_to_argument`), and x for the cosine n·v = cos θ (see
+    `_cosine_to_argument`). There are NODES polynomials in the roughness, and
+    P = 2 degree + 1 + MARGIN in the cosine.
+
+    Args:
+        degree: Largest degree l of the spherical harmonics.
+
+    Returns:
+        Coefficients a_kp, float64, for each of the three Fresnel terms and of
+        the M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l,
+        shape (3, M, NODES, P).
+    """
+    roughness_arguments = _chebyshev_nodes(NODES)
+    roughnesses = _argument_to_roughness(roughness_arguments)
+    # Shape (NODES, 3, M, P).
+    fits = torch.stack([_fit(degree, float(roughness)) for roughness in roughnesses])
+    # There are as many polynomials in the roughness as values of the roughness,
+    # so the polynomials pass through all values. This matrix maps values to
+    # coefficients, shape (NODES, NODES).
+    interpolation = torch.linalg.inv(_chebyshev(roughness_arguments, NODES).T)
+    return torch.einsum("kr,rtmc->tmkc", interpolation, fits).contiguous()
 
 
 @lru_cache(maxsize=8)
 @torch.inference_mode(False)
 def _table_at(degree: int, roughness: float) -> Tensor:
-    """(3 terms, M functions, 2 degree + 4) float64: `_table` at one roughness, in less time."""
+    """Fit the lobe functions at one roughness as in `_fit`, and keep the latest results."""
     return _fit(degree, roughness)
 
 
 def _fit(degree: int, roughness: float) -> Tensor:
-    """Fit π c at one roughness in Chebyshev polynomials of the cosine, shape (3 terms, M functions, 2 degree + 4).
+    """Fit the lobe functions π c_lm(cos θ, r) at one roughness by Chebyshev polynomials.
 
-    Bands without amplitude at this roughness are zero.
+    There are P = 2 degree + 1 + MARGIN polynomials in the cosine. When a mirror
+    turns by θ, the reflected light turns by 2 θ. A harmonic of degree l of this
+    light therefore has degree 2 l as a function of θ.
+
+    Args:
+        degree: Largest degree l of the spherical harmonics.
+        roughness: Roughness r in [MIN_ROUGHNESS, 1].
+
+    Returns:
+        Coefficients, float64, for each of the three Fresnel terms and of the
+        M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l,
+        shape (3, M, P). They are zero for degrees above USUAL that have no
+        noticeable amplitude at this roughness (see NEGLIGIBLE).
     """
-    count, shown = 2 * degree + 4, max(min(degree, USUAL), min(degree, degree_for(roughness, NEGLIGIBLE)))
-    angles = math.pi * (torch.arange(3 * count // 2, dtype=torch.float64) + 0.5) / (3 * count // 2)
-    x = angles.cos()
-    cosines = (x + 1) / (3 - x)
-    orders = torch.tensor([m for l in range(shown + 1) for m in range(l + 1)])
-    of_roughness = torch.tensor(roughness, dtype=torch.float64)
-    lobes = torch.cat([_lobes(some, of_roughness, shown) for some in cosines.split(AT_ONCE)], dim=2).permute(1, 2, 0)
-    # Least squares with the factor sin^m θ, since near 0 the functions are quotients of small numbers.
-    factors = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2) * _chebyshev(x, count).T
-    fits = torch.linalg.lstsq(factors, lobes, rcond=1e-9, driver="gelsd").solution.permute(2, 0, 1)  # (3, M, count)
-    return torch.nn.functional.pad(fits, (0, 0, 0, (degree + 1) * (degree + 2) // 2 - len(orders)))
+    polynomial_count = 2 * degree + 1 + MARGIN
+    noticeable_degree = max(degree_for(roughness, NEGLIGIBLE), USUAL)
+    fitted_degree = min(degree, noticeable_degree)
+    # The least squares below use 1.5 times as many cosines as polynomials. The
+    # number of cosines is N.
+    cosine_arguments = _chebyshev_nodes(3 * polynomial_count // 2)
+    cosines = _argument_to_cosine(cosine_arguments)
+    roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
+    integrals_of_parts = []
+    for some_cosines in cosines.split(COSINES_AT_ONCE):
+        integrals_of_parts.append(_lobe_integrals(some_cosines, roughness_tensor, fitted_degree))
+    # Shape (M', N, 3), with the M' pairs (l, m) up to the fitted degree.
+    integrals = torch.cat(integrals_of_parts, dim=2).permute(1, 2, 0)
+    # The integrals contain the factor sin^m θ, so the polynomials are
+    # multiplied by it too. A division by it would be a quotient of small
+    # numbers near θ = 0.
+    orders = torch.tensor([m for l in range(fitted_degree + 1) for m in range(l + 1)])
+    # Shape (M', N, 1).
+    sine_powers = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2)
+    # Shape (M', N, P).
+    fitted_functions = sine_powers * _chebyshev(cosine_arguments, polynomial_count).T
+    fit = torch.linalg.lstsq(fitted_functions, integrals, rcond=1e-9, driver="gelsd")
+    # Shape (3, M', P), and then (3, M, P).
+    coefficients = fit.solution.permute(2, 0, 1)
+    function_count = (degree + 1) * (degree + 2) // 2
+    missing_count = function_count - len(orders)
+    return torch.nn.functional.pad(coefficients, (0, 0, 0, missing_count))
 
 
-def _lobes(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
-    """Compute π c_lm sin^m θ at N cosines, shape (3 terms, M, N), by quadrature over half vectors.
+def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
+    """Integrate π times the lobe times each spherical harmonic over the directions of light.
 
-    The half vectors on one side of the plane of n and v have azimuth φ and polar angle θ, tan θ = α tan ψ. Nodes are
-    even in φ and Gauss-Legendre's in ψ, up to the angle at which the light comes from below the horizon.
+    In the axes of a sample, with the normal in the plane of x and z, the
+    integral with the harmonic of degree l and order m is π c_lm sin^m θ. The
+    quadrature runs over Q half vectors for each camera direction.
+
+    Args:
+        cosines: Cosine n·v in (0, 1) of N camera directions, float64,
+            shape (N,).
+        roughness: Roughness, shape ().
+        degree: Largest degree l of the spherical harmonics.
+
+    Returns:
+        Integrals for the three Fresnel terms and the
+        M = (degree + 1) (degree + 2) / 2 pairs (l, m) with 0 ≤ m ≤ l, in
+        ascending order of l and then of m, shape (3, M, N).
     """
-    node, weight = (torch.from_numpy(values) for values in np.polynomial.legendre.leggauss(QUADRATURE[0]))
-    azimuth = math.pi * (torch.arange(QUADRATURE[1], dtype=torch.float64) + 0.5) / QUADRATURE[1]
+    half, solid_angles = _half_vectors(cosines, roughness)
+    # Axes of the surface: the normal is the z-axis, and the camera lies in the
+    # plane of x and z.
+    normal = half.new_tensor([[0.0, 0.0, 1.0]])
+    sines = (1 - cosines**2).sqrt()
+    zeros = 0 * sines
+    toward = torch.stack([-sines, zeros, cosines], dim=1)
+    # Cosine v·h, shape (N, Q).
+    half_cosine = (toward[:, None] * half).sum(-1)
+    # The camera direction is mirrored at each half vector, shape (N, Q, 3).
+    light = 2 * half_cosine[..., None] * half - toward[:, None]
+    light_cosine = light[..., 2].clamp(min=0)
+    # The solid angle of the reflected light is dl = 4 (v·h) dh (Walter et al.
+    # 2007, equation 14). Both tensors have shape (3, N, Q).
+    reflected = reflectance(normal, toward[:, None], light, roughness)
+    weighted_lobe = reflected * light_cosine * solid_angles * 4 * half_cosine
+
+    # Sample axes: the camera is the z-axis, and the normal lies in the plane of
+    # x and z.
+    x_axis = torch.stack([cosines, zeros, sines], dim=1)
+    light_x = (light * x_axis[:, None]).sum(2)
+    light_y = light[..., 1]
+    light_z = (light * toward[:, None]).sum(2)
+    harmonic_indices = [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]
+    light_in_sample = torch.stack([light_x, light_y, light_z])
+    # Shape (M, N, Q).
+    harmonics = torch.stack(select_rows(light_in_sample, harmonic_indices))
+    # Shape (3, M, N).
+    return torch.einsum("tnq,mnq->tmn", weighted_lobe, harmonics)
+
+
+def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
+    """Place half vectors around a normal along z, most of them where the lobe is high.
+
+    The half vectors have azimuths φ and polar angles θ_h. The substitution
+    tan θ_h = α tan ψ spreads the lobe evenly over ψ. Nodes are equally spaced
+    in φ and are those of Gauss-Legendre quadrature in ψ. Half vectors with
+    larger polar angles are left out, because the light that they mirror to the
+    camera would come from below the horizon. The lobe is symmetric about the
+    plane of n and v, so azimuths on one side of this plane are enough.
+
+    Args:
+        cosines: Cosine n·v in (0, 1) of N camera directions, float64,
+            shape (N,).
+        roughness: Roughness, shape ().
+
+    Returns:
+        A tuple of
+        - Q unit half vectors for each camera direction, float64,
+          shape (N, Q, 3);
+        - their solid angles dh on both sides of the plane, float64,
+          shape (N, Q).
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(POLAR_NODE_COUNT)
+    node = torch.from_numpy(nodes)[:, None]
+    weight = torch.from_numpy(weights)[:, None]
+    steps = torch.arange(AZIMUTH_COUNT, dtype=torch.float64) + 0.5
+    azimuth = math.pi * steps / AZIMUTH_COUNT
     alpha = roughness**2
     sines = (1 - cosines**2).sqrt()
-    toward = torch.stack([-sines, 0 * sines, cosines], dim=1)  # (N, 3)
-    steepest = (math.pi / 2 - torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])) / 2  # (N, azimuths)
-    last = (steepest.tan() / alpha).atan()[:, None]
-    angle = last * (node[:, None] + 1) / 2  # ψ (N, nodes, azimuths)
-    polar = (alpha * angle.tan()).atan()
-    half = torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()], -1).flatten(1, 2)
-    # The solid angle of a half vector is sin θ dθ dφ, and that of light is 4 (v·h) times it.
-    per_angle = alpha * (polar.cos() / angle.cos()) ** 2
-    measure = (last * weight[:, None] / 2 * per_angle * polar.sin()).flatten(1) * (2 * math.pi / QUADRATURE[1])
-    facing = (toward[:, None] * half).sum(-1)
-    light = 2 * facing[..., None] * half - toward[:, None]
-    values = reflectance(half.new_tensor([[0.0, 0, 1]]), toward[:, None], light, roughness)
-    values = values * light[..., 2].clamp(min=0) * measure * 4 * facing
-    ahead = torch.stack([cosines, 0 * sines, sines], dim=1)  # normal to v, in its plane with n
-    directions = torch.stack([(light * ahead[:, None]).sum(2), light[..., 1], (light * toward[:, None]).sum(2)])
-    harmonics = torch.stack(select_rows(directions, [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]))
-    return torch.einsum("tnq,mnq->tmn", values, harmonics)
+    # The camera leans away from the half vectors by this angle, in the plane of
+    # the normal and the azimuth φ. The mirrored light leans from the normal by
+    # this angle plus twice the polar angle. Shape (N, azimuths).
+    camera_lean = torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])
+    largest_polar = (math.pi / 2 - camera_lean) / 2
+    # Shape (N, 1, azimuths).
+    largest_psi = (largest_polar.tan() / alpha).atan()[:, None]
+    # Shape (N, nodes, azimuths).
+    psi = largest_psi * (node + 1) / 2
+    polar = (alpha * psi.tan()).atan()
+    x = polar.sin() * azimuth.cos()
+    y = polar.sin() * azimuth.sin()
+    half = torch.stack([x, y, polar.cos()], -1).flatten(1, 2)
+    # The solid angle is sin θ_h dθ_h dφ, with the derivative dθ_h / dψ.
+    polar_per_psi = alpha * (polar.cos() / psi.cos()) ** 2
+    per_azimuth = (largest_psi * weight / 2 * polar_per_psi * polar.sin()).flatten(1)
+    return half, per_azimuth * (2 * math.pi / AZIMUTH_COUNT)

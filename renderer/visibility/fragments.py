@@ -1,6 +1,12 @@
-"""What a view sees of a mesh: the covered samples of an image, each with its pixel and its face.
+"""Surface samples that a camera sees of a mesh, found once by rasterization.
 
-Rasterized once and then fixed, while light, albedo or the positions of the vertices are differentiated.
+An image of size² pixels has s² samples per pixel, where s is
+`Fragments.samples`. The samples that show the mesh are kept in `Fragments`,
+with the pixel and the face of each. They stay fixed while the lighting, the
+albedo or the vertex positions are differentiated.
+
+Shapes use these letters: a view has S covered samples in P pixels, and they
+show G of the F faces of the mesh.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,16 +24,24 @@ from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import Rasterizer
 
-BLOCK = 2**14  # samples at a time
+# Number of samples that loops process at once, so that their values stay in
+# the cache of the processor.
+BLOCK = 2**14
+
+# Name of the cached property `Fragments.barycentric`.
+_WEIGHTS = "barycentric"
 
 
 class Runs(NamedTuple):
-    """R runs of neighboring samples that see one face in one pixel, in the samples' order.
+    """R runs of neighboring samples that show one face in one pixel.
+
+    The runs have the order of the samples.
 
     Attributes:
-        pixel: Index into `Fragments.pixels`, ascending, (R,) int64.
-        face: Index into `Fragments.faces`, (R,) int64.
-        sample_count: The number of samples, (R,) int64.
+        pixel: Index into `Fragments.pixels` of each run, ascending, int64,
+            shape (R,).
+        face: Index into `Fragments.faces` of each run, int64, shape (R,).
+        sample_count: Number of samples in each run, int64, shape (R,).
     """
 
     pixel: Tensor
@@ -37,17 +51,33 @@ class Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class Fragments:
-    """S covered samples of an image of size² pixels; they see G faces in P pixels. samples: per side of a pixel.
+    """The S samples of an image that show a mesh, with their pixels and faces.
 
-    pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the image.
-    coverage: (P,) float64 in (0, 1], the fraction of a pixel's samples that the mesh covers.
-    faces: (G,) int64, the mesh's faces that any sample sees, ascending; the others are neither shaded nor moved.
-    corners: (G, 3) int64, their vertices. facing: (G, 1) float64, -1 where the camera sees a face from behind.
-    outlines: (G, 3, 2) float64, their corners as projected, x right and y up in [-1, 1].
-    pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
-    sample: (S,) int64, their position in the image: pixel by pixel, and row by row within a pixel.
-    depths: (G, 3) float64 of the corners, by which perspective divides (`Camera.depths`); None without perspective.
-    camera: whose view it is; None of surface that is gathered without one.
+    The samples of a pixel are neighbors in all tensors of shape (S,).
+
+    Attributes:
+        size: Width and height of the image in pixels.
+        samples: Number of samples along one side of a pixel.
+        pixels: Row-major indices of the P pixels with covered samples,
+            ascending, int64, shape (P,). Row 0 is the top of the image.
+        coverage: Fraction of the samples of each pixel that show the mesh, in
+            (0, 1], float64, shape (P,).
+        faces: Indices in the mesh of the G faces that samples show, ascending,
+            int64, shape (G,).
+        corners: Indices of the three vertices of each seen face, int64,
+            shape (G, 3).
+        facing: -1 for seen faces that the camera sees from behind, and 1 for
+            the others, float64, shape (G, 1).
+        outlines: Projected corners of each seen face, x to the right and y up,
+            with the image in [-1, 1], float64, shape (G, 3, 2).
+        pixel: Index into `pixels` of each sample, int64, shape (S,).
+        face: Index into `faces` of each sample, int64, shape (S,).
+        sample: Position of each sample among all samples of the image, int64,
+            shape (S,). Positions count pixel by pixel, and row by row within a
+            pixel.
+        depths: Depths of the corners of seen faces (see `Camera.depths`),
+            float64, shape (G, 3). None without perspective.
+        camera: Camera of the view. None if the samples come from no camera.
     """
 
     size: int
@@ -66,28 +96,43 @@ class Fragments:
 
     @property
     def eye(self) -> Tensor:
-        """(4,) homogeneous: the camera's position and 1, or the direction to it and 0. Only gloss asks for it."""
-        return torch.zeros(4) if self.camera is None else torch.from_numpy(self.camera.eye())
+        """Position of the camera or direction to it, see `Camera.eye`. Zeros without a camera."""
+        if self.camera is None:
+            return torch.zeros(4)
+        return torch.from_numpy(self.camera.eye())
 
     @cached_property
     def barycentric(self) -> Tensor:
-        """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped.
+        """Barycentric weights of the three corners at each sample, float64, shape (S, 3).
 
-        Under perspective, a function that is linear on a face is a quotient of two linear functions in the image, which
-        are interpolated there (Heckbert and Moreton 1991).
+        They are computed from unrounded corners, but the rasterizer rounds
+        corners. A sample may therefore lie slightly outside its face, and its
+        weights are clipped at 0.
+
+        In a perspective image, a function that is linear on a face is a
+        quotient of two linear functions of the image position (Heckbert and
+        Moreton 1991). The weights are therefore divided by the depths of the
+        corners and normalized.
         """
+        # Shape (2, 3, G), for x and y, and three corners.
         outlines = self.outlines.permute(2, 1, 0)
+        # The edges b and c lead from the first corner to the other two corners.
         edges = outlines[:, 1:] - outlines[:, :1]
         (bx, cx), (by, cy) = edges
         area = bx * cy - cx * by
-        scaled = edges / area.masked_fill(area == 0, 1)
-        faces = torch.cat([outlines[:, 0], scaled.flatten(0, 1)])
+        edges_by_area = edges / area.masked_fill(area == 0, 1)
+        # Rows x₀ and y₀ of the first corner, and bx, cx, by and cy over the
+        # area, shape (6, G).
+        face_values = torch.cat([outlines[:, 0], edges_by_area.flatten(0, 1)])
         nearness = None if self.depths is None else self.depths.T.reciprocal()
-        weights = faces.new_empty(3, len(self.face))
-        for weight, face, at in _blocks(weights, self.face, self.positions().T):
-            x0, y0, bx, cx, by, cy = faces.gather(1, face.expand(len(faces), -1))  # index_select takes thrice as long
-            x, y = at[0] - x0, at[1] - y0
-            weight[1], weight[2] = x * cy - y * cx, y * bx - x * by
+        weights = face_values.new_empty(3, len(self.face))
+        for weight, face, position in _blocks(weights, self.face, self.positions().T):
+            # gather takes a third of the time of index_select.
+            x0, y0, bx, cx, by, cy = face_values.gather(1, face.expand(len(face_values), -1))
+            x = position[0] - x0
+            y = position[1] - y0
+            weight[1] = x * cy - y * cx
+            weight[2] = y * bx - x * by
             weight[0] = 1 - weight[1] - weight[2]
             weight.clamp_(0, 1)
             if nearness is not None:
@@ -96,59 +141,150 @@ class Fragments:
         return weights.T
 
     def positions(self) -> Tensor:
-        """(S, 2) float64 positions of the samples, in the same coordinates as `outlines`."""
-        pixel, within = _divide(self.sample.double(), self.samples**2)  # as floats: integers divide ten times as slowly
-        (row, column), (down, across) = _divide(pixel, self.size), _divide(within, self.samples)
+        """Compute the positions of the samples in the image.
+
+        Returns:
+            x to the right and y up, with the image in [-1, 1], float64,
+            shape (S, 2).
+        """
+        # Floating-point numbers are divided in a tenth of the time of integers.
+        pixel, within_pixel = _divide(self.sample.double(), self.samples**2)
+        pixel_row, pixel_column = _divide(pixel, self.size)
+        row_within, column_within = _divide(within_pixel, self.samples)
         resolution = self.size * self.samples
-        column, row = column * self.samples + across, row * self.samples + down
+        column = pixel_column * self.samples + column_within
+        row = pixel_row * self.samples + row_within
+        # Samples are the centers of cells of width 2 / resolution.
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
     def by_sample(self) -> "Fragments":
-        """The same samples, in the same order, as pixels of an image of size · samples pixels per side."""
+        """Return the same samples as pixels of a finer image.
+
+        Returns:
+            Samples in the same order, for an image with size · s pixels per
+            side and one sample per pixel.
+        """
         resolution = self.size * self.samples
-        cells = torch.arange(resolution**2, device=self.sample.device).view(self.size, self.samples, self.size, -1)
-        sample = cells.transpose(1, 2).flatten().index_select(0, self.sample)
-        pixel, coverage = torch.arange(len(sample), device=sample.device), self.coverage.new_ones(len(sample))
-        finer: dict[str, Any] = {"pixels": sample, "pixel": pixel, "sample": sample, "coverage": coverage}
-        return self._like(replace(self, size=resolution, samples=1, **finer), slice(None))
+        # Row-major position of each sample among all samples of the image,
+        # shape (size, s, size, s), for the row and column of a pixel and of a
+        # sample in it.
+        cells = torch.arange(resolution**2, device=self.sample.device)
+        cells = cells.view(self.size, self.samples, self.size, -1)
+        position = cells.transpose(1, 2).flatten().index_select(0, self.sample)
+        finer = replace(
+            self,
+            size=resolution,
+            samples=1,
+            pixels=position,
+            coverage=self.coverage.new_ones(len(position)),
+            pixel=torch.arange(len(position), device=position.device),
+            sample=position,
+        )
+        return self._share_weights(finer, slice(None))
 
     def select(self, samples: Tensor) -> "Fragments":
-        """Some of the samples (N,), in the same pixels."""
-        names = "pixel", "face", "sample"
-        chosen: dict[str, Any] = {name: getattr(self, name).index_select(0, samples) for name in names}
-        return self._like(replace(self, **chosen), samples)
+        """Return some of the samples, in the same pixels.
 
-    def _like(self, view: "Fragments", samples: Tensor | slice) -> "Fragments":
-        """A view with samples of this one, and with their weights, if these are there already."""
-        if "barycentric" in vars(self):
-            vars(view)["barycentric"] = self.barycentric[samples]
+        Args:
+            samples: Indices of the N samples to keep, shape (N,).
+
+        Returns:
+            Copy whose `pixel`, `face` and `sample` have N entries.
+        """
+        selected = replace(
+            self,
+            pixel=self.pixel.index_select(0, samples),
+            face=self.face.index_select(0, samples),
+            sample=self.sample.index_select(0, samples),
+        )
+        return self._share_weights(selected, samples)
+
+    def _share_weights(self, view: "Fragments", samples: Tensor | slice) -> "Fragments":
+        """Give a view of some of these samples their barycentric weights if they are known."""
+        if _WEIGHTS in vars(self):
+            vars(view)[_WEIGHTS] = self.barycentric[samples]
         return view
 
     def image_of_samples(self, values: Tensor, empty: float) -> Tensor:
-        """Values (S,) where the samples lie in the image, (size · samples, size · samples), and `empty` elsewhere."""
-        image = values.new_full((self.size**2 * self.samples**2,), empty).index_copy_(0, self.sample, values)
-        by_row = image.view(self.size, self.size, self.samples, self.samples).transpose(1, 2)
-        return by_row.reshape(self.size * self.samples, -1)
+        """Arrange values at samples as an image with one pixel per sample.
+
+        Args:
+            values: Value of each covered sample, shape (S,).
+            empty: Value of samples that show no mesh.
+
+        Returns:
+            Image of samples, shape (size · s, size · s). Row 0 is at the top.
+        """
+        image = values.new_full((self.size**2 * self.samples**2,), empty)
+        image.index_copy_(0, self.sample, values)
+        # Rows of pixels and columns of pixels, then rows and columns of samples.
+        by_pixel = image.view(self.size, self.size, self.samples, self.samples)
+        return by_pixel.transpose(1, 2).reshape(self.size * self.samples, -1)
 
     def of_image(self, image: Tensor) -> Tensor:
-        """(S,) the values of an image of samples, (size · samples, size · samples), at the samples."""
-        by_pixel = image.view(self.size, self.samples, self.size, self.samples).transpose(1, 2)
-        return by_pixel.flatten().index_select(0, self.sample)
+        """Read an image with one pixel per sample at the covered samples.
+
+        This is the inverse of `image_of_samples`.
+
+        Args:
+            image: Image of samples, shape (size · s, size · s).
+
+        Returns:
+            Values of the covered samples, shape (S,).
+        """
+        by_row = image.view(self.size, self.samples, self.size, self.samples)
+        return by_row.transpose(1, 2).flatten().index_select(0, self.sample)
 
     def interpolate(self, corners: Tensor) -> Tensor:
-        """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
+        """Interpolate values of face corners at the samples.
+
+        The result is differentiable with respect to `corners`.
+
+        Args:
+            corners: D values for each of the three corners of the seen faces,
+                shape (G, 3, D).
+
+        Returns:
+            Values at the samples, shape (S, D).
+        """
         rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(rows, self.face, self.barycentric.T).T
 
     def distribute(self, values: Tensor) -> Tensor:
-        """(G, 3, D) sums of values (S, D) over the samples, weighted for each corner: `interpolate` transposed."""
-        rows = _distribute(values.T, self.face, self.barycentric.T, (3 * values.shape[1], len(self.faces)))
+        """Add values at samples to the corners of their faces.
+
+        Each value is weighted with the barycentric weight of the corner. This
+        is the transpose of `interpolate`.
+
+        Args:
+            values: D values for each sample, shape (S, D).
+
+        Returns:
+            Weighted sums for the three corners of the seen faces,
+            shape (G, 3, D).
+        """
+        shape = (3 * values.shape[1], len(self.faces))
+        rows = _distribute(values.T, self.face, self.barycentric.T, shape)
         return rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixel (R,), face (R,), albedo (R, C)): neighboring samples of one face in one pixel as one, since they
-        share a normal, with the sum of their albedos (S, C) over samples². Differentiable in them."""
-        if self.samples == 1 or not len(self.pixel):
+        """Join neighboring samples that show one face in one pixel into runs.
+
+        The samples of a run share a normal if normals are flat. Shading one run
+        then replaces shading its samples.
+
+        Args:
+            albedo: C values of albedo for each sample, shape (S, C). The result
+                is differentiable with respect to it.
+
+        Returns:
+            A tuple of
+            - the index into `pixels` of each of R runs, shape (R,);
+            - the index into `faces` of each run, shape (R,);
+            - the albedo summed over the samples of each run and divided by the
+              number of samples in a pixel, shape (R, C).
+        """
+        if self.samples == 1 or len(self.pixel) == 0:
             return self.pixel, self.face, albedo
         runs = self.runs
         sample_count = runs.sample_count.cpu().numpy()
@@ -161,33 +297,62 @@ class Fragments:
 
     @cached_property
     def runs(self) -> Runs:
-        """The runs of samples that lie next to each other in memory and see one face in one pixel."""
+        """Runs of neighboring samples that show one face in one pixel."""
+        # The additional last entry marks the end of all samples.
         is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
         torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
         is_start[1:-1] |= self.face[1:] != self.face[:-1]
-        # NumPy finds them in a quarter of the time of torch. The last is the end of all samples.
+        # NumPy finds the starts in a quarter of the time of torch.
         found = np.flatnonzero(is_start.cpu().numpy())
         starts = torch.from_numpy(found).to(self.pixel.device)
-        pixel = self.pixel.index_select(0, starts[:-1])
-        face = self.face.index_select(0, starts[:-1])
-        return Runs(pixel, face, starts.diff())
+        return Runs(
+            pixel=self.pixel.index_select(0, starts[:-1]),
+            face=self.face.index_select(0, starts[:-1]),
+            sample_count=starts.diff(),
+        )
 
     def to(self, device: torch.device | str) -> "Fragments":
-        """The same on another device."""
-        values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        moved: dict[str, Any] = {name: value.to(device) for name, value in values if isinstance(value, Tensor)}
+        """Return a copy with all tensors on a device.
+
+        Args:
+            device: Device for the tensors.
+
+        Returns:
+            The same samples with tensors on `device`.
+        """
+        moved: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                moved[field.name] = value.to(device)
         return replace(self, **moved)
 
 
 class _Interpolation(torch.autograd.Function):
-    """Values (D, S) of corners' (3 D, G), all of a corner together, by blocks of samples that stay in the cache."""
+    """Interpolation of corner values at samples, in blocks of samples.
+
+    Corner values have shape (3 D, G) with all values of the first corner first.
+    Values at samples have shape (D, S).
+    """
 
     @staticmethod
     def forward(ctx: Any, corners: Tensor, face: Tensor, weights: Tensor) -> Tensor:
+        """Interpolate the values of the corners at each sample.
+
+        Args:
+            ctx: Context of autograd.
+            corners: Values of the corners of the seen faces, shape (3 D, G).
+            face: Index of the seen face at each sample, shape (S,).
+            weights: Barycentric weights of each sample, shape (3, S).
+
+        Returns:
+            Values at the samples, shape (D, S).
+        """
         ctx.save_for_backward(face, weights)
-        ctx.corners = corners.shape
+        ctx.corners_shape = corners.shape
         values = corners.new_empty(len(corners) // 3, len(face))
         for value, index, weight in _blocks(values, face, weights):
+            # Shape (3, D, samples of the block).
             at_corners = corners.gather(1, index.expand(len(corners), -1)).unflatten(0, (3, -1))
             torch.sum(at_corners.mul_(weight[:, None]), 0, out=value)
         return values
@@ -195,16 +360,50 @@ class _Interpolation(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
+        """Distribute the gradient by the values to the corners.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the values at the samples, shape (D, S).
+
+        Returns:
+            Gradient by the values of the corners, shape (3 D, G), and None for
+            the other arguments of `forward`.
+        """
         face, weights = ctx.saved_tensors
-        return _distribute(upstream, face, weights, ctx.corners), None, None
+        return _distribute(upstream, face, weights, ctx.corners_shape), None, None
 
 
-def _distribute(values: Tensor, face: Tensor, weights: Tensor, corners: Sequence[int]) -> Tensor:
-    """Values (D, S) of samples, to the corners (3 D, G) of their faces."""
-    by_corners = values.new_zeros(corners)
+def _distribute(
+    values: Tensor, face: Tensor, weights: Tensor, corners_shape: Sequence[int]
+) -> Tensor:
+    """Add weighted values of samples to the corners of their faces.
+
+    Args:
+        values: D values for each sample, shape (D, S).
+        face: Index of the seen face at each sample, shape (S,).
+        weights: Barycentric weights of each sample, shape (3, S).
+        corners_shape: Shape (3 D, G) of the result.
+
+    Returns:
+        Sums for the corners of the seen faces, with all values of the first
+        corner first, shape (3 D, G).
+    """
+    at_corners = values.new_zeros(corners_shape)
     for value, index, weight in _blocks(values, face, weights.to(values)):
-        by_corners.index_add_(1, index, (weight[:, None] * value).flatten(0, 1))
-    return by_corners
+        at_corners.index_add_(1, index, (weight[:, None] * value).flatten(0, 1))
+    return at_corners
+
+
+def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Split tensors along their last axis into views of BLOCK samples."""
+    return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
+
+
+def _divide(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
+    """Divide whole floating-point numbers, and return the quotients and the remainders."""
+    quotient = (numbers / divisor).floor()
+    return quotient, numbers - quotient * divisor
 
 
 def build_fragments(
@@ -215,19 +414,55 @@ def build_fragments(
     rasterizer: Rasterizer,
     closed: bool = False,
 ) -> list[Fragments]:
-    """Rasterize a mesh of vertices (V, 3) and faces (F, 3), once per camera.
+    """Rasterize a mesh once for each camera.
 
-    closed: the mesh is watertight and its faces are counter-clockwise from outside (`Mesh.closed`), so that the ones
-    seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the image has no
-    fragments; that is no error. InputError: NaN, or a perspective camera that the mesh is not all in front of.
+    Args:
+        vertices: Vertex positions in world axes, float64, shape (V, 3).
+        faces: Indices of the three vertices of each face, shape (F, 3).
+        cameras: Cameras of the N views.
+        settings: Size of the images and number of samples per pixel side.
+        rasterizer: Rasterizer to use.
+        closed: True promises that the mesh is watertight and that its faces are
+            counter-clockwise seen from outside (see `Mesh.closed`). Faces that
+            are seen from behind are then not drawn, unless the near plane cuts
+            the mesh open.
+
+    Returns:
+        Samples that show the mesh, for each camera. A mesh outside the image
+        has no samples.
+
+    Raises:
+        InputError: If `vertices` holds NaN or infinite values, or if the mesh
+            reaches a perspective camera.
     """
     require_finite(vertices=torch.from_numpy(vertices))
-    rows = np.stack([camera.project(vertices).T for camera in cameras])  # each coordinate side by side in memory
-    points = rows.swapaxes(1, 2)
-    closed = closed and bool((points[..., 2] >= -1).all())
-    ids = rasterizer.rasterize(points, faces, settings.size * settings.samples, closed=closed)
-    depths = [camera.depths(vertices) for camera in cameras]
-    return [_fragments(*view, faces, settings) for view in zip(cameras, points, depths, ids, strict=True)]
+    # Each coordinate is contiguous in memory, shape (N, 3, V).
+    coordinates = np.stack([camera.project(vertices).T for camera in cameras])
+    projected = coordinates.swapaxes(1, 2)
+    # The third coordinate is -1 at the near plane.
+    is_uncut = bool((projected[..., 2] >= -1).all())
+    face_ids = rasterizer.rasterize(
+        projected, faces, settings.size * settings.samples, closed=closed and is_uncut
+    )
+    views = []
+    for camera, points, ids in zip(cameras, projected, face_ids, strict=True):
+        depths = camera.depths(vertices)
+        views.append(_fragments(camera, points, depths, ids, faces, settings))
+    return views
+
+
+class _CoveredSamples(NamedTuple):
+    """Covered samples of one view, and their pixels.
+
+    Attributes:
+        pixels: Row-major indices of the pixels with covered samples, shape (P,).
+        counts: Number of covered samples in each of these pixels, shape (P,).
+        pixel: Index into `pixels` of each sample, shape (S,).
+    """
+
+    pixels: np.ndarray
+    counts: np.ndarray
+    pixel: np.ndarray
 
 
 def _fragments(
@@ -238,56 +473,91 @@ def _fragments(
     faces: np.ndarray,
     settings: ImageSettings,
 ) -> Fragments:
-    size, samples = settings.size, settings.samples
-    within = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)  # a pixel's row of samples as one item
-    by_pixel = within.swapaxes(1, 2).reshape(-1).view(ids.dtype)
-    hits = np.flatnonzero(by_pixel >= 0)
-    visible, face = _compact(by_pixel[hits], len(faces))
-    if samples == 1:  # a sample is a pixel
-        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits), dtype=np.int64)
-    else:
-        counts = np.bincount(hits // samples**2, minlength=size**2)
-        pixels = np.flatnonzero(counts > 0)
-        counts = counts[pixels]
-        pixel = np.repeat(np.arange(len(pixels)), counts)
-    corners = np.ascontiguousarray(faces.take(visible, axis=0).T)
+    """Gather the covered samples of one rasterized view.
+
+    Args:
+        camera: Camera of the view.
+        projected: Vertices as `Camera.project` returns them, shape (V, 3).
+        depths: Depths of the vertices, shape (V,). None without perspective.
+        ids: Face of each sample of the image or -1, shape (size · s, size · s).
+        faces: Vertex indices of all faces, shape (F, 3).
+        settings: Size of the image and number of samples per pixel side.
+
+    Returns:
+        Samples that show the mesh.
+    """
+    size = settings.size
+    samples = settings.samples
+    # The s samples of a pixel in one row are moved as one item.
+    row_of_pixel = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)
+    ids_by_pixel = row_of_pixel.swapaxes(1, 2).reshape(-1).view(ids.dtype)
+    sample = np.flatnonzero(ids_by_pixel >= 0)
+    seen_faces, sample_to_seen_face = _compact(ids_by_pixel[sample], len(faces))
+    covered = _pixels_of_samples(sample, size, samples)
+    # All first corners are contiguous in memory, since they are read together,
+    # shape (3, G).
+    corners = np.ascontiguousarray(faces.take(seen_faces, axis=0).T)
+    # Shape (2, 3, G).
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
-    behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
+    # The projected corners of a face that is seen from behind are clockwise.
+    is_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         size=size,
         samples=samples,
-        pixels=torch.from_numpy(pixels),
-        coverage=torch.from_numpy(counts / samples**2),
-        faces=torch.from_numpy(visible),
-        corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
-        facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
+        pixels=torch.from_numpy(covered.pixels),
+        coverage=torch.from_numpy(covered.counts / samples**2),
+        faces=torch.from_numpy(seen_faces),
+        corners=torch.from_numpy(corners).T,
+        facing=torch.from_numpy(np.where(is_behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        pixel=torch.from_numpy(pixel),
-        face=torch.from_numpy(face),
-        sample=torch.from_numpy(hits),
+        pixel=torch.from_numpy(covered.pixel),
+        face=torch.from_numpy(sample_to_seen_face),
+        sample=torch.from_numpy(sample),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
         camera=camera,
     )
 
 
-def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(the distinct values below `count`, ascending, and where in them each value is): np.unique without a sort."""
-    values = values.astype(np.intp)  # Otherwise each of the two lookups converts them.
-    present = np.zeros(count, dtype=bool)
-    present[values] = True
-    distinct = np.flatnonzero(present)
-    place = np.empty(count, dtype=np.intp)  # only the entries of distinct values are ever touched
-    place[distinct] = np.arange(len(distinct))
-    return distinct, place.take(values)
+def _pixels_of_samples(sample: np.ndarray, size: int, samples: int) -> _CoveredSamples:
+    """Find the pixels with covered samples, from the positions of these samples (S,)."""
+    if samples == 1:
+        # A sample is a pixel.
+        return _CoveredSamples(
+            pixels=sample,
+            counts=np.ones(len(sample), dtype=np.int64),
+            pixel=np.arange(len(sample)),
+        )
+    counts_of_all = np.bincount(sample // samples**2, minlength=size**2)
+    pixels = np.flatnonzero(counts_of_all > 0)
+    counts = counts_of_all[pixels]
+    return _CoveredSamples(
+        pixels=pixels,
+        counts=counts,
+        pixel=np.repeat(np.arange(len(pixels)), counts),
+    )
 
 
-def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Blocks of samples, along the last axis of each tensor."""
-    return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
+def _compact(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the distinct values, and the index of each value among them, as np.unique does.
 
+    This takes less time than np.unique because it does not sort.
 
-def _divide(numbers: Tensor, by: int) -> tuple[Tensor, Tensor]:
-    """(quotient, remainder) of whole numbers, as floats."""
-    quotient = (numbers / by).floor()
-    return quotient, numbers - quotient * by
+    Args:
+        values: Whole numbers in [0, limit), shape (S,).
+        limit: Upper limit of the values.
+
+    Returns:
+        A tuple of
+        - the G distinct values, ascending, shape (G,);
+        - the index of each value among the distinct values, shape (S,).
+    """
+    # One conversion here replaces one in each of the two lookups below.
+    values = values.astype(np.intp)
+    is_present = np.zeros(limit, dtype=bool)
+    is_present[values] = True
+    distinct = np.flatnonzero(is_present)
+    # Entries of absent values stay undefined and are never read.
+    index_of_value = np.empty(limit, dtype=np.intp)
+    index_of_value[distinct] = np.arange(len(distinct))
+    return distinct, index_of_value.take(values)

@@ -1,20 +1,31 @@
-"""How outlines move: the derivative of an image by where surfaces lie in it, which `renderer.surface.shading` holds fixed.
+"""Gradients of images by the positions of surfaces and silhouettes in them.
 
-At a fixed place, the radiance L of an image changes as the surface there is shaded otherwise, and by −v · ∇L, as it
-moves with a velocity v in the image. Between neighboring samples i and j, ∇L is a difference, whether surface goes on
-between them or ends (Pidhorskyi et al. 2024, "Rasterized edge gradients"): where it moves by δ samples from i to j, the
-pixel of s² samples gains δ (L_i − L_j) / s². Pixels on both sides of a border gain half each.
+`renderer.surface.shading` differentiates the shading of samples and holds fixed which
+face a sample shows. This module adds the gradient that is missing there: of an
+image by where the surfaces lie in it.
 
-Where a silhouette lies between i and j, δ is the silhouette's (Li et al. 2018), not that of the surface beside it: the
-points of a ball move as it turns, its outline does not. Silhouettes are the edges whose faces all lie on one side of
-them in the image. They are cut where they cross rows and columns of samples. A line with unit normal n that moves by v
-moves by n · v / n_x along a row; with rows weighted by n_x² and columns by n_y², the pieces add up to its length.
+At a fixed position of the image, the radiance L changes by -v · ∇L as the
+surface there moves with velocity v. Between neighboring samples i and j, ∇L is
+the difference of their radiances, whether they show one surface or two
+(Pidhorskyi et al. 2024, "Rasterized edge gradients"). If the surface moves by δ
+samples from i toward j, a pixel of s² samples gains δ (L_i - L_j) / s². If i
+and j lie in two pixels, each pixel gains half of this.
 
-Light is fixed: edges of shadows and of projected patterns stay on the surface that they are on.
+If a silhouette lies between i and j, δ is the movement of the silhouette (Li et
+al. 2018), not of the surface beside it. When a ball turns, its points move but
+its silhouette does not. Silhouette edges are the edges of the mesh whose faces
+all lie on one side of them in the image. They are cut where they cross rows and
+columns of samples. A line with unit normal n that moves by v moves along a row
+by n · v / n_x. Cuts of rows have the weight n_x² and cuts of columns the weight
+n_y², so that all cuts together have the length of the line.
+
+The light is fixed: edges of shadows and of projected patterns stay on the
+surface on which they lie.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,17 +42,37 @@ from renderer.visibility.rasterizers.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-NEAR = 1e-3  # of the mesh's depth: an edge no farther behind a surface lies on it
+# A silhouette is visible if it lies behind the surface beside it by at most
+# this fraction of the depth of the mesh. It then lies on that surface.
+NEAR = 1e-3
+
+# Index of samples that show no mesh.
+NOT_COVERED = -1
+
+# Axes of the image. Neighbors in a row differ along X.
+X = 0
+Y = 1
 
 
 class Crossings(NamedTuple):
-    """K places where a silhouette runs between neighboring samples; of several between the same two, the one next to
-    the sample that sees farther, which no other hides.
+    """K places where a visible silhouette edge passes between two neighboring samples.
 
-    ends: (2, K), its vertices. fraction: (K,), of the way between them. normal: (2, K), of unit length. horizontal:
-    (K,) bool, the neighbors lie in a row; otherwise in a column. cells: (2, K), the neighbors' row-major positions
-    among all samples of the image, the left or the upper one first. samples: (2, K), the same among the covered ones,
-    or -1.
+    If several silhouettes pass between the same two samples, only the one next
+    to the sample that shows the farther surface is kept. No other silhouette
+    hides it.
+
+    Attributes:
+        ends: Vertices at both ends of each edge, shape (2, K).
+        fraction: Position of the place between the ends, from 0 to 1,
+            shape (K,).
+        normal: Unit normal of each edge in the image, x to the right and y up,
+            shape (2, K).
+        horizontal: True if the two samples are neighbors in a row, and False if
+            they are neighbors in a column, shape (K,).
+        cells: Row-major positions of the two samples among all samples of the
+            image, the left or the upper one first, shape (2, K).
+        samples: Indices of the two samples among the covered samples, or
+            NOT_COVERED, shape (2, K).
     """
 
     ends: Tensor
@@ -60,215 +91,548 @@ def moving_outlines(
     radiance: Float[Tensor, "3 S"],
     background: Float[Tensor, "3 pixels"],
 ) -> tuple[Int[Tensor, " E"], Float[Tensor, "3 P_E"]]:
-    """E pixels beside the P covered ones, into which outlines may move, and zeros to add to the linear values of these
-    P + E pixels, whose derivative by vertices, and by fields of the camera that are tensors, is that of the outlines.
+    """Return zeros whose gradient is the gradient of an image by the positions of surfaces.
 
-    radiance: linear, at the S samples. background: linear, of all pixels of the image.
+    The zeros are to be added to the linear values of the P covered pixels and
+    of E uncovered pixels into which silhouettes may move. The gradient reaches
+    the vertices, and fields of the camera that are tensors.
+
+    Args:
+        fragments: Covered samples of the view.
+        camera: Camera of the view.
+        vertices: Vertices in world axes, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        radiance: Linear radiance at the covered samples, shape (3, S).
+        background: Linear background of all pixels, shape (3, size²).
+
+    Returns:
+        A tuple of
+        - row-major indices of the E uncovered pixels, shape (E,);
+        - zeros for the P covered pixels and the E uncovered pixels,
+          shape (3, P + E).
     """
     positions, nearness = camera.homogeneous(vertices.double())
-    numbers = torch.arange(len(fragments.sample), dtype=torch.int32, device=vertices.device)
-    grid = fragments.image_of_samples(numbers, -1)
-    arrays = (tensor.detach().cpu().numpy() for tensor in (positions, nearness, faces, grid))
-    crossings = Crossings(*(part.to(grid.device) for part in _crossings(fragments.to("cpu"), *arrays)))
-    touched = torch.zeros(fragments.size**2, dtype=torch.bool, device=grid.device)
-    touched.index_fill_(0, _pixels(crossings.cells, fragments).flatten(), True)
-    beside = touched.index_fill_(0, fragments.pixels, False).nonzero().squeeze(1)
-    zeros = _Outlines.apply(positions, fragments, crossings, grid, beside, radiance.detach(), background.detach())
-    return beside, zeros
+    sample_indices = torch.arange(len(fragments.sample), dtype=torch.int32, device=vertices.device)
+    sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
+    on_cpu = _find_crossings(
+        fragments.to("cpu"),
+        _to_numpy(positions),
+        _to_numpy(nearness),
+        faces=_to_numpy(faces),
+        sample_grid=_to_numpy(sample_grid),
+    )
+    crossings = Crossings(*(values.to(sample_grid.device) for values in on_cpu))
+    is_touched = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
+    is_touched.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
+    is_touched.index_fill_(0, fragments.pixels, False)
+    uncovered_pixels = is_touched.nonzero().squeeze(1)
+    view = _MovingView(
+        fragments=fragments,
+        crossings=crossings,
+        sample_grid=sample_grid,
+        uncovered_pixels=uncovered_pixels,
+        radiance=radiance.detach(),
+        background=background.detach(),
+    )
+    return uncovered_pixels, _ZerosWithGradient.apply(positions, view)
 
 
-class _Outlines(torch.autograd.Function):
-    """Zeros (3, P + E) of homogeneous positions (V, 3)."""
+def _to_numpy(tensor: Tensor) -> np.ndarray:
+    """Return the values of a tensor as a NumPy array."""
+    return tensor.detach().cpu().numpy()
+
+
+class _ZerosWithGradient(torch.autograd.Function):
+    """Zeros (3, P + E) with a gradient by the homogeneous positions (V, 3) of the vertices."""
 
     @staticmethod
-    def forward(ctx: Any, positions: Tensor, fragments: Fragments, *others: Tensor) -> Tensor:
+    def forward(ctx: Any, positions: Tensor, view: _MovingView) -> Tensor:
+        """Return zeros and store what the gradient needs.
+
+        Args:
+            ctx: Context of autograd.
+            positions: Homogeneous positions (x w, y w, w) of the vertices in
+                the image, shape (V, 3).
+            view: View whose gradient `backward` computes.
+
+        Returns:
+            Zeros, shape (3, P + E).
+        """
         ctx.save_for_backward(positions)
-        ctx.view = fragments, *others
-        return others[3].new_zeros(3, len(fragments.pixels) + len(others[2]))
+        ctx.view = view
+        pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
+        return view.radiance.new_zeros(3, pixel_count)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        """Compute the gradient by the homogeneous positions.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the linear values of the pixels,
+                shape (3, P + E).
+
+        Returns:
+            Gradient, shape (V, 3), and None for the view.
+        """
         (positions,) = ctx.saved_tensors
-        fragments, crossings, grid, beside, radiance, background = ctx.view
-        upstream = upstream * (fragments.size / 4 / fragments.samples)  # from half the image's width to samples' areas
-        gradient = _by_surface(positions, fragments, crossings, grid, radiance, upstream)
-        ends, by_ends = _by_silhouettes(positions, fragments, crossings, beside, radiance, background, upstream)
-        return gradient.index_add_(0, ends, by_ends), None, None, None, None, None, None
+        view: _MovingView = ctx.view
+        # A length of 2 is the width of the image, which has size · s samples.
+        # A sample has 1 / s² of the area of its pixel.
+        upstream = upstream * (view.fragments.size / 4 / view.fragments.samples)
+        gradient = view.gradient_by_surface(positions, upstream)
+        ends, gradient_by_ends = view.gradient_by_silhouettes(positions, upstream)
+        return gradient.index_add_(0, ends, gradient_by_ends), None
 
 
-def _by_surface(
-    positions: Tensor, fragments: Fragments, crossings: Crossings, grid: Tensor, radiance: Tensor, upstream: Tensor
-) -> Tensor:
-    """(V, 3) the gradient by surface that goes on from one sample to the next: both move with it."""
-    upstream = upstream.index_select(1, fragments.pixel)
-    level = fragments.image_of_samples((radiance * upstream).sum(0), torch.nan)
-    right, down = (_forces_along(dim, fragments, crossings, grid, level, radiance, upstream) for dim in (1, 0))
-    moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
-    part = fragments.select(moving)
-    forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
-    if fragments.depths is not None:
-        depth = part.interpolate(positions[:, 2:][part.corners])
-        forces = _homogeneous(forces, part.positions(), depth)
-    by_corners = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
-    gradient = positions.new_zeros(positions.shape[::-1])
-    gradient[: forces.shape[1]].index_add_(1, part.corners.T.flatten(), by_corners)
-    return gradient.T
+@dataclass(frozen=True)
+class _MovingView:
+    """View whose image is differentiated by the positions of surfaces.
 
+    Attributes:
+        fragments: The S covered samples in P pixels.
+        crossings: Places where silhouettes pass between samples.
+        sample_grid: Index of the covered sample at each sample of the image,
+            or NOT_COVERED, shape (size · s, size · s).
+        uncovered_pixels: Row-major indices of the E other pixels whose values
+            change, shape (E,).
+        radiance: Linear radiance at the covered samples, shape (3, S).
+        background: Linear background of all pixels, shape (3, size²).
+    """
 
-def _forces_along(
-    dim: int,
-    fragments: Fragments,
-    crossings: Crossings,
-    grid: Tensor,
-    level: Tensor,
-    radiance: Tensor,
-    upstream: Tensor,
-) -> Tensor:
-    """(S,) the gradient by the places of samples along columns (dim 0) or rows (dim 1) of all samples of the image.
+    fragments: Fragments
+    crossings: Crossings
+    sample_grid: Tensor
+    uncovered_pixels: Tensor
+    radiance: Tensor
+    background: Tensor
 
-    level: radiance times upstream gradient, (3, S) both, as an image of samples, NaN where nothing is covered."""
-    samples, steps = fragments.samples, len(grid) - 1
-    jump = torch.zeros_like(level)  # from a sample to the next one
-    torch.sub(level.narrow(dim, 0, steps), level.narrow(dim, 1, steps), out=jump.narrow(dim, 0, steps))
-    jump.nan_to_num_(0)  # one of them is background
-    # The upstream gradient differs between the two pixels of neighbors across a border.
-    borders = slice(samples - 1, -1, samples), slice(samples, None, samples)
-    before, after = ((border, slice(None)) if dim == 0 else (slice(None), border) for border in borders)
-    covered = (grid[before] >= 0) & (grid[after] >= 0)
-    first, second = grid[before][covered], grid[after][covered]
-    both = upstream.index_select(1, first) + upstream.index_select(1, second)
-    difference = radiance.index_select(1, first) - radiance.index_select(1, second)
-    jump[before].masked_scatter_(covered, (difference * both).sum(0) / 2)
-    jump.view(-1).index_fill_(0, crossings.cells[0, crossings.horizontal == (dim == 1)], 0)
-    force = jump.clone()  # half of the jump times the upstream gradients of both
-    force.narrow(dim, 1, steps).add_(jump.narrow(dim, 0, steps))
-    return fragments.of_image(force)
+    def gradient_by_surface(self, positions: Tensor, upstream: Tensor) -> Tensor:
+        """Compute the gradient by the positions of surfaces, without silhouettes.
 
+        A force is the gradient by the position of a sample in the image.
 
-def _by_silhouettes(
-    positions: Tensor,
-    fragments: Fragments,
-    crossings: Crossings,
-    beside: Tensor,
-    radiance: Tensor,
-    background: Tensor,
-    upstream: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """(2 K) vertices of silhouettes, and the gradient by them (2 K, 3)."""
-    pixels = _pixels(crossings.cells, fragments)
-    slots = torch.full((fragments.size**2,), -1, device=pixels.device)
-    slots[torch.cat([fragments.pixels, beside])] = torch.arange(upstream.shape[1], device=pixels.device)
-    force = radiance.new_zeros(pixels.shape[1])
-    for pixel in pixels:  # of either neighbor, whose background is seen where nothing covers it
-        first, second = (
-            torch.where(samples >= 0, radiance[:, samples], background[:, pixel]) for samples in crossings.samples
+        Args:
+            positions: Homogeneous positions of the vertices, shape (V, 3).
+            upstream: Gradient by the linear values of pixels, shape (3, P + E).
+
+        Returns:
+            Gradient by the homogeneous positions, shape (V, 3).
+        """
+        fragments = self.fragments
+        at_samples = upstream.index_select(1, fragments.pixel)
+        weighted = (self.radiance * at_samples).sum(0)
+        weighted_image = fragments.image_of_samples(weighted, torch.nan)
+        right = self._forces_along(X, weighted_image, at_samples)
+        down = self._forces_along(Y, weighted_image, at_samples)
+        # Most samples have neighbors of the same color, and therefore no force.
+        moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
+        part = fragments.select(moving)
+        forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
+        if fragments.depths is not None:
+            depth = part.interpolate(positions[:, 2:][part.corners])
+            forces = _by_homogeneous(forces, part.positions(), depth)
+        # Shape (2 or 3, 3 G), for the coordinates and the corners of seen faces.
+        by_corners = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
+        gradient = positions.new_zeros(positions.shape[::-1])
+        gradient[: forces.shape[1]].index_add_(1, part.corners.T.flatten(), by_corners)
+        return gradient.T
+
+    def _forces_along(self, axis: int, weighted_image: Tensor, at_samples: Tensor) -> Tensor:
+        """Compute the gradient by the positions of samples along one axis of the image.
+
+        Args:
+            axis: X for movements to the right, or Y for movements down.
+            weighted_image: Radiance times upstream gradient, summed over
+                channels, as an image of samples, NaN for samples that show no
+                mesh, shape (size · s, size · s).
+            at_samples: Upstream gradient at the covered samples, shape (3, S).
+
+        Returns:
+            Gradient by the position of each covered sample, shape (S,).
+        """
+        dim = 1 - axis
+        steps = len(self.sample_grid) - 1
+        # Difference of each sample and the next one along the axis.
+        jump = torch.zeros_like(weighted_image)
+        torch.sub(
+            weighted_image.narrow(dim, 0, steps),
+            weighted_image.narrow(dim, 1, steps),
+            out=jump.narrow(dim, 0, steps),
         )
-        force += (upstream[:, slots[pixel]] * (first - second)).sum(0)
-    along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])  # rows run down
-    forces = (force * along * crossings.normal).T
-    gradients = []
-    for ends, weight in zip(crossings.ends, (1 - crossings.fraction, crossings.fraction), strict=True):
-        x, y, depth = positions[ends].T
-        place = torch.stack([x / depth, y / depth], dim=1)
-        gradients.append(_homogeneous(forces * weight[:, None], place, depth[:, None]))
-    return crossings.ends.flatten(), torch.cat(gradients)
+        # The difference is NaN if one of the two samples shows no mesh.
+        jump.nan_to_num_(0)
+        self._correct_borders(dim, jump, at_samples)
+        # Silhouettes have a gradient of their own.
+        is_along_axis = self.crossings.horizontal == (axis == X)
+        jump.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
+        # Each sample gets the jumps to both of its neighbors.
+        force = jump.clone()
+        force.narrow(dim, 1, steps).add_(jump.narrow(dim, 0, steps))
+        return self.fragments.of_image(force)
+
+    def _correct_borders(self, dim: int, jump: Tensor, at_samples: Tensor) -> None:
+        """Replace the jumps across borders of pixels in place.
+
+        The upstream gradient differs between the two pixels. The difference of
+        the radiances is multiplied by the mean of both.
+        """
+        samples = self.fragments.samples
+        before: Any = (slice(None), slice(samples - 1, -1, samples))
+        after: Any = (slice(None), slice(samples, None, samples))
+        if dim == 0:
+            before = before[::-1]
+            after = after[::-1]
+        grid = self.sample_grid
+        is_covered = (grid[before] >= 0) & (grid[after] >= 0)
+        first = grid[before][is_covered]
+        second = grid[after][is_covered]
+        both = at_samples.index_select(1, first) + at_samples.index_select(1, second)
+        difference = self.radiance.index_select(1, first) - self.radiance.index_select(1, second)
+        jump[before].masked_scatter_(is_covered, (difference * both).sum(0) / 2)
+
+    def gradient_by_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the gradient by the positions of the ends of silhouette edges.
+
+        A force is the gradient by the position of an edge in the image.
+
+        Args:
+            positions: Homogeneous positions of the vertices, shape (V, 3).
+            upstream: Gradient by the linear values of pixels, shape (3, P + E).
+
+        Returns:
+            A tuple of
+            - the vertices at the ends of the K edges, shape (2 K,);
+            - the gradient by their homogeneous positions, shape (2 K, 3).
+        """
+        crossings = self.crossings
+        # Image rows run down.
+        along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
+        forces = (self._silhouette_forces(upstream) * along * crossings.normal).T
+        weights = (1 - crossings.fraction, crossings.fraction)
+        gradients = []
+        for ends, weight in zip(crossings.ends, weights, strict=True):
+            x, y, depth = positions[ends].T
+            place = torch.stack([x / depth, y / depth], dim=1)
+            gradients.append(_by_homogeneous(forces * weight[:, None], place, depth[:, None]))
+        return crossings.ends.flatten(), torch.cat(gradients)
+
+    def _silhouette_forces(self, upstream: Tensor) -> Tensor:
+        """Compute the gradient by the movement of silhouettes across samples, shape (K,)."""
+        pixels = _pixels_of_cells(self.crossings.cells, self.fragments)
+        # Column in `upstream` of each pixel of the image, or -1.
+        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=pixels.device)
+        changed_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
+        column_of_pixel[changed_pixels] = torch.arange(upstream.shape[1], device=pixels.device)
+        force = self.radiance.new_zeros(pixels.shape[1])
+        first_samples, second_samples = self.crossings.samples
+        # The two samples may lie in two pixels, which gain half each.
+        for pixels_of_side in pixels:
+            first = self._seen_radiance(first_samples, pixels_of_side)
+            second = self._seen_radiance(second_samples, pixels_of_side)
+            gradient = upstream[:, column_of_pixel[pixels_of_side]]
+            force += (gradient * (first - second)).sum(0)
+        return force
+
+    def _seen_radiance(self, samples: Tensor, pixels: Tensor) -> Tensor:
+        """Return the radiance at K samples, or the background of K pixels if they show no mesh."""
+        return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
-def _homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
-    """(N, 3) gradients by (x w, y w, w) of those (N, 2) by places (x, y) in the image; depth: w (N, 1)."""
+def _by_homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
+    """Convert gradients by positions in the image to gradients by homogeneous positions.
+
+    Args:
+        forces: Gradients by the positions (x, y), shape (N, 2).
+        places: Positions (x, y) in the image, shape (N, 2).
+        depth: Third homogeneous coordinate w, shape (N, 1).
+
+    Returns:
+        Gradients by (x w, y w, w), shape (N, 3).
+    """
     return torch.cat([forces, -(forces * places).sum(1, keepdim=True)], dim=1) / depth
 
 
-def _pixels(cells: Tensor, fragments: Fragments) -> Tensor:
-    """The pixels that samples at row-major positions lie in."""
-    resolution = fragments.size * fragments.samples
-    return cells // resolution // fragments.samples * fragments.size + cells % resolution // fragments.samples
+def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
+    """Return the row-major indices of the pixels that hold samples at row-major positions."""
+    samples = fragments.samples
+    resolution = fragments.size * samples
+    row = cells // resolution // samples
+    column = cells % resolution // samples
+    return row * fragments.size + column
 
 
-def _crossings(
-    fragments: Fragments, positions: np.ndarray, nearness: np.ndarray, faces: np.ndarray, grid: np.ndarray
+def _find_crossings(
+    fragments: Fragments,
+    positions: np.ndarray,
+    nearness: np.ndarray,
+    faces: np.ndarray,
+    sample_grid: np.ndarray,
 ) -> Crossings:
-    """Where silhouettes are seen; they hide where both samples beside them are of nearer surfaces."""
-    resolution = len(grid)
+    """Find where visible silhouettes pass between neighboring samples.
+
+    Args:
+        fragments: Covered samples, with tensors on the CPU.
+        positions: Homogeneous positions of the vertices, shape (V, 3).
+        nearness: Nearness of the vertices to the camera, which is linear in the
+            image, shape (V,).
+        faces: Vertex indices of all faces, shape (F, 3).
+        sample_grid: Index of the covered sample at each sample of the image, or
+            NOT_COVERED, shape (size · s, size · s).
+
+    Returns:
+        Crossings in rows, and then in columns.
+    """
     x, y, w = positions.T
-    places = to_fixed_point(np.stack([x / w, y / w, nearness]).T, resolution)[0] / SUBSAMPLES
-    ends = _silhouettes(places, faces)[:, : None if len(fragments.face) else 0]  # a mesh outside the image has none
-    start, end = places[:, ends[0]], places[:, ends[1]]
-    normal = np.stack([end[1] - start[1], end[0] - start[0]])  # in an image whose y runs up
+    points = np.stack([x / w, y / w, nearness]).T
+    # Positions in units of samples, x to the right and y down, shape (2, V).
+    places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
+    ends = _silhouette_edges(places, faces)
+    if len(fragments.face) == 0:
+        # A mesh outside the image has no visible silhouettes.
+        ends = ends[:, :0]
+    start = places[:, ends[0]]
+    end = places[:, ends[1]]
+    # The normal is in an image whose y-axis points up.
+    normal = np.stack([end[1] - start[1], end[0] - start[0]])
     normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
-    tolerance = NEAR * np.ptp(nearness)
-    parts = []
-    for axis, step in enumerate((1, resolution)):
-        edge, line, fraction, after = _cut(start[1 - axis], end[1 - axis], start[axis], end[axis], resolution)
-        after = line * resolution + after if axis == 0 else after * resolution + line
-        cells = np.stack([after - step, after])
-        samples = grid.ravel()[cells].astype(np.int64)
-        first, second = nearness[ends[:, edge]]
-        near = first + fraction * (second - first)
-        place = start[:, edge] + fraction * (end - start)[:, edge]
-        beside = _plane_nearness(fragments, places, nearness, samples, place)
-        seen = np.flatnonzero((samples >= 0).any(axis=0) & (near >= beside.min(axis=0) - tolerance))
-        onward = np.where(beside[0] < beside[1], 1, -1) * place[axis]  # away from the farther sample
-        seen = seen[np.lexsort([onward[seen], after[seen]])]
-        seen = seen[np.diff(after[seen], prepend=-1) != 0]  # one between the same two samples
-        horizontal = np.full(len(seen), axis == 0)
-        parts.append(
-            (ends[:, edge[seen]], fraction[seen], normal[:, edge[seen]], horizontal, cells[:, seen], samples[:, seen])
+    silhouettes = _Silhouettes(fragments, places, nearness, sample_grid, ends, normal)
+    in_rows = silhouettes.crossings_along(X)
+    in_columns = silhouettes.crossings_along(Y)
+    joined = [np.concatenate(pair, axis=-1) for pair in zip(in_rows, in_columns, strict=True)]
+    return Crossings(*map(torch.from_numpy, joined))
+
+
+@dataclass(frozen=True)
+class _Silhouettes:
+    """N silhouette edges of a view.
+
+    Attributes:
+        fragments: Covered samples, with tensors on the CPU.
+        places: Positions of the vertices in units of samples, x to the right
+            and y down, shape (2, V).
+        nearness: Nearness of the vertices to the camera, shape (V,).
+        sample_grid: Index of the covered sample at each sample of the image, or
+            NOT_COVERED, shape (size · s, size · s).
+        ends: Vertices at both ends of each edge, shape (2, N).
+        normal: Unit normal of each edge in the image, shape (2, N).
+    """
+
+    fragments: Fragments
+    places: np.ndarray
+    nearness: np.ndarray
+    sample_grid: np.ndarray
+    ends: np.ndarray
+    normal: np.ndarray
+
+    def crossings_along(self, axis: int) -> tuple[np.ndarray, ...]:
+        """Find visible crossings between samples that are neighbors along an axis.
+
+        Args:
+            axis: X for neighbors in a row, and Y for neighbors in a column.
+
+        Returns:
+            Arrays for the attributes of `Crossings`, in their order.
+        """
+        resolution = len(self.sample_grid)
+        start = self.places[:, self.ends[0]]
+        end = self.places[:, self.ends[1]]
+        cuts = _cut(start[1 - axis], end[1 - axis], start[axis], end[axis], resolution)
+        edge = cuts.edge
+        # Row-major positions of the samples after and before each cut.
+        if axis == X:
+            after = cuts.line * resolution + cuts.next_sample
+            before = after - 1
+        else:
+            after = cuts.next_sample * resolution + cuts.line
+            before = after - resolution
+        cells = np.stack([before, after])
+        samples = self.sample_grid.ravel()[cells].astype(np.int64)
+        place = start[:, edge] + cuts.fraction * (end - start)[:, edge]
+        surface_nearness = self._surface_nearness(samples, place)
+        is_visible = self._is_visible(cuts, samples, surface_nearness)
+        # This coordinate grows with the distance from the farther sample.
+        from_farther = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
+        kept = np.flatnonzero(is_visible)
+        kept = kept[np.lexsort([from_farther[kept], after[kept]])]
+        # If several cuts lie between the same two samples, the first one is kept.
+        kept = kept[np.diff(after[kept], prepend=-1) != 0]
+        return (
+            self.ends[:, edge[kept]],
+            cuts.fraction[kept],
+            self.normal[:, edge[kept]],
+            np.full(len(kept), axis == X),
+            cells[:, kept],
+            samples[:, kept],
         )
-    return Crossings(*(torch.from_numpy(np.concatenate(both, axis=-1)) for both in zip(*parts, strict=True)))
+
+    def _is_visible(
+        self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray
+    ) -> np.ndarray:
+        """Tell which cuts are visible.
+
+        A cut is hidden if the surfaces at both samples beside it are nearer.
+
+        Args:
+            cuts: K cuts of the silhouette edges.
+            samples: Covered samples beside each cut, shape (2, K).
+            surface_nearness: Nearness of their surfaces at the cut,
+                shape (2, K).
+
+        Returns:
+            True for visible cuts, shape (K,).
+        """
+        tolerance = NEAR * np.ptp(self.nearness)
+        start_nearness, end_nearness = self.nearness[self.ends[:, cuts.edge]]
+        edge_nearness = start_nearness + cuts.fraction * (end_nearness - start_nearness)
+        is_in_front = edge_nearness >= surface_nearness.min(axis=0) - tolerance
+        return (samples >= 0).any(axis=0) & is_in_front
+
+    def _surface_nearness(self, samples: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Compute the nearness of the planes of faces at places in the image.
+
+        Args:
+            samples: Covered samples that show the faces, or NOT_COVERED,
+                shape (2, K).
+            place: Positions at which the planes are evaluated, in units of
+                samples, shape (2, K).
+
+        Returns:
+            Nearness, shape (2, K). It is minus infinity for NOT_COVERED.
+        """
+        sample_to_seen_face = self.fragments.face.numpy()
+        corners = self.fragments.corners.numpy()[sample_to_seen_face[samples]]
+        nearness_of_corners = self.nearness[corners]
+        (ax, bx, cx), (ay, by, cy) = np.moveaxis(self.places[:, corners], 3, 1)
+        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+        # Faces without area get the nearness of their first corner.
+        area = np.where(area == 0, np.inf, area)
+        # Barycentric weights of the corners b and c.
+        weight_b = ((place[0] - ax) * (cy - ay) - (place[1] - ay) * (cx - ax)) / area
+        weight_c = ((bx - ax) * (place[1] - ay) - (by - ay) * (place[0] - ax)) / area
+        nearness_a = nearness_of_corners[..., 0]
+        difference_b = nearness_of_corners[..., 1] - nearness_a
+        difference_c = nearness_of_corners[..., 2] - nearness_a
+        plane = nearness_a + weight_b * difference_b + weight_c * difference_c
+        return np.where(samples >= 0, plane, -np.inf)
+
+
+class _Cuts(NamedTuple):
+    """K places where edges cross rows of samples, or columns of samples.
+
+    A line stands for a row or a column.
+
+    Attributes:
+        edge: Index of the edge, shape (K,).
+        line: Index of the line, shape (K,).
+        fraction: Position between start and end of the edge, from 0 to 1,
+            shape (K,).
+        next_sample: Index in the line of the first sample at or after the
+            place, shape (K,).
+    """
+
+    edge: np.ndarray
+    line: np.ndarray
+    fraction: np.ndarray
+    next_sample: np.ndarray
 
 
 def _cut(
     start: np.ndarray, end: np.ndarray, across: np.ndarray, end_across: np.ndarray, resolution: int
-) -> tuple[np.ndarray, ...]:
-    """Cut N edges at each line of samples between their starts and ends: (edge (K,), line (K,), the fraction of the way
-    along the edge (K,), the first sample of the line at or after it (K,)), where there are samples before it, too."""
-    first, last = (
-        np.ceil(limit).clip(0, resolution).astype(np.int64)
-        for limit in (np.minimum(start, end), np.maximum(start, end))
-    )
+) -> _Cuts:
+    """Cut edges at each line of samples between their starts and ends.
+
+    Cuts before the first sample or after the last sample of a line are left
+    out. All coordinates are in units of samples.
+
+    Args:
+        start: Coordinate of the start of N edges across the lines, shape (N,).
+        end: Coordinate of their ends across the lines, shape (N,).
+        across: Coordinate of their starts along the lines, shape (N,).
+        end_across: Coordinate of their ends along the lines, shape (N,).
+        resolution: Number of lines, and of samples in a line.
+
+    Returns:
+        Cuts in ascending order of the edge and then of the line.
+    """
+    first = np.ceil(np.minimum(start, end)).clip(0, resolution).astype(np.int64)
+    last = np.ceil(np.maximum(start, end)).clip(0, resolution).astype(np.int64)
     counts = last - first
     edge = np.repeat(np.arange(len(start)), counts)
-    line = np.arange(len(edge)) - (np.cumsum(counts) - counts - first)[edge]
+    cuts_before_edge = np.cumsum(counts) - counts
+    line = np.arange(len(edge)) - (cuts_before_edge - first)[edge]
     fraction = (line - start[edge]) / (end - start)[edge]
-    after = np.ceil(across[edge] + fraction * (end_across - across)[edge]).astype(np.int64)
-    inside = (after > 0) & (after < resolution)
-    return edge[inside], line[inside], fraction[inside], after[inside]
+    position = across[edge] + fraction * (end_across - across)[edge]
+    next_sample = np.ceil(position).astype(np.int64)
+    is_inside = (next_sample > 0) & (next_sample < resolution)
+    return _Cuts(
+        edge=edge[is_inside],
+        line=line[is_inside],
+        fraction=fraction[is_inside],
+        next_sample=next_sample[is_inside],
+    )
 
 
-def _plane_nearness(
-    fragments: Fragments, places: np.ndarray, nearness: np.ndarray, samples: np.ndarray, at: np.ndarray
-) -> np.ndarray:
-    """(2, K) of the planes of the faces that samples (2, K) see, at (2, K); of background, minus infinity."""
-    corners = fragments.corners.numpy()[fragments.face.numpy()[samples]]
-    near = nearness[corners]
-    (ax, bx, cx), (ay, by, cy) = np.moveaxis(places[:, corners], 3, 1)
-    area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-    area = np.where(area == 0, np.inf, area)
-    to_b = ((at[0] - ax) * (cy - ay) - (at[1] - ay) * (cx - ax)) / area
-    to_c = ((bx - ax) * (at[1] - ay) - (by - ay) * (at[0] - ax)) / area
-    plane = near[..., 0] + to_b * (near[..., 1] - near[..., 0]) + to_c * (near[..., 2] - near[..., 0])
-    return np.where(samples >= 0, plane, -np.inf)
+def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Find the edges whose faces all lie on one side of them in the image.
+
+    Args:
+        places: Positions of the vertices in the image, shape (2, V).
+        faces: Vertex indices of the faces, shape (F, 3).
+
+    Returns:
+        Vertices at both ends of the N silhouette edges, shape (2, N).
+    """
+    edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
+    (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
+    orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
+    # A face lies to the left (+1) or to the right (-1) of its sides.
+    sides = (orientation * edges.direction).ravel()
+    sum_of_sides = np.bincount(edges.edge_of_side, sides, len(edges.face_count))
+    # A face that is seen edge-on is on neither side. One of two faces may be.
+    is_silhouette = np.abs(sum_of_sides) > edges.face_count - 2
+    return edges.ends.take(np.flatnonzero(is_silhouette), axis=1)
 
 
-def _silhouettes(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(2, N) the vertices of the edges whose faces all lie on one side of them; places: (2, V)."""
-    corners, ends, edge, forth, count = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
-    (ax, bx, cx), (ay, by, cy) = places.take(corners, axis=1)
-    turn = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    sides = np.bincount(edge, (turn * forth).ravel(), len(count))
-    return ends.take(np.flatnonzero(np.abs(sides) > count - 2), axis=1)  # of two faces, one may be seen edge-on
+class _Edges(NamedTuple):
+    """N edges of a mesh of F faces.
+
+    Attributes:
+        corners: Vertices of the faces, shape (3, F).
+        ends: Vertices at both ends of each edge, the lower index first,
+            shape (2, N).
+        edge_of_side: Edge of each of the three sides of the faces,
+            shape (3 F,).
+        direction: 1 for sides that lead to the vertex with the higher index,
+            and -1 for the others, shape (3, F).
+        face_count: Number of faces at each edge, shape (N,).
+    """
+
+    corners: np.ndarray
+    ends: np.ndarray
+    edge_of_side: np.ndarray
+    direction: np.ndarray
+    face_count: np.ndarray
 
 
 @lru_cache(maxsize=4)
-def _edges(faces: bytes) -> tuple[np.ndarray, ...]:
-    """Of faces (F, 3) of int64: their corners (3, F), the ends (2, N) of their edges, the edge of each side (3 F,), ±1
-    by its direction (3, F), and how many faces an edge has (N,)."""
+def _edges(faces: bytes) -> _Edges:
+    """Find the edges of faces (F, 3), given as the bytes of int64 numbers so that they hash."""
     corners = np.ascontiguousarray(np.frombuffer(faces, dtype=np.int64).reshape(-1, 3).T)
+    # Shape (3, F), for the first and the second vertex of the three sides.
     first, second = corners.take(EDGES, axis=0).swapaxes(0, 1)
-    low, high = np.minimum(first, second).ravel(), np.maximum(first, second).ravel()
-    vertices = int(high.max()) + 1
-    keys, edge, count = np.unique(low * vertices + high, return_inverse=True, return_counts=True)
-    forth = np.where(first < second, 1.0, -1.0)
-    return corners, np.stack(np.divmod(keys, vertices)), edge.ravel(), forth, count
+    low = np.minimum(first, second).ravel()
+    high = np.maximum(first, second).ravel()
+    vertex_count = int(high.max()) + 1
+    # np.unique sorts one number per side faster than a pair of vertices.
+    keys, edge_of_side, face_count = np.unique(
+        low * vertex_count + high, return_inverse=True, return_counts=True
+    )
+    return _Edges(
+        corners=corners,
+        ends=np.stack(np.divmod(keys, vertex_count)),
+        edge_of_side=edge_of_side.ravel(),
+        direction=np.where(first < second, 1.0, -1.0),
+        face_count=face_count,
+    )

@@ -1,18 +1,31 @@
-"""Which face covers each sample: by OpenGL, NumPy or numba, under one contract.
+"""Rasterizers: OpenGL, NumPy and numba find the face that each sample of an image shows.
 
-rasterize(points, faces, resolution, closed) -> ids
+Each module of this package has a function
 
-points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
-            a square image; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
-faces       (F, 3) integer; drawn from both sides unless closed
-resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
-closed      promises a watertight mesh within the range of depths, its faces counter-clockwise seen from outside, and
-            leaves out the faces that wind clockwise in the image: the same samples are covered, with the same ids
-            except where a face turned away is as near as the nearest within rounding, as along outlines
-ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
+    rasterize(points, faces, resolution, closed) -> ids
 
-All snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once. NumPy and numba agree to the
-bit; OpenGL rounds depths otherwise.
+with these arguments:
+
+- points: The V vertices as N views project them, float64, shape (N, V, 3). The
+  image is [-1, 1] in x (to the right) and y (up). The third coordinate is the
+  depth, which is smaller for nearer points. Surfaces outside the depths [-1, 1)
+  are clipped.
+- faces: Vertex indices of the faces, shape (F, 3).
+- resolution: Number R of samples per side of an image. The sample in row i and
+  column j lies at x = (2 j + 1) / R - 1 and y = 1 - (2 i + 1) / R.
+- closed: False draws faces from both sides. True promises that the mesh is
+  watertight, that it lies within the range of depths, and that its faces are
+  counter-clockwise seen from outside. Faces that are clockwise in the image are
+  then left out. The same samples are covered. Their ids only differ at samples
+  where a face that is seen from behind is as near as the nearest face within
+  rounding, as along silhouettes.
+
+The result holds the index of the nearest face at each sample, or -1, int32,
+shape (N, R, R). Row 0 is at the top. If depths are equal, the lower index wins.
+
+All rasterizers round vertices to 1/256 of a sample, so faces that share an edge
+cover each sample once. The results of NumPy and numba are equal. OpenGL rounds
+depths differently.
 """
 
 from dataclasses import dataclass
@@ -24,44 +37,81 @@ from renderer.errors import InputError, require_choice
 from renderer.settings import RASTERIZERS
 from renderer.visibility.rasterizers import opengl
 
-SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
+# Points are clipped to this number of samples from the center of the image, so
+# that products of fixed-point coordinates fit in int64.
+SPAN = 2**21
 
 
 @dataclass(frozen=True)
 class Rasterizer:
-    """One way to rasterize. `name` is its module, `description` names it, and the device, for the line logged at the
-    start."""
+    """One of the rasterizers of this package.
+
+    Attributes:
+        name: Name of its module in this package.
+        description: Name with the version or the device, for log lines.
+    """
 
     name: str
     description: str
 
-    def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
-        """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
-        low, high = points.min(initial=0), points.max(initial=0)
-        if not (np.isfinite(low) and np.isfinite(high)):
-            raise ValueError("points hold NaN or infinity")
+    def rasterize(
+        self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False
+    ) -> np.ndarray:
+        """Find the nearest face at each sample of N images.
+
+        The module docstring of `renderer.visibility.rasterizers` describes the arguments in
+        detail.
+
+        Args:
+            points: Projected vertices, float64, shape (N, V, 3).
+            faces: Vertex indices of the faces, shape (F, 3).
+            resolution: Number R of samples per side.
+            closed: Whether the mesh is watertight, so that faces that are seen
+                from behind are left out.
+
+        Returns:
+            Index of the face at each sample, or -1, int32, shape (N, R, R).
+
+        Raises:
+            ValueError: If a point is NaN or infinite.
+        """
+        lowest = points.min(initial=0)
+        highest = points.max(initial=0)
+        if not (np.isfinite(lowest) and np.isfinite(highest)):
+            raise ValueError("points holds NaN or infinity, but must be finite")
         limit = SPAN / resolution
-        if max(-low, high) > limit:
+        if max(-lowest, highest) > limit:
             points = np.clip(points, -limit, limit)
         module = import_module(f"renderer.visibility.rasterizers.{self.name}")
         return module.rasterize(points, faces, resolution, closed)
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
-    """Settle on a rasterizer, once at the start.
+    """Choose a rasterizer that works on this machine.
 
-    "auto" takes numba where it is installed, else numpy, so that images are the same on every machine. InputError: an
-    unknown name, "opengl" on a machine that cannot, or "numba" without numba.
+    Args:
+        rasterizer: Name of the rasterizer. "auto" chooses numba if it is
+            installed, and numpy otherwise. Images are then the same on every
+            machine.
+
+    Returns:
+        The rasterizer.
+
+    Raises:
+        InputError: If the name is unknown, if "opengl" does not work on this
+            machine, or if "numba" is not installed.
     """
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
         return Rasterizer("opengl", f"opengl ({opengl.device()})")
-    if rasterizer != "numpy":
-        try:
-            from renderer.visibility.rasterizers import numba  # takes half a second to import
+    if rasterizer == "numpy":
+        return Rasterizer("numpy", "numpy")
+    try:
+        # This import takes half a second.
+        from renderer.visibility.rasterizers import numba
 
-            return Rasterizer("numba", f"numba ({numba.VERSION})")
-        except InputError:
-            if rasterizer == "numba":
-                raise
-    return Rasterizer("numpy", "numpy" if rasterizer == "numpy" else "numpy (numba is faster: pip install numba)")
+        return Rasterizer("numba", f"numba ({numba.VERSION})")
+    except InputError:
+        if rasterizer == "numba":
+            raise
+    return Rasterizer("numpy", "numpy (numba is faster: pip install numba)")

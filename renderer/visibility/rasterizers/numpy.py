@@ -1,70 +1,131 @@
-"""The NumPy rasterizer: fixed-point corners and exact integer arithmetic, as GPUs have them.
+"""NumPy rasterizer with fixed-point corners and exact integer arithmetic, as GPUs have.
 
-Corners (x, y) are integers in 1/256 of a sample. In the row y = 256 r, an edge from (x₀, y₀) to (x₁, y₁) begins at the
-column ⌈(x₀ + (y − y₀) (x₁ − x₀) / (y₁ − y₀)) / 256⌉, an exact quotient of integers, which both faces of the edge share:
-so each sample belongs to one of them (the top-left rule). Between its two columns in a row, a face covers a run of
-samples. Depth is the plane z = z_a + (x − x_a) ∂z/∂x + (y − y_a) ∂z/∂y, rounded to 24 bits, and the image is the least
-key of each sample,
+Corners (x, y) are integers in 1/256 of a sample. In the row y = 256 r, an edge
+from (x₀, y₀) to (x₁, y₁) begins at the column
 
-    key = depth · 2³² + face,
+    ⌈(x₀ + (y - y₀) (x₁ - x₀) / (y₁ - y₀)) / 256⌉.
 
-whose lower half is the id: the nearest face, and of equal depths the one with the lower index. Only covered samples are
-computed: faces are cut into rows, and rows into samples, in blocks that stay in the cache. The longest axis is the last
-of every array.
+This quotient of integers is exact, and both faces of the edge share it. Each
+sample therefore belongs to one of the two faces (the top-left rule). In a row,
+a face covers the samples between its two columns. The depth of a face is the
+plane z = z_a + (x - x_a) ∂z/∂x + (y - y_a) ∂z/∂y, rounded to 24 bits. Each
+sample keeps the smallest of its keys,
+
+    key = depth · 2³² + face.
+
+The lower half of the key is then the nearest face, and the one with the lower
+index if depths are equal.
+
+Only covered samples are computed: triangles are split into rows, and rows into
+samples. This happens in blocks that stay in the cache of the processor. The
+longest axis is the last axis of every array. An array of triangles has shape
+(2, 3, T), for x and y, three corners and T triangles.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
+# Corners are rounded to multiples of 1 / SUBSAMPLES of a sample.
 SUBSAMPLE_BITS = 8
-SUBSAMPLES = 2**SUBSAMPLE_BITS  # corners snap to this fraction of a sample
-FAR = 2**24 - 1  # depth is a 24-bit key, and surface at the far plane itself is not drawn
-FACE_BITS = 32  # a sample's key is its depth above so many bits of face index, so the least key wins
-EMPTY = (FAR << FACE_BITS) - 1  # less than any key at the far plane; its face index reads -1
-FACES, PARTS = 2**14, 2**13  # faces, and their rows or samples, at a time: what they take stays in the cache
+SUBSAMPLES = 2**SUBSAMPLE_BITS
+# Depth of the far plane, with 24 bits. Surfaces at the far plane are not drawn.
+FAR = 2**24 - 1
+# Number of bits of a key that hold the index of the face.
+FACE_BITS = 32
+# Key of samples without a face. It is less than any key at the far plane, and
+# its index is -1.
+EMPTY = (FAR << FACE_BITS) - 1
+# Number of faces that are processed at once, so that their arrays stay in the
+# cache of the processor.
+FACES = 2**14
+# Number of rows, or of samples, that are processed at once, for the same reason.
+PARTS = 2**13
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Ids by the contract in `renderer.visibility.rasterizers`, for finite points."""
+    """Find the nearest face at each sample, as `renderer.visibility.rasterizers` describes.
+
+    Args:
+        points: Projected vertices, finite, float64, shape (N, V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: Whether faces that are clockwise in the image are left out.
+
+    Returns:
+        Index of the face at each sample, or -1, int32, shape (N, R, R).
+    """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
-    for view, image in zip(points, ids, strict=True):
-        image[:] = _keys(view, faces, resolution, closed).reshape(image.shape)  # of which an id is the lower half
+    for view, view_ids in zip(points, ids, strict=True):
+        # The conversion to int32 keeps the lower half of each key.
+        view_ids[:] = _keys(view, faces, resolution, closed).reshape(view_ids.shape)
     return ids
 
 
 def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """(R²,) the least key of each sample."""
+    """Compute the smallest key of each sample of one view.
+
+    Args:
+        points: Projected vertices, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: Whether faces that are clockwise in the image are left out.
+
+    Returns:
+        Keys in row-major order, int64, shape (R²,).
+    """
     positions, depths = to_fixed_point(points, resolution)
     keys = np.full(resolution * resolution, EMPTY)
     for begin in range(0, len(faces), FACES):
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
-        drawn, first, rows = _cull(positions.take(block, axis=1), resolution, closed)
-        corners = _sort(block.take(drawn, axis=1))  # so that duplicate faces have one depth and tie
+        drawn = _cull(positions.take(block, axis=1), resolution, closed)
+        # Duplicate faces with sorted corners have exactly the same depth. The lower
+        # index wins.
+        corners = _sort(block.take(drawn.triangle_index, axis=1))
         triangles = positions.take(corners, axis=1)
-        edges, planes, ids = _edges(triangles), _planes(triangles, depths.take(corners)), drawn + begin
-        for triangle, row in _parts(rows):
-            row += first.take(triangle)
+        edges = _edges(triangles)
+        planes = _planes(triangles, depths.take(corners))
+        face_ids = drawn.triangle_index + begin
+        for triangle, row in _parts(drawn.row_count):
+            row += drawn.first_row.take(triangle)
             left, right = _crossings(edges, triangle, row, resolution)
-            x, y, depth, slope, by_row = planes.take(triangle, axis=1)
-            at_row, offset = depth + (row - y) * by_row, left - x
-            sample, face = row * resolution + left, ids.take(triangle)
+            x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
+            depth_at_row = depth + (row - y) * slope_y
+            first_offset = left - x
+            first_sample = row * resolution + left
+            face = face_ids.take(triangle)
             for span, step in _parts(right - left):
-                depth = np.rint(at_row.take(span) + slope.take(span) * (offset.take(span) + step)).astype(np.int64)
-                depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
-                np.minimum.at(keys, sample.take(span) + step, (depth << FACE_BITS) | face.take(span))
+                offset = first_offset.take(span) + step
+                exact_depth = depth_at_row.take(span) + slope_x.take(span) * offset
+                rounded = np.rint(exact_depth).astype(np.int64)
+                # Negative depths are large as unsigned numbers.
+                clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
+                sample_keys = (clipped << FACE_BITS) | face.take(span)
+                np.minimum.at(keys, first_sample.take(span) + step, sample_keys)
     return keys
 
 
 def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (V, 3) as positions (2, V) int64, x right and y down from the center of the first sample in 1/256 sample,
-    and depths (V,) float64 between 0 and FAR.
+    """Convert projected points to fixed-point positions and depths.
 
-    Before they are snapped, positions are float32 numbers, from a multiply-add that rounds once, as GPUs have it.
+    As on GPUs, positions are converted to float32 after one multiplication and
+    addition, and then rounded to subsamples.
+
+    Args:
+        points: Projected points, shape (V, 3).
+        resolution: Number of samples per side of the image.
+
+    Returns:
+        A tuple of
+        - x to the right and y down from the center of the first sample, in
+          1 / SUBSAMPLES of a sample, int64, shape (2, V);
+        - depths between 0 and FAR, float64, shape (V,).
     """
     half = resolution / 2
     window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
     window += half
+    # The window is float64 until here, so that its values are rounded once.
     snapped = window.astype(np.float32)
     snapped *= SUBSAMPLES
     positions = np.rint(snapped, out=snapped).astype(np.int64)
@@ -75,80 +136,170 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
     return positions, depths
 
 
-def _cull(corners: np.ndarray, resolution: int, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which triangles (2, 3, F) to draw (T,), and the first and the number of the rows (T,) that they reach.
+class _Drawn(NamedTuple):
+    """T triangles that are drawn.
 
-    By the top-left rule a sample on an edge belongs to the triangle that has the edge at its left or, if level, its
-    top. So rows and columns begin at or after a triangle's least coordinate, and end before its greatest.
+    Attributes:
+        triangle_index: Index of each triangle among those given, shape (T,).
+        first_row: First row that each triangle can cover, shape (T,).
+        row_count: Number of rows that each triangle can cover, shape (T,).
     """
-    areas = _doubled_areas(corners)
-    first = _next_sample(corners.min(axis=1)).clip(0, None)
-    counts = _next_sample(corners.max(axis=1)).clip(None, resolution) - first
-    towards = areas < 0 if closed else areas != 0  # y runs down: counter-clockwise areas are negative
-    drawn = np.flatnonzero(towards & (counts > 0).all(axis=0))
-    return drawn, first[1].take(drawn), counts[1].take(drawn)
+
+    triangle_index: np.ndarray
+    first_row: np.ndarray
+    row_count: np.ndarray
 
 
-def _doubled_areas(corners: np.ndarray) -> np.ndarray:
-    (ax, bx, cx), (ay, by, cy) = corners
+def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
+    """Find the triangles that can cover samples.
+
+    By the top-left rule, a sample on an edge belongs to the triangle to the
+    right of the edge or, if the edge is horizontal, to the triangle below it.
+    Rows and columns therefore begin at or after the least coordinate of a
+    triangle, and end before its greatest coordinate.
+
+    Args:
+        triangles: Corners of F triangles, shape (2, 3, F).
+        resolution: Number of samples per side.
+        closed: Whether clockwise triangles are left out.
+
+    Returns:
+        Triangles that are drawn.
+    """
+    areas = _doubled_areas(triangles)
+    # Columns and rows, shape (2, F).
+    first = _next_sample(triangles.min(axis=1)).clip(0, None)
+    counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
+    # y points down, so the areas of counter-clockwise triangles are negative.
+    is_facing = areas < 0 if closed else areas != 0
+    index = np.flatnonzero(is_facing & (counts > 0).all(axis=0))
+    return _Drawn(
+        triangle_index=index,
+        first_row=first[1].take(index),
+        row_count=counts[1].take(index),
+    )
+
+
+def _doubled_areas(triangles: np.ndarray) -> np.ndarray:
+    """Compute twice the signed areas of triangles, negative if they are counter-clockwise."""
+    (ax, bx, cx), (ay, by, cy) = triangles
     return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
 
 
 def _next_sample(positions: np.ndarray) -> np.ndarray:
-    """The first row or column at or after each position."""
+    """Find the first row, or the first column, at or after each position."""
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
 def _sort(corners: np.ndarray) -> np.ndarray:
-    """np.sort(corners, axis=0) of (3, T), several times faster."""
-    least, greatest = corners.min(axis=0), corners.max(axis=0)
+    """Sort three values per column, shape (3, T), several times faster than np.sort."""
+    least = corners.min(axis=0)
+    greatest = corners.max(axis=0)
     return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
 
 
-def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (3, 3, T) of triangles (2, 3, T), and the first row (T,) after each triangle's middle corner.
+class _EdgeLines(NamedTuple):
+    """Lines of the three edges of T triangles.
 
-    The edges go from the top to the bottom, from the top to the middle and from the middle to the bottom corner. Minus
-    the column where a row crosses one is (slope · row + constant) / height, of its three numbers.
+    The edges lead from the top corner to the bottom corner, from the top corner
+    to the middle corner, and from the middle corner to the bottom corner. A row
+    crosses an edge at the column -(slope · row + constant) / height.
+
+    Attributes:
+        coefficients: Slope, constant and height of the three edges,
+            shape (3, 3, T).
+        middle_row: First row at or after the middle corner, shape (T,).
     """
-    x, y = corners
-    downwards = _sort((y << 32) + x)  # the sums may wrap around, and wrap back
-    x = ((downwards + 2**31) & (2**32 - 1)) - 2**31
-    y = (downwards - x) >> 32
-    start, end = [0, 0, 1], [2, 1, 2]
-    dx, dy = x[end] - x[start], y[end] - y[start]
-    return np.stack([-SUBSAMPLES * dx, y[start] * dx - x[start] * dy, SUBSAMPLES * dy]), _next_sample(y[1])
+
+    coefficients: np.ndarray
+    middle_row: np.ndarray
+
+
+def _edges(triangles: np.ndarray) -> _EdgeLines:
+    """Find the lines of the edges of triangles, shape (2, 3, T)."""
+    x, y = triangles
+    # One number per corner holds y in its upper 32 bits and x in its lower 32
+    # bits. Sorting these numbers sorts the corners from the top to the bottom.
+    # Sums of three numbers in `_sort` may overflow, and their differences wrap
+    # back.
+    downward = _sort((y << 32) + x)
+    x = ((downward + 2**31) & (2**32 - 1)) - 2**31
+    y = (downward - x) >> 32
+    start = [0, 0, 1]
+    end = [2, 1, 2]
+    dx = x[end] - x[start]
+    dy = y[end] - y[start]
+    slope = -SUBSAMPLES * dx
+    constant = y[start] * dx - x[start] * dy
+    height = SUBSAMPLES * dy
+    return _EdgeLines(np.stack([slope, constant, height]), middle_row=_next_sample(y[1]))
 
 
 def _crossings(
-    edges: tuple[np.ndarray, np.ndarray], triangle: np.ndarray, row: np.ndarray, resolution: int
+    edges: _EdgeLines, triangle: np.ndarray, row: np.ndarray, resolution: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first column in a triangle and the first after it, for each of its rows."""
-    numbers, middle = edges
-    below = row >= middle.take(triangle)
-    both = np.stack([triangle, triangle + (1 + below) * len(middle)])
-    slope, constant, height = numbers.reshape(3, -1).take(both, axis=1)
+    """Find the columns that triangles cover in rows.
+
+    Args:
+        edges: Lines of the edges of T triangles.
+        triangle: Index of the triangle of each of N parts, shape (N,).
+        row: Row of each part, shape (N,).
+        resolution: Number of samples per side.
+
+    Returns:
+        A tuple of the first covered column, and the first column after it that
+        is not covered, shape (N,) each.
+    """
+    is_below = row >= edges.middle_row.take(triangle)
+    # A row crosses the first edge, and the second or the third edge. The
+    # coefficients of the three edges follow each other.
+    short_edge = triangle + (1 + is_below) * len(edges.middle_row)
+    crossed = np.stack([triangle, short_edge])
+    slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed, axis=1)
     columns = (-((slope * row + constant) // height)).clip(0, resolution)
     return np.minimum(*columns), np.maximum(*columns)
 
 
-def _planes(corners: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """(5, T) of triangles (2, 3, T) with depths (3, T): of the first corner column, row and depth, and the depth's
-    slopes by column and row."""
-    (ax, bx, cx), (ay, by, cy) = corners
-    a, b, c = depths
-    scale = SUBSAMPLES / _doubled_areas(corners)
-    by_column = ((b - a) * (cy - ay) - (c - a) * (by - ay)) * scale
-    by_row = ((c - a) * (bx - ax) - (b - a) * (cx - ax)) * scale
-    return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, a, by_column, by_row])
+def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Compute the depth of triangles as a linear function of column and row.
+
+    Args:
+        triangles: Corners, shape (2, 3, T).
+        depths: Depths of the corners, shape (3, T).
+
+    Returns:
+        Column, row and depth of the first corner, and the slopes of the depth
+        per column and per row, shape (5, T).
+    """
+    (ax, bx, cx), (ay, by, cy) = triangles
+    depth_a, depth_b, depth_c = depths
+    to_b = depth_b - depth_a
+    to_c = depth_c - depth_a
+    scale = SUBSAMPLES / _doubled_areas(triangles)
+    slope_x = (to_b * (cy - ay) - to_c * (by - ay)) * scale
+    slope_y = (to_c * (bx - ax) - to_b * (cx - ax)) * scale
+    return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, depth_a, slope_x, slope_y])
 
 
 def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(whole, part): each whole repeated by its count, with parts from 0; about PARTS at a time, wholes uncut."""
+    """Split items into parts, about PARTS at a time, and keep all parts of an item together.
+
+    Args:
+        counts: Number of parts of each item.
+
+    Yields:
+        A tuple of the index of the item, and the number of the part in its item
+        from 0, for each part of a block.
+    """
     ends = np.cumsum(counts)
-    starts, begin, done = ends - counts, 0, 0
+    starts = ends - counts
+    begin = 0
+    parts_before = 0
     while begin < len(counts):
-        end = max(begin + 1, int(np.searchsorted(ends, done + PARTS, side="right")))
-        whole = np.repeat(np.arange(begin, end), counts[begin:end])
-        yield whole, np.arange(done, done + len(whole)) - starts.take(whole)
-        begin, done = end, int(ends[end - 1])
+        end = int(np.searchsorted(ends, parts_before + PARTS, side="right"))
+        end = max(begin + 1, end)
+        item = np.repeat(np.arange(begin, end), counts[begin:end])
+        number = np.arange(parts_before, parts_before + len(item))
+        yield item, number - starts.take(item)
+        begin = end
+        parts_before = int(ends[end - 1])

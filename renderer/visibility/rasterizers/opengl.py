@@ -1,10 +1,21 @@
-"""The OpenGL rasterizer: moderngl over EGL, without a window.
+"""OpenGL rasterizer: moderngl with EGL, which needs no window.
 
-A context is made, used and released in one call, since one that is kept returns stale data in another thread.
-After a fork only the process that made a context first can make another: under Mesa a child hangs. Ids come from
-gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly. Triton and Mesa's llvmpipe each bring an LLVM of
-their own, and a process that loads Triton second crashes; so it is loaded here, where it is installed.
-Of several EGL devices moderngl takes the one whose number is in GLCONTEXT_DEVICE_INDEX, by default the first.
+Choose it for large meshes or images on a machine with a GPU.
+
+Several workarounds for drivers are in use:
+
+- Each call creates and releases a context. A context that is kept returns old
+  data in another thread.
+- After a fork, only the process that created a context first can create another
+  one. With Mesa, a child process hangs.
+- The index of a face comes from gl_VertexID, because some versions of Mesa count
+  gl_PrimitiveID wrongly.
+- Triton and the llvmpipe driver of Mesa have an LLVM each, and a process that
+  loads Triton second crashes. Triton is therefore loaded before the context is
+  created, if it is installed.
+
+If a machine has several EGL devices, moderngl uses the one whose number is in
+the environment variable GLCONTEXT_DEVICE_INDEX, and by default the first one.
 """
 
 from __future__ import annotations
@@ -25,7 +36,7 @@ VERTEX_SHADER = """
 in vec3 position;
 flat out int face;
 void main() {
-    gl_Position = vec4(position.x, -position.y, position.z, 1.0);  // OpenGL's rows go up, ours down
+    gl_Position = vec4(position.x, -position.y, position.z, 1.0);  // The rows of OpenGL go up.
     face = gl_VertexID / 3;
 }
 """
@@ -35,74 +46,131 @@ FRAGMENT_SHADER = """
 flat in int face;
 layout(location = 0) out int id;
 void main() {
-    id = face + 1;  // 0 is what the image is cleared to
+    id = face + 1;  // 0 stands for no face.
 }
 """
 
 
+# Bytes of a float32 coordinate.
+FLOAT_BYTES = 4
+
+
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Ids by the contract in `renderer.visibility.rasterizers`, for finite points.
-    InputError: no EGL device, or a driver that renders wrong ids or fails."""
-    least = faces.argmin(axis=1)[:, None]  # first, so that duplicate faces have one depth, and tie
-    ordered = np.take_along_axis(faces, (least + np.arange(3)) % 3, axis=1) if closed else np.sort(faces, axis=1)
+    """Find the nearest face at each sample, as `renderer.visibility.rasterizers` describes.
+
+    Args:
+        points: Projected vertices, finite, float64, shape (N, V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: Whether faces that are clockwise in the image are left out.
+
+    Returns:
+        Index of the face at each sample, or -1, int32, shape (N, R, R).
+
+    Raises:
+        InputError: If there is no EGL device, or if the driver fails or renders
+            wrong ids.
+    """
+    # Duplicate faces that begin with the same vertex have exactly the same depth.
+    # The first one stays. A cyclic permutation keeps the orientation.
+    if closed:
+        lowest = faces.argmin(axis=1)[:, None]
+        ordered = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
+    else:
+        ordered = np.sort(faces, axis=1)
     with _context() as context:
         return _draw(context, points, ordered, resolution, closed)
 
 
 def device() -> str:
-    """The name of the OpenGL driver's device. InputError: no EGL device, or a driver that renders wrong ids."""
+    """Return the name of the device of the OpenGL driver.
+
+    Returns:
+        Name of the device.
+
+    Raises:
+        InputError: If there is no EGL device, or if the driver fails or renders
+            wrong ids.
+    """
     with _context() as context:
         return context.info["GL_RENDERER"]
 
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
+    """Create an OpenGL context, check it, and release it at the end of the block."""
     with suppress(ImportError):
         import triton  # noqa: F401
     import moderngl
 
     try:
-        context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]  # annotated as though a dict
-    except Exception as error:  # moderngl raises no narrower class
-        raise InputError("no EGL device: apt install libegl1 libgl1, or choose the rasterizer numpy") from error
+        # The type annotation of `backend` is wrong.
+        context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
+    except Exception as error:  # moderngl raises no narrower class.
+        raise InputError(
+            "no EGL device was found: apt install libegl1 libgl1, or choose the rasterizer numpy"
+        ) from error
     try:
         _check(context)
         yield context
     except moderngl.Error as error:
-        raise InputError(f"the OpenGL driver failed ({error}): choose the rasterizer numpy") from error
+        raise InputError(
+            f"the OpenGL driver failed ({error}): choose the rasterizer numpy"
+        ) from error
     finally:
         context.release()
 
 
 def _check(context: moderngl.Context) -> None:
-    """InputError unless a test image is right: a large triangle, first turned away and then not, behind a small one."""
-    points = np.array([[[-1, -1, 0], [3, -1, 0], [-1, 3, 0], [-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]])
-    ids = _draw(context, points, np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]]), 4, closed=True)
-    if ids[0].tolist() != [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]:
+    """Raise InputError if the driver renders wrong ids in a test image.
+
+    The image shows a large triangle twice, first seen from behind and then from
+    the front, and a small triangle in front of it.
+    """
+    large_triangle = [[-1, -1, 0], [3, -1, 0], [-1, 3, 0]]
+    small_triangle = [[-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]
+    points = np.array([large_triangle + small_triangle])
+    faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
+    expected = [
+        [2, 2, 1, 1],
+        [2, 1, 1, 1],
+        [1, 1, 1, 1],
+        [1, 1, 1, 1],
+    ]
+    ids = _draw(context, points, faces, resolution=4, closed=True)
+    if ids[0].tolist() != expected:
         name = context.info["GL_RENDERER"]
-        raise InputError(f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy")
+        raise InputError(
+            f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy"
+        )
 
 
 def _draw(
     context: moderngl.Context, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool
 ) -> np.ndarray:
+    """Draw the views in a context, see `rasterize` for the arguments and the result."""
     import moderngl
 
     size = (resolution, resolution)
     program = context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
-    corners = context.buffer(reserve=faces.size * 3 * 4, dynamic=True)
+    corners = context.buffer(reserve=faces.size * 3 * FLOAT_BYTES, dynamic=True)
     triangles = context.vertex_array(program, [(corners, "3f", "position")])
     texture = context.texture(size, 1, dtype="i4")
     framebuffer = context.framebuffer([texture], context.depth_renderbuffer(size))
     framebuffer.use()
-    context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
-    context.front_face = "cw"  # counter-clockwise in the image, whose rows go down
-    context.depth_func = "<"  # of equal depths the face drawn first stays, the one with the lower index
+    culling = moderngl.CULL_FACE if closed else moderngl.NOTHING
+    context.enable_only(moderngl.DEPTH_TEST | culling)
+    # The rows of the result go down, so counter-clockwise faces are clockwise
+    # for OpenGL.
+    context.front_face = "cw"
+    # If depths are equal, the face that was drawn first stays. It has the lower
+    # index.
+    context.depth_func = "<"
 
-    ids = np.empty((len(points), *size), dtype=np.int32)
-    for view, view_ids in zip(points.astype(np.float32), ids, strict=True):
+    ids_from_one = np.empty((len(points), *size), dtype=np.int32)
+    for view, view_ids in zip(points.astype(np.float32), ids_from_one, strict=True):
         corners.write(view[faces])
         framebuffer.clear()
         triangles.render(moderngl.TRIANGLES)
         texture.read_into(view_ids)
-    return ids - 1
+    return ids_from_one - 1

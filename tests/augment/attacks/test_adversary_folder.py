@@ -175,7 +175,7 @@ DAMAGES = {
     "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),
     "a camera within the mesh": (
         described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0.5}]),
-        r"adversary\.json: the mesh reaches to a camera at distance 0\.5",
+        r"adversary\.json: the mesh reaches the camera at distance 0\.5",
     ),
     "a pipe for images": (pipe, "after.npy is not a regular file"),
     "images of 10 TB": (announced, "after.npy cannot be read"),

@@ -1,4 +1,4 @@
-"""Exported meshes: read back, and read by trimesh alone."""
+"""Exported meshes, read by the renderer and by trimesh alone."""
 
 import json
 import math
@@ -26,35 +26,47 @@ EPS32 = np.finfo(np.float32).eps
 
 
 def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
-    """A color and a uv for each corner, so that every edge is a seam, and textures of different sizes by face."""
+    """Give each corner its own color and texture coordinates, so that every edge is a seam.
+
+    Faces have one of several textures of different sizes, or none.
+    """
     rng = np.random.default_rng(seed)
-    count = len(mesh.faces)
-    ids = np.sort(rng.integers(-1, textures, count)).astype(np.int32)
-    uvs = rng.uniform(-1, 2, (count, 3, 2)).astype(np.float32)
+    face_count = len(mesh.faces)
+    ids = np.sort(rng.integers(-1, textures, face_count)).astype(np.int32)
+    uvs = rng.uniform(-1, 2, (face_count, 3, 2)).astype(np.float32)
+    colors = rng.random((face_count, 3, 3), dtype=np.float32)
+    shapes = [(8, 4 + number, 3) for number in range(textures)]
     return replace(
         mesh,
-        corner_colors=rng.random((count, 3, 3), dtype=np.float32),
+        corner_colors=colors,
         corner_uvs=np.where((ids < 0)[:, None, None], 0, uvs),
         texture_ids=ids,
-        textures=tuple(rng.integers(0, 256, (8, 4 + i, 3), dtype=np.uint8) for i in range(textures)),
+        textures=tuple(rng.integers(0, 256, shape, dtype=np.uint8) for shape in shapes),
     )
 
 
 def box() -> Mesh:
+    """Return a box with three different sides, above the origin."""
     geometry = trimesh.creation.box((1, 2, 3))
     return Mesh.plain(geometry.vertices + np.array([0, 0, 0.25]), geometry.faces)
 
 
 def with_a_seam() -> Mesh:
-    """A smooth ball whose uvs, and whose colors at the bottom, end at an edge."""
+    """Return a smooth ball with texture coordinates that jump along one meridian."""
     ball = trimesh.creation.uv_sphere(count=[8, 12])
-    mesh = Mesh.plain(ball.vertices, ball.faces, np.random.default_rng(1).random(ball.vertices.shape))
-    azimuth = np.arctan2(ball.vertices[:, 1], ball.vertices[:, 0])[ball.faces] / (2 * np.pi)
-    azimuth = np.where(np.ptp(azimuth, axis=1, keepdims=True) > 0.5, azimuth % 1, azimuth)
-    uvs = np.stack([azimuth, ball.vertices[:, 2][ball.faces] / 2 + 0.5], axis=-1).astype(np.float32)
+    x, y, z = ball.vertices.T
+    colors = np.random.default_rng(1).random(ball.vertices.shape)
+    u = np.arctan2(y, x)[ball.faces] / (2 * np.pi)
+    is_at_seam = np.ptp(u, axis=1, keepdims=True) > 0.5
+    u = np.where(is_at_seam, u % 1, u)
+    v = z[ball.faces] / 2 + 0.5
     texture = np.random.default_rng(2).integers(0, 256, (16, 32, 3), dtype=np.uint8)
-    ids = np.zeros(len(ball.faces), dtype=np.int32)
-    return replace(mesh, corner_uvs=uvs, texture_ids=ids, textures=(texture,))
+    return replace(
+        Mesh.plain(ball.vertices, ball.faces, colors),
+        corner_uvs=np.stack([u, v], axis=-1).astype(np.float32),
+        texture_ids=np.zeros(len(ball.faces), dtype=np.int32),
+        textures=(texture,),
+    )
 
 
 MESHES = {
@@ -67,8 +79,11 @@ MESHES = {
 
 
 def assert_same_surface(loaded: Mesh, mesh: Mesh) -> None:
-    """Positions are rounded to float32 once; so are colors, in linear light, where sRGB's curve only makes their
-    relative error smaller, and encoded ones, once more; v is stored as 1 - v, which is at most 2 here."""
+    """Compare two meshes up to the rounding to float32.
+
+    Positions are rounded once. Colors are rounded twice, as linear and as
+    encoded values. The file holds 1 - v, which is at most 2.
+    """
     assert_array_equal(corners_of(loaded), corners_of(mesh).astype(np.float32))
     assert_allclose(loaded.corner_colors, mesh.corner_colors, rtol=2 * EPS32, atol=0)
     assert_allclose(loaded.corner_uvs, mesh.corner_uvs, rtol=0, atol=2 * EPS32)
@@ -83,33 +98,64 @@ def test_a_glb_gives_back_the_same_surface(tmp_path, mesh):
     export_mesh(mesh, tmp_path / "mesh.glb")
     loaded = load_mesh(tmp_path / "mesh.glb")
     assert_same_surface(loaded, mesh)
-    assert len(loaded.vertices) == len(mesh.vertices) and loaded.closed is mesh.closed
+    assert len(loaded.vertices) == len(mesh.vertices)
+    assert loaded.closed is mesh.closed
 
 
 def read_glb(path: Path) -> list[trimesh.Trimesh]:
-    """The primitives, as trimesh reads them: y up, uvs from the bottom."""
+    """Return the parts as trimesh reads them, with y up and v = 0 at the bottom."""
     return list(trimesh.load(path, force="scene", process=False).geometry.values())
 
 
-def test_a_glb_holds_y_up_positions_linear_colors_and_diffuse_two_sided_materials(tmp_path):
+@pytest.fixture(scope="module")
+def painted_box() -> Mesh:
+    """Return a box on which some faces have a texture and others do not."""
     mesh = painted(box(), 1)
-    export_mesh(mesh, tmp_path / "mesh.glb")
-    parts, plain = read_glb(tmp_path / "mesh.glb"), mesh.texture_ids < 0
-    assert len(parts) == 2 and plain.any() and not plain.all()
-    for part, here in zip(parts, (plain, ~plain), strict=True):
-        x, y, z = np.moveaxis(corners_of(mesh)[here], -1, 0)
-        assert_array_equal(part.triangles, np.stack([x, z, -y], axis=-1).astype(np.float32))
-        colors = linear_of(mesh.corner_colors[here].astype(np.float64))
-        assert_allclose(part.visual.vertex_attributes["color"][part.faces], colors, rtol=EPS32, atol=0)
-        assert_allclose(part.visual.uv[part.faces], mesh.corner_uvs[here], rtol=0, atol=2 * EPS32)
+    assert (mesh.texture_ids < 0).any()
+    assert (mesh.texture_ids >= 0).any()
+    return mesh
+
+
+@pytest.fixture
+def parts(painted_box, tmp_path) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
+    """Export the box. Return each part with the mask of its faces, the untextured part first."""
+    export_mesh(painted_box, tmp_path / "mesh.glb")
+    is_untextured = painted_box.texture_ids < 0
+    masks = [is_untextured, ~is_untextured]
+    return list(zip(read_glb(tmp_path / "mesh.glb"), masks, strict=True))
+
+
+def test_a_glb_holds_positions_with_y_up(painted_box, parts):
+    for part, mask in parts:
+        x, y, z = np.moveaxis(corners_of(painted_box)[mask], -1, 0)
+        expected = np.stack([x, z, -y], axis=-1).astype(np.float32)
+        assert_array_equal(part.triangles, expected)
+
+
+def test_a_glb_holds_linear_colors_and_texture_coordinates(painted_box, parts):
+    for part, mask in parts:
+        expected = linear_of(painted_box.corner_colors[mask].astype(np.float64))
+        colors = part.visual.vertex_attributes["color"][part.faces]
+        assert_allclose(colors, expected, rtol=EPS32, atol=0)
+        uvs = part.visual.uv[part.faces]
+        assert_allclose(uvs, painted_box.corner_uvs[mask], rtol=0, atol=2 * EPS32)
+
+
+def test_a_glb_has_diffuse_materials_that_are_seen_from_both_sides(parts):
+    for part, _ in parts:
         material = part.visual.material
-        assert (material.doubleSided, material.metallicFactor, material.roughnessFactor) == (True, 0, 1)
-        assert material.baseColorFactor is None and (material.baseColorTexture is None) == (here is plain)
+        assert material.doubleSided
+        assert material.metallicFactor == 0
+        assert material.roughnessFactor == 1
+        assert material.baseColorFactor is None
+    (untextured, _), (textured, _) = parts
+    assert untextured.visual.material.baseColorTexture is None
+    assert textured.visual.material.baseColorTexture is not None
 
 
 @pytest.mark.parametrize("normals", ["smooth", "flat"])
 def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
-    """Flat ones by the cross product; smooth ones the area-weighted sum of those around the vertex."""
+    """Flat normals are cross products. Smooth normals are their sums over the faces of a vertex."""
     mesh = solid("pear")
     export_mesh(mesh, tmp_path / "mesh.glb", normals)
     [part] = read_glb(tmp_path / "mesh.glb")
@@ -125,44 +171,71 @@ def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
 
 
 def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
-    """A point through the node's matrix, turned from y up, lands where `project` puts it."""
+    """The matrices of the file project points with y up to where `project` puts them."""
     view = {"polar": 2.0, "azimuth": 1.0, "width": 2.5, "right": 0.3, "up": -0.2}
-    close = [PerspectiveCamera(**view, distance=distance) for distance in (1.2, 3.0)]
-    cameras = [*orbit_cameras(2, 3.0, 1.0, 0.4), OrthographicCamera(**view), *close]
+    cameras = [
+        *orbit_cameras(2, 3.0, 1.0, 0.4),
+        OrthographicCamera(**view),
+        PerspectiveCamera(**view, distance=1.2),
+        PerspectiveCamera(**view, distance=3.0),
+    ]
     export_mesh(box(), tmp_path / "mesh.glb", cameras=cameras)
-    blob = (tmp_path / "mesh.glb").read_bytes()
-    tree = json.loads(blob[20 : 20 + struct.unpack("<I", blob[12:16])[0]])
+    tree = read_tree(tmp_path / "mesh.glb")
     points = np.random.default_rng(0).uniform(-0.6, 0.6, size=(20, 3))
     x, y, z = points.T
+    y_up = np.stack([x, z, -y, np.ones(20)])
     nodes = [tree["nodes"][index] for index in tree["scenes"][0]["nodes"][1:]]
     assert len(nodes) == len(cameras)
     for camera, node in zip(cameras, nodes, strict=True):
-        pose, lens = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]
-        clipped = gltf_projection(lens) @ np.linalg.inv(pose) @ np.stack([x, z, -y, np.ones(20)])
-        assert_allclose((clipped[:3] / clipped[3]).T, camera.project(points), atol=1e-12)
+        # glTF stores matrices by columns.
+        pose = np.reshape(node["matrix"], (4, 4)).T
+        projection = gltf_projection(tree["cameras"][node["camera"]])
+        homogeneous = projection @ np.linalg.inv(pose) @ y_up
+        projected = (homogeneous[:3] / homogeneous[3]).T
+        assert_allclose(projected, camera.project(points), atol=1e-12)
+
+
+def read_tree(path: Path) -> dict:
+    """Read the JSON chunk of a .glb file, after a header of 20 bytes."""
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    return json.loads(content[20 : 20 + length])
 
 
 def gltf_projection(lens: dict) -> np.ndarray:
-    """The matrix of a camera by the specification (glTF 2.0, 3.10.3)."""
+    """Return the projection matrix of a camera (glTF 2.0, section 3.10.3)."""
     kind = lens[lens["type"]]
-    near, far = kind["znear"], kind["zfar"]
+    near = kind["znear"]
+    far = kind["zfar"]
+    depth_range = near - far
+    matrix = np.zeros((4, 4))
     if lens["type"] == "orthographic":
-        depth = [0, 0, 2 / (near - far), (far + near) / (near - far)]
-        return np.array([[1 / kind["xmag"], 0, 0, 0], [0, 1 / kind["ymag"], 0, 0], depth, [0, 0, 0, 1]])
+        matrix[0, 0] = 1 / kind["xmag"]
+        matrix[1, 1] = 1 / kind["ymag"]
+        matrix[2, 2] = 2 / depth_range
+        matrix[2, 3] = (far + near) / depth_range
+        matrix[3, 3] = 1
+        return matrix
     tangent = math.tan(kind["yfov"] / 2)
-    depth = [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)]
-    return np.array([[1 / (kind["aspectRatio"] * tangent), 0, 0, 0], [0, 1 / tangent, 0, 0], depth, [0, 0, -1, 0]])
+    matrix[0, 0] = 1 / (kind["aspectRatio"] * tangent)
+    matrix[1, 1] = 1 / tangent
+    matrix[2, 2] = (far + near) / depth_range
+    matrix[2, 3] = 2 * far * near / depth_range
+    matrix[3, 2] = -1
+    return matrix
 
 
 def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path):
-    mesh = painted(box(), 1)
-    mesh = replace(mesh, texture_ids=np.arange(12, dtype=np.int32) % 2 * 2, textures=painted(box(), 3).textures)
+    # Faces have the textures 0 and 2 in turn.
+    mesh = replace(painted(box(), 3), texture_ids=np.arange(12, dtype=np.int32) % 2 * 2)
     export_mesh(mesh, tmp_path / "mesh.glb")
     loaded = load_mesh(tmp_path / "mesh.glb")
-    assert_array_equal(corners_of(loaded), corners_of(mesh)[[0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]])
+    order = [0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]
+    assert_array_equal(corners_of(loaded), corners_of(mesh)[order])
     assert_array_equal(loaded.texture_ids, [0] * 6 + [1] * 6)
-    for texture, index in zip(loaded.textures, (0, 2), strict=True):
-        assert_array_equal(texture, mesh.textures[index])
+    first, second = loaded.textures
+    assert_array_equal(first, mesh.textures[0])
+    assert_array_equal(second, mesh.textures[2])
 
 
 @pytest.mark.parametrize("name", ["mesh.obj", "mesh.ply", "folder.glb"])
@@ -173,37 +246,48 @@ def test_a_path_that_cannot_be_written_is_refused(tmp_path, name):
 
 
 def glossy(mesh: Mesh) -> Mesh:
-    """Three kinds of gloss by face, and gloss textures."""
+    """Give each face one of three kinds of gloss, and each texture a gloss texture."""
     rng = np.random.default_rng(3)
     kinds = rng.random((3, 3), dtype=np.float32)
-    textures = tuple(rng.integers(0, 256, (5, 3 + i, 2), dtype=np.uint8) for i in range(len(mesh.textures)))
-    return replace(mesh, gloss=kinds[rng.integers(0, 3, len(mesh.faces))], gloss_textures=textures)
+    shapes = [(5, 3 + number, 2) for number in range(len(mesh.textures))]
+    textures = tuple(rng.integers(0, 256, shape, dtype=np.uint8) for shape in shapes)
+    kind_of_face = rng.integers(0, 3, len(mesh.faces))
+    return replace(mesh, gloss=kinds[kind_of_face], gloss_textures=textures)
 
 
 @pytest.mark.parametrize("textures", [0, 2])
-def test_a_glb_gives_back_the_gloss_to_those_who_ask(tmp_path, textures):
+def test_a_glb_gives_back_the_gloss_if_it_is_asked_for(tmp_path, textures):
     mesh = glossy(painted(box(), textures) if textures else box())
-    order = np.lexsort([*mesh.gloss.T[::-1], mesh.texture_ids])
     export_mesh(mesh, tmp_path / "mesh.glb")
-    loaded, matte = load_mesh(tmp_path / "mesh.glb", gloss=True), load_mesh(tmp_path / "mesh.glb")
-    assert matte.gloss is None and matte.gloss_textures == ()
+    loaded = load_mesh(tmp_path / "mesh.glb", gloss=True)
+    # Faces are ordered by texture, and then by the three values of gloss.
+    order = np.lexsort([*mesh.gloss.T[::-1], mesh.texture_ids])
     assert_array_equal(corners_of(loaded), corners_of(mesh)[order].astype(np.float32))
     assert_array_equal(loaded.gloss, mesh.gloss[order])
-    for face, other in enumerate(order):
-        if mesh.texture_ids[other] >= 0:
-            expected = mesh.gloss_textures[mesh.texture_ids[other]]
-            assert_array_equal(loaded.gloss_textures[loaded.texture_ids[face]], expected)
+    for face, original_face in enumerate(order):
+        texture_id = mesh.texture_ids[original_face]
+        if texture_id >= 0:
+            gloss_texture = loaded.gloss_textures[loaded.texture_ids[face]]
+            assert_array_equal(gloss_texture, mesh.gloss_textures[texture_id])
+
+
+def test_a_glb_with_gloss_is_loaded_as_matte_by_default(tmp_path):
+    export_mesh(glossy(painted(box(), 2)), tmp_path / "mesh.glb")
+    loaded = load_mesh(tmp_path / "mesh.glb")
+    assert loaded.gloss is None
+    assert loaded.gloss_textures == ()
 
 
 def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
-    """A rough metal where factors are missing, as the standard has it; green is roughness and blue metallic."""
+    """A material without factors is a rough metal. Green is roughness, and blue is metallic."""
     texels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     triangle = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False)
     material = PBRMaterial(metallicRoughnessTexture=Image.fromarray(texels))
     triangle.visual = TextureVisuals(uv=np.eye(3)[:, :2], material=material)
     triangle.export(tmp_path / "mesh.glb")
     mesh = load_mesh(tmp_path / "mesh.glb", gloss=True)
-    assert mesh.gloss.tolist() == [[1, 1, 1]] and mesh.textures[0].tolist() == [[[255, 255, 255]]]
+    assert mesh.gloss.tolist() == [[1, 1, 1]]
+    assert mesh.textures[0].tolist() == [[[255, 255, 255]]]
     assert_array_equal(mesh.gloss_textures[0], texels[..., 1:])
 
 

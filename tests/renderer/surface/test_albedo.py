@@ -1,4 +1,4 @@
-"""Albedo at the samples: textures against scipy, and derivatives by texel and by face."""
+"""Albedo at the samples: textures compared with SciPy, and gradients by texel and by face."""
 
 import math
 from dataclasses import replace
@@ -19,68 +19,84 @@ from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import choose
 
 EPS = torch.finfo(torch.float64).eps
-ABOVE = OrthographicCamera(0, -math.pi / 2, 2.0)  # x is right, y is up
-ALL_OF_IT = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+# Camera whose image shows x to the right and y up, from -1 to 1.
+ABOVE = OrthographicCamera(0, -math.pi / 2, 2.0)
+# Vertices and faces of a square that fills this image, and its texture
+# coordinates.
+SQUARE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+SQUARE_FACES = [[0, 1, 2], [0, 2, 3]]
 UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-HALVES = [[0, 1, 2], [0, 2, 3]]
 
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
+    """Rasterize a mesh for one camera."""
     settings = ImageSettings(size, samples)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
     return fragments
 
 
 def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    """Draw a texture, uint8, shape (height, width, 3)."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    """The whole image, one texture on it."""
-    uvs = np.asarray(uvs, dtype=np.float32)[HALVES]
-    ids = np.zeros(2, dtype=np.int32)
-    return replace(Mesh.plain(ALL_OF_IT, HALVES, color), corner_uvs=uvs, texture_ids=ids, textures=(texture,))
+    """Return the square that fills the image of ABOVE, with a texture."""
+    return replace(
+        Mesh.plain(SQUARE, SQUARE_FACES, color),
+        corner_uvs=np.asarray(uvs, dtype=np.float32)[SQUARE_FACES],
+        texture_ids=np.zeros(2, dtype=np.int32),
+        textures=(texture,),
+    )
 
 
 def draw(*shape: int) -> torch.Tensor:
+    """Draw numbers in [0, 1)."""
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
-def dented() -> Mesh:
+def patchwork_sphere() -> Mesh:
+    """Return a sphere whose faces have different colors and textures, or no texture."""
     sphere = trimesh.creation.icosphere(subdivisions=1)
     return patchwork(sphere.vertices, sphere.faces)
 
 
 def decoded(colors: np.ndarray, encoding: str) -> np.ndarray:
+    """Decode colors by the formula of the standard."""
     return linear_of(colors) if encoding == "srgb" else colors
-
-
-# ---------------------------------------------------------------------------- as the mesh has it
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repeats(encoding):
-    texture = random_texture(5, 7)
-    uvs = np.array([[-1.25, -0.75], [2.125, 0.25], [2.5, 2.0], [-0.875, 1.0]])  # a parallelogram, in float32 exactly
+    height = 5
+    width = 7
+    texture = random_texture(height, width)
+    # float32 holds this parallelogram exactly.
+    uvs = np.array([[-1.25, -0.75], [2.125, 0.25], [2.5, 2.0], [-0.875, 1.0]])
     mesh = poster(texture, uvs)
     fragments = view(mesh, 23)
     x, y = (fragments.positions().numpy().T + 1) / 2
     u, v = (uvs[0] + np.outer(x, uvs[1] - uvs[0]) + np.outer(y, uvs[3] - uvs[0])).T
-    at = np.stack([(1 - v) * 5 - 0.5, u * 7 - 0.5])
-    texels = decoded(texture / 255, encoding)
-    expected = [map_coordinates(texels[..., c], at, order=1, mode="grid-wrap") for c in range(3)]
-    np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), np.stack(expected, axis=1), atol=64 * EPS)
+    # Row and column in units of texels, whose centers are whole numbers in SciPy.
+    position = np.stack([(1 - v) * height - 0.5, u * width - 0.5])
+    channels = np.moveaxis(decoded(texture / 255, encoding), 2, 0)
+    expected = [
+        map_coordinates(channel, position, order=1, mode="grid-wrap") for channel in channels
+    ]
+    albedo = surface_albedo(mesh, fragments, encoding)
+    np.testing.assert_allclose(albedo, np.stack(expected, axis=1), atol=64 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_corner_colors_are_decoded_and_then_interpolated(encoding):
-    """Over a triangle whose corners are the image's and two beyond it: weights are the coordinates."""
+    """The weights of a triangle with edges along x and y are linear in x and y."""
     colors = np.array([[0.0, 0.5, 1.0], [1.0, 0.25, 0.5], [0.125, 0.0, 0.75]])
     mesh = Mesh.plain([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], [[0, 1, 2]], colors)
     fragments = view(mesh, 8)
     x, y = (fragments.positions().numpy().T + 1) / 4
     expected = np.stack([1 - x - y, x, y], axis=1) @ decoded(colors, encoding)
-    np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), expected, rtol=0, atol=16 * EPS)
+    albedo = surface_albedo(mesh, fragments, encoding)
+    np.testing.assert_allclose(albedo, expected, rtol=0, atol=16 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -91,9 +107,10 @@ def test_a_texture_multiplies_the_corner_color(encoding):
     np.testing.assert_allclose(albedo, np.tile(expected, (9, 1)), rtol=16 * EPS)
 
 
-# ---------------------------------------------------------------------------- as a parameter
-
-TEXTURED = [(dented(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_texture(3, 4)), ABOVE)]
+TEXTURED = [
+    (patchwork_sphere(), OrthographicCamera(1.0, 0.4, 1.7)),
+    (poster(random_texture(3, 4)), ABOVE),
+]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -102,90 +119,111 @@ def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, enco
     fragments = view(mesh, 6, 3, camera)
     textures = [torch.from_numpy(decoded(texture / 255, encoding)) for texture in mesh.textures]
     albedo = surface_albedo(mesh, fragments, encoding, textures)
-    torch.testing.assert_close(albedo, surface_albedo(mesh, fragments, encoding), rtol=0, atol=16 * EPS)
+    expected = surface_albedo(mesh, fragments, encoding)
+    torch.testing.assert_close(albedo, expected, rtol=0, atol=16 * EPS)
 
 
 @pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
 def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera):
     fragments = view(mesh, 3, 2, camera)
     inputs = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
-    assert torch.autograd.gradcheck(lambda *given: surface_albedo(mesh, fragments, "srgb", given), inputs)
+
+    def albedo(*textures: torch.Tensor) -> torch.Tensor:
+        return surface_albedo(mesh, fragments, "srgb", textures)
+
+    assert torch.autograd.gradcheck(albedo, inputs)
 
 
-# ---------------------------------------------------------------------------- what is added to faces
-
-
-def middling(colors_differ: bool) -> Mesh:
-    """`dented` between 0.2 and 0.8 in linear light, so that adding up to 0.15 clamps nothing."""
-    mesh = dented()
-    colors = mesh.corner_colors if colors_differ else mesh.corner_colors[:, :1].repeat(3, axis=1)
-    colors = np.where((mesh.texture_ids >= 0)[:, None, None], 1.0, 0.2 + 0.6 * colors).astype(np.float32)
-    textures = tuple((51 + 0.6 * each).astype(np.uint8) for each in mesh.textures)
+def mid_tone_sphere() -> Mesh:
+    """Return a sphere with linear colors from 0.2 to 0.8, so that adding 0.15 clamps nothing."""
+    mesh = patchwork_sphere()
+    has_texture = (mesh.texture_ids >= 0)[:, None, None]
+    colors = np.where(has_texture, 1.0, 0.2 + 0.6 * mesh.corner_colors).astype(np.float32)
+    textures = tuple((51 + 0.6 * texture).astype(np.uint8) for texture in mesh.textures)
     return replace(mesh, corner_colors=colors, textures=textures)
 
 
 @pytest.mark.parametrize("albedo_scale", [1.0, 0.5, 1.2])
 def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(albedo_scale):
-    mesh = middling(True)
-    fragments, added = view(mesh, 16, 2), 0.1 * (draw(len(mesh.faces), 3) - 0.5)
-    expected = surface_albedo(mesh, fragments, "linear") * albedo_scale + face_albedo(added, fragments)
-    torch.testing.assert_close(
-        painted_albedo(mesh, fragments, "linear", albedo_scale, added), expected, rtol=0, atol=8 * EPS
-    )
+    mesh = mid_tone_sphere()
+    fragments = view(mesh, 16, 2)
+    added = 0.1 * (draw(len(mesh.faces), 3) - 0.5)
+    scaled = surface_albedo(mesh, fragments, "linear") * albedo_scale
+    expected = scaled + face_albedo(added, fragments)
+    painted = painted_albedo(mesh, fragments, "linear", albedo_scale, added)
+    torch.testing.assert_close(painted, expected, rtol=0, atol=8 * EPS)
 
 
 @pytest.mark.parametrize("albedo_scale", [1.0, 3.0])
 def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale):
-    mesh = dented()
+    mesh = patchwork_sphere()
     fragments = view(mesh, 16, 2)
-    much = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
-    assert (painted_albedo(mesh, fragments, "srgb", albedo_scale, -much) == 0).all()
-    most = painted_albedo(mesh, fragments, "srgb", albedo_scale, much)
-    assert most.min() >= 1 - 4 * EPS and most.max() <= albedo_scale * (1 + 4 * EPS)
+    large = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
+    darkest = painted_albedo(mesh, fragments, "srgb", albedo_scale, -large)
+    assert (darkest == 0).all()
+    brightest = painted_albedo(mesh, fragments, "srgb", albedo_scale, large)
+    assert brightest.min() >= 1 - 4 * EPS
+    assert brightest.max() <= albedo_scale * (1 + 4 * EPS)
 
 
 def test_the_derivative_by_the_added_albedo_is_that_of_finite_differences():
     shape = trimesh.creation.icosahedron()
     mesh = patchwork(shape.vertices, shape.faces)
-    fragments, added = view(mesh, 5), (0.3 * (draw(20, 3) - 0.5)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda values: painted_albedo(mesh, fragments, "srgb", 1.5, values), [added])
+    fragments = view(mesh, 5)
+    added = (0.3 * (draw(len(mesh.faces), 3) - 0.5)).requires_grad_()
+
+    def albedo(values: torch.Tensor) -> torch.Tensor:
+        return painted_albedo(mesh, fragments, "srgb", 1.5, values)
+
+    assert torch.autograd.gradcheck(albedo, [added])
 
 
-@pytest.mark.parametrize(("encoding", "albedo_scale"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
-def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale):
-    """Colors at corners to float32; texels, in which no colors vary, to half of a step of 8 bits, encoded."""
-    mesh = dented()
-    even = mesh.corner_colors[:, :1].repeat(3, axis=1)
-    mesh = replace(mesh, corner_colors=np.where((mesh.texture_ids >= 0)[:, None, None], even, mesh.corner_colors))
+def with_even_colors_on_textures(mesh: Mesh) -> Mesh:
+    """Give all corners of each textured face the color of its first corner."""
+    first_colors = mesh.corner_colors[:, :1].repeat(3, axis=1)
+    has_texture = (mesh.texture_ids >= 0)[:, None, None]
+    return replace(mesh, corner_colors=np.where(has_texture, first_colors, mesh.corner_colors))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "albedo_scale"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)]
+)
+@pytest.mark.parametrize("angle", [0.3, 1.5, 2.8])
+def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle):
+    """Colors at corners have float32 precision, and texels are rounded to 8 bits."""
+    mesh = with_even_colors_on_textures(patchwork_sphere())
     added = 0.6 * (draw(len(mesh.faces), 3) - 0.5)
     painted, new_albedo_scale = with_added_albedo(mesh, added.numpy(), encoding, albedo_scale)
     assert 1 <= new_albedo_scale <= max(1, albedo_scale)
-    bare = torch.from_numpy(mesh.texture_ids < 0)
-    steepest = 2.4 / 1.055 if encoding == "srgb" else 1.0  # slope of the curve, at 1
-    step = 0.5 / 255 * steepest * new_albedo_scale
-    for polar in (0.3, 1.5, 2.8):
-        fragments = view(mesh, 24, 2, OrthographicCamera(polar, polar, 2.0))
-        expected = painted_albedo(mesh, fragments, encoding, albedo_scale, added)
-        off = (surface_albedo(painted, fragments, encoding) * new_albedo_scale - expected).abs().amax(1)
-        without = bare[fragments.faces][fragments.face]
-        assert without.any() and not without.all()
-        assert off[without].max() < 1e-6 and off[~without].max() < step + 1e-5
+
+    fragments = view(mesh, 24, 2, OrthographicCamera(angle, angle, 2.0))
+    expected = painted_albedo(mesh, fragments, encoding, albedo_scale, added)
+    found = surface_albedo(painted, fragments, encoding) * new_albedo_scale
+    error = (found - expected).abs().amax(1)
+    is_untextured = torch.from_numpy(mesh.texture_ids < 0)[fragments.faces][fragments.face]
+    assert is_untextured.any()
+    assert not is_untextured.all()
+    assert error[is_untextured].max() < 1e-6
+    # The curve that decodes texels is steepest at 1.
+    largest_slope = 2.4 / 1.055 if encoding == "srgb" else 1.0
+    largest_error = 0.5 / 255 * largest_slope * new_albedo_scale
+    assert error[~is_untextured].max() < largest_error + 1e-5
 
 
 def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
-    """A texture of one color, under a blend of four: the blend, to what texels can tell."""
-    mesh = poster(
-        np.full((64, 64, 3), 255, np.uint8), color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3])
-    )
-    fragments, nothing = view(mesh, 32), np.zeros((2, 3))
-    painted, _ = with_added_albedo(mesh, nothing, "linear")
+    """A white texture gets the interpolated colors of the corners, rounded to 8 bits."""
+    white = np.full((64, 64, 3), 255, np.uint8)
+    mesh = poster(white, color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3]))
+    fragments = view(mesh, 32)
+    painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "linear")
     assert (painted.corner_colors == 1).all()
     expected = surface_albedo(mesh, fragments, "linear")
-    torch.testing.assert_close(surface_albedo(painted, fragments, "linear"), expected, rtol=0, atol=1.1 / 255)
+    found = surface_albedo(painted, fragments, "linear")
+    torch.testing.assert_close(found, expected, rtol=0, atol=1.1 / 255)
 
 
 def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads_and_on_one():
-    """Half a million samples of two faces add up to each value of the gradient, in one order."""
+    """Each value of the gradient is a sum over half a million samples, always in one order."""
     mesh = poster(random_texture(16, 16))
     fragments = view(mesh, 256, samples=3)
 
@@ -199,9 +237,10 @@ def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads
 
     before = torch.get_num_threads()
     try:
-        expected, *again = gradient(1), *(gradient(4) for _ in range(4))
+        expected = gradient(threads=1)
+        on_four_threads = [gradient(threads=4) for _ in range(4)]
     finally:
         torch.set_num_threads(before)
-    for found in again:
-        for values, exact in zip(found, expected, strict=True):
-            assert torch.equal(values, exact)
+    for found in on_four_threads:
+        for values, expected_values in zip(found, expected, strict=True):
+            assert torch.equal(values, expected_values)

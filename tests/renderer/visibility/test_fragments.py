@@ -1,6 +1,7 @@
-"""What a view sees of a mesh, against loops over the rasterized image."""
+"""Samples that a camera sees of a mesh, compared with loops over the rasterized image."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -19,20 +20,55 @@ CAMERAS = [CAMERA, OrthographicCamera(2.5, -2.0, 1.6)]
 
 
 def dented_sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) and faces (F, 3) of a closed sphere with dents."""
     sphere = trimesh.creation.icosphere(subdivisions=1)
-    dents = np.random.default_rng(0).uniform(0.7, 1, (len(sphere.vertices), 1))
-    return sphere.vertices * dents, np.array(sphere.faces)
+    radii = np.random.default_rng(0).uniform(0.7, 1, (len(sphere.vertices), 1))
+    return sphere.vertices * radii, np.array(sphere.faces)
 
 
 def open_shell() -> tuple[np.ndarray, np.ndarray]:
-    """Two thirds of the dented sphere: some faces are seen from behind."""
+    """Return two thirds of the dented sphere, so that some faces are seen from behind."""
     vertices, faces = dented_sphere()
     return vertices, faces[: 2 * len(faces) // 3]
 
 
-def fragments_of(mesh, settings: ImageSettings, camera: OrthographicCamera = CAMERA, closed: bool = False) -> Fragments:
-    [fragments] = build_fragments(*mesh, [camera], settings, RASTERIZER, closed)
+def fragments_of(
+    mesh: tuple[np.ndarray, np.ndarray],
+    settings: ImageSettings,
+    camera: OrthographicCamera = CAMERA,
+    closed: bool = False,
+) -> Fragments:
+    """Rasterize a mesh of vertices and faces for one camera."""
+    vertices, faces = mesh
+    [fragments] = build_fragments(vertices, faces, [camera], settings, RASTERIZER, closed)
     return fragments
+
+
+class CoveredSample(NamedTuple):
+    """Sample of an image that shows a face, with its position in the image."""
+
+    pixel: int
+    face: int
+    x: float
+    y: float
+
+
+def covered_samples(ids: np.ndarray, size: int, samples: int) -> list[CoveredSample]:
+    """List the covered samples of an image of face ids, pixel by pixel."""
+    resolution = size * samples
+    found = []
+    for pixel in range(size**2):
+        first_row = pixel // size * samples
+        first_column = pixel % size * samples
+        for row in range(first_row, first_row + samples):
+            for column in range(first_column, first_column + samples):
+                face = ids[row, column]
+                if face < 0:
+                    continue
+                x = (2 * column + 1) / resolution - 1
+                y = 1 - (2 * row + 1) / resolution
+                found.append(CoveredSample(pixel, face, x, y))
+    return found
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -40,70 +76,98 @@ def fragments_of(mesh, settings: ImageSettings, camera: OrthographicCamera = CAM
 def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera):
     vertices, faces = open_shell()
     fragments = fragments_of((vertices, faces), ImageSettings(size, samples), camera)
-    points, resolution = camera.project(vertices), size * samples
-    ids = RASTERIZER.rasterize(points[None], faces, resolution)[0]
-    seen = sorted(set(ids[ids >= 0]))
-    expected = []
-    for pixel in range(size**2):
-        for row in range(pixel // size * samples, (pixel // size + 1) * samples):
-            for column in range(pixel % size * samples, (pixel % size + 1) * samples):
-                if ids[row, column] >= 0:
-                    x, y = (2 * column + 1) / resolution - 1, 1 - (2 * row + 1) / resolution
-                    expected.append((pixel, ids[row, column], x, y))
-    pixel, face, x, y = (np.array(column) for column in zip(*expected, strict=True))
+    [ids] = RASTERIZER.rasterize(camera.project(vertices)[None], faces, size * samples)
+    expected = covered_samples(ids, size, samples)
 
-    assert fragments.faces.tolist() == seen
-    assert fragments.pixels.tolist() == sorted(set(pixel))
+    pixel = np.array([sample.pixel for sample in expected])
+    pixels, counts = np.unique(pixel, return_counts=True)
+    np.testing.assert_array_equal(fragments.pixels, pixels)
+    np.testing.assert_array_equal(fragments.coverage, counts / samples**2)
     np.testing.assert_array_equal(fragments.pixels[fragments.pixel], pixel)
+
+    face = [sample.face for sample in expected]
     np.testing.assert_array_equal(fragments.faces[fragments.face], face)
-    np.testing.assert_allclose(fragments.positions(), np.stack([x, y], axis=1), rtol=0, atol=2 * EPS)
-    np.testing.assert_array_equal(fragments.coverage, [np.sum(pixel == p) / samples**2 for p in sorted(set(pixel))])
+
+    positions = [[sample.x, sample.y] for sample in expected]
+    np.testing.assert_allclose(fragments.positions(), positions, rtol=0, atol=2 * EPS)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_seen_faces_have_their_corners_and_the_side_that_the_camera_sees(camera):
+    vertices, faces = open_shell()
+    fragments = fragments_of((vertices, faces), ImageSettings(9, 3), camera)
+    points = camera.project(vertices)
+    [ids] = RASTERIZER.rasterize(points[None], faces, 27)
+    seen = np.unique(ids[ids >= 0])
+
+    np.testing.assert_array_equal(fragments.faces, seen)
     np.testing.assert_array_equal(fragments.corners, faces[seen])
-    a, b, c = vertices[faces[seen]].transpose(1, 0, 2)
-    np.testing.assert_array_equal(fragments.facing[:, 0], np.sign(np.cross(b - a, c - a) @ camera.axes()[2]))
     np.testing.assert_array_equal(fragments.outlines, points[faces[seen], :2])
+    a, b, c = vertices[faces[seen]].transpose(1, 0, 2)
+    toward_camera = camera.axes()[2]
+    side = np.sign(np.cross(b - a, c - a) @ toward_camera)
+    np.testing.assert_array_equal(fragments.facing[:, 0], side)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.05])
 def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(shift):
-    """Corners are snapped when they are drawn, so that a sample may lie just outside; here, some lie well outside."""
+    """The rasterizer rounds corners, so that a sample may lie just outside of its face.
+
+    With shifted corners, some samples lie well outside.
+    """
     fragments = fragments_of(open_shell(), ImageSettings(8, 4))
     fragments = replace(fragments, outlines=fragments.outlines + shift)
-    outside = 0
-    for weight, face, at in zip(fragments.barycentric, fragments.face, fragments.positions(), strict=True):
+    outside_count = 0
+    samples = zip(fragments.barycentric, fragments.face, fragments.positions(), strict=True)
+    for weight, face, position in samples:
         corners = np.vstack([fragments.outlines[face].T, np.ones(3)])
-        solved = np.linalg.solve(corners, [*at, 1])
-        outside += solved.min() < 0
-        clipped = solved.clip(0, 1) / solved.clip(0, 1).sum()
-        np.testing.assert_allclose(weight, clipped, rtol=0, atol=8 * EPS * np.linalg.cond(corners))
-    assert (outside > 20) == (shift > 0)
+        solved = np.linalg.solve(corners, [*position, 1])
+        outside_count += solved.min() < 0
+        clipped = solved.clip(0, 1)
+        tolerance = 8 * EPS * np.linalg.cond(corners)
+        np.testing.assert_allclose(weight, clipped / clipped.sum(), rtol=0, atol=tolerance)
+    assert (outside_count > 20) == (shift > 0)
 
 
 @pytest.mark.parametrize(
-    "flatten", [lambda o: 0 * o, lambda o: o[:, :1].expand(-1, 3, -1), lambda o: o[..., :1] * 1e-9]
+    "flatten",
+    [
+        lambda corners: 0 * corners,
+        lambda corners: corners[:, :1].expand(-1, 3, -1),
+        lambda corners: corners[..., :1] * 1e-9,
+    ],
+    ids=["all at the center", "all at the first corner", "on a short line"],
 )
-def test_an_outline_without_area_has_finite_barycentric_weights(flatten):
+def test_a_face_without_area_in_the_image_has_finite_barycentric_weights(flatten):
     fragments = fragments_of(open_shell(), ImageSettings(4, 1))
-    weights = replace(fragments, outlines=flatten(fragments.outlines).expand(-1, -1, 2)).barycentric
+    outlines = flatten(fragments.outlines).expand(-1, -1, 2)
+    weights = replace(fragments, outlines=outlines).barycentric
     assert (weights >= 0).all()
-    torch.testing.assert_close(weights.sum(1), torch.ones(len(weights), dtype=torch.float64), rtol=0, atol=4 * EPS)
+    ones = torch.ones(len(weights), dtype=torch.float64)
+    torch.testing.assert_close(weights.sum(1), ones, rtol=0, atol=4 * EPS)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
     settings = ImageSettings(16, 4)
-    whole, culled = (fragments_of(dented_sphere(), settings, camera, closed) for closed in (False, True))
-    assert torch.equal(culled.pixels, whole.pixels) and torch.equal(culled.coverage, whole.coverage)
+    whole = fragments_of(dented_sphere(), settings, camera)
+    culled = fragments_of(dented_sphere(), settings, camera, closed=True)
+    assert torch.equal(culled.pixels, whole.pixels)
+    assert torch.equal(culled.coverage, whole.coverage)
     assert (culled.facing == 1).all()
-    # Only along the outline may a face turned away be as near as its neighbor.
-    assert (culled.faces[culled.face] != whole.faces[whole.face]).double().mean() < 0.01
+    # A face that is seen from behind can be as near as its neighbor along
+    # silhouettes only.
+    differs = culled.faces[culled.face] != whole.faces[whole.face]
+    assert differs.double().mean() < 0.01
 
 
 def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
     vertices, faces = dented_sphere()
-    mesh, settings = (3 * vertices, faces), ImageSettings(8, 2)
+    mesh = (3 * vertices, faces)
+    settings = ImageSettings(8, 2)
     camera = OrthographicCamera(1.0, 0.4, 8.0)
     inside = fragments_of(mesh, settings, camera, closed=True)
     assert (inside.facing == -1).any()
     whole = fragments_of(mesh, settings, camera)
-    assert torch.equal(inside.sample, whole.sample) and torch.equal(inside.faces[inside.face], whole.faces[whole.face])
+    assert torch.equal(inside.sample, whole.sample)
+    assert torch.equal(inside.faces[inside.face], whole.faces[whole.face])

@@ -276,7 +276,7 @@ GPU, NO_GPU = "NVIDIA H200/PCIe/SSE2", "llvmpipe (LLVM 15.0.6, 256 bits)"
         ("auto", None, False, "numpy"),
         ("opengl", NO_GPU, True, "opengl"),
         ("opengl", None, True, "apt install libegl1 libgl1, or choose the rasterizer numpy"),
-        ("numba", GPU, False, "numba does not start .*: pip install numba, or choose the rasterizer numpy"),
+        ("numba", GPU, False, "numba cannot be imported .*: pip install numba, or choose the rasterizer numpy"),
         ("numpy", GPU, True, "numpy"),
         ("other", GPU, True, "^rasterizer=other: choose one of auto"),
     ],

@@ -58,7 +58,7 @@ def test_the_camera_moves_as_another_scenes_camera_stands(fov):
 def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
     scene = scene_of(fov=85.0, width=2.0)
     parameter, far = Pose(scene, augment.PoseSettings()), torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
-    with pytest.raises(InputError, match="reaches to a camera"):
+    with pytest.raises(InputError, match="reaches the camera"):
         AttackProblem(scene, [parameter]).render(far, ONE)
     AttackProblem(scene, [parameter]).render(parameter.domain(far), ONE)
 
