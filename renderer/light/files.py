@@ -20,7 +20,9 @@ from renderer.validation import as_path, as_tensor, require_kind
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
-def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
+def save_light(
+    path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS
+) -> None:
     """Write a light to a .json file, from which `read_light` reads float32 back to the bit.
 
     The pattern of a projector is also written as a .png file of eight bits
@@ -99,7 +101,8 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         OSError,
     ) as error:
         raise InputError(f"{path} does not describe a light ({error}): write it again") from error
-    is_bounded = bool((coefficients.abs() <= FACTOR).all())  # NaN is not.
+    # NaN fails the comparison.
+    is_bounded = bool((coefficients.abs() <= FACTOR).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)
         advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"
