@@ -27,7 +27,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.light.basis import COEFFICIENTS, DEGREE
@@ -670,6 +670,6 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     mask_center = np.array([left + right, bottom + top]) / 2
     shift = mask_center - (low + high) / 2 / factor
     framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
-    if isinstance(framed, OrthographicCamera):
-        return framed
-    return replace(framed, distance=framed.distance * factor)
+    if isinstance(framed, PerspectiveCamera):
+        framed = replace(framed, distance=framed.distance * factor)
+    return framed
