@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 # The normals around a vertex cancel if their sum is at most this fraction of the
 # sum of their areas.
 ROUNDING = 64 * torch.finfo(torch.float64).eps
-# With more vertices in the mesh per corner of the given faces, sums are taken
-# over the vertices of these faces alone.
+# If a mesh has more vertices than this number times the corners of the given
+# faces, sums are taken over the vertices of these faces alone.
 FEW = 2
 # Sine of the angle at a corner below which a face is a sliver: plain float64
 # would lose more than about 64 units in the last place.

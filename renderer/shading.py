@@ -90,7 +90,7 @@ def radiance(
         weights = albedo / fragments.samples**2
         shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
     seen = shade * weights.T
-    # With one sample per pixel, samples are pixels, and there is nothing to sum.
+    # Samples are pixels if there is one per pixel. Then there is nothing to sum.
     if fragments.samples > 1:
         zeros = seen.new_zeros(COLORS, len(fragments.pixels))
         seen = zeros.index_add(1, pixel, seen)
@@ -267,7 +267,7 @@ class _Irradiance(torch.autograd.Function):
         del evaluated
         absent = torch.nonzero(lengths == 0).squeeze(1)
         if len(absent):
-            # At the zero vector, the homogeneous polynomials differ from `basis`.
+            # The homogeneous polynomials differ from `basis` at the zero vector.
             degree = math.isqrt(len(light)) - 1
             nonzero, rows = _nonzero_harmonics(directions[:, absent], degree)
             value[:, absent] = light[nonzero].T @ rows

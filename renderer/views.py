@@ -226,7 +226,7 @@ class TransferOperators(Sequence[TransferOperator]):
             rows = slice(first_row, first_row + len(shown))
             first_row = rows.stop
             of_stack = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
-            # From two axes, torch selects ten times as fast as from three.
+            # torch selects ten times as fast from two axes as from three.
             at_pixels = of_stack.flatten(0, 1).index_select(1, stack.pixels)
             coverage = stack.coverage[shown.to(background.device)].to(background)
             term = background_term(coverage, at_pixels.unflatten(0, (-1, COLORS)), encoding)
@@ -265,7 +265,7 @@ class InPlace(torch.autograd.Function):
     ) -> Tensor:
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, covered, strict=True):
-            # On a CPU, index_copy_ takes twice as long as scatter_.
+            # index_copy_ takes twice as long as scatter_ on a CPU.
             images = canvas[rows].scatter_(2, pixels.expand(values.shape), values)
             if isinstance(rows, Tensor):
                 # Indexing with a tensor copies the rows, so write them back.
@@ -277,7 +277,7 @@ class InPlace(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         gradients = []
         for rows, pixels in ctx.targets:
-            # From two axes, torch selects ten times as fast as from three.
+            # torch selects ten times as fast from two axes as from three.
             values = upstream[rows].flatten(0, 1).index_select(1, pixels)
             gradients.append(values.unflatten(0, (-1, COLORS)))
         return None, None, *gradients

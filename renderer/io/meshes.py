@@ -336,7 +336,7 @@ def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> 
     accessors = [tree["accessors"][index] for index in indices]
     if part.get("mode") == FAN or any("sparse" in accessor for accessor in accessors):
         raise ValueError("triangle fans and sparse accessors are not supported")
-    # Without texture coordinates, the positions are checked, which are floats.
+    # The positions take the place of missing texture coordinates. They are floats.
     uvs = tree["accessors"][attributes.get("TEXCOORD_0", attributes["POSITION"])]
     if uvs["componentType"] != FLOAT:
         raise ValueError(
@@ -457,8 +457,8 @@ def _material_color(material: Material) -> tuple[np.ndarray, Image.Image | None]
         factor = material.baseColorFactor
         color = np.ones(3) if factor is None else _unit_rgb(factor)
         return color, material.baseColorTexture
-    # Where an .obj file has no color or no image, trimesh makes them gray. The
-    # color of the file itself is kept under the name "kd".
+    # trimesh sets a gray color and a gray image if an .obj file has none. It keeps
+    # the color of the file itself under the name "kd".
     is_placeholder = material.image == empty_material().image
     image = None if is_placeholder else material.image
     return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image

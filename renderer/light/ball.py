@@ -86,7 +86,7 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
         s = (s + step.clamp(min=0)).clamp(max=1)
-        # At s = 1 the target is the values themselves, without rounding.
+        # The target at s = 1 is the values themselves, without rounding.
         target = torch.where(s < 1, ball.center + s.sqrt() * offset, values)
         nearest = target.clamp(low, high)
         slope = _squared_norm(offset * (nearest == target))

@@ -222,7 +222,7 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     """Read the texels (H, W, C) of an .hdr or .exr file and the names of their channels."""
     image = _openimageio().ImageBuf(str(path))
-    # Without this check, `get_pixels` would end the process.
+    # `get_pixels` would end the process if the file could not be read.
     if not image.read():
         raise InputError(image.geterror())
     texels = image.get_pixels("float")

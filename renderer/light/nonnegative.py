@@ -64,7 +64,7 @@ from renderer.vectors import tangent_axes
 
 Array = NDArray[Any]
 
-# How far results may be below zero, as a fraction of the light's largest radiance.
+# Results may be below zero by this fraction of the light's largest radiance.
 TOLERANCE = 1e-4
 
 # Both functions search for dips of this depth. It is smaller than TOLERANCE,
@@ -75,7 +75,7 @@ _MIN_DIP_DEPTH = TOLERANCE / 10
 _DARK_FRACTION = 1e-6
 # Exchange steps of both functions. Seven are usual.
 _MAX_ROUNDS = 50
-# Times that `project_nonnegative` solves its program before it fills dips.
+# `project_nonnegative` solves its program this many times before it fills dips.
 _MAX_SOLUTIONS = 4
 # Relative error of the distance |x - c| from the radius of a ball.
 _RADIUS_TOLERANCE = 1e-7
@@ -83,9 +83,9 @@ _RADIUS_TOLERANCE = 1e-7
 _MAX_RADIUS_STEPS = 10
 # The smallest denominator, which avoids a division by zero.
 _TINY = 1e-300
-# The grid of directions is an icosphere of the first number of subdivisions,
-# with nodes 0.07 radians apart, up to the degree _COARSE_GRID_DEGREE, and of the second
-# number, with nodes half as far apart, above.
+# The grid of directions is an icosphere. Its nodes are 0.07 radians apart with the
+# coarse number of subdivisions, which is used for lights up to the degree
+# _COARSE_GRID_DEGREE. The nodes of the fine grid are half as far apart.
 _COARSE_SUBDIVISIONS = 4
 _FINE_SUBDIVISIONS = 5
 _COARSE_GRID_DEGREE = 10
@@ -275,8 +275,8 @@ class _Program:
         self._min_t = min(radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
         self.nearest = self._target().clip(low, high)
-        # Of each channel, the harmonics (M, K) of the M directions whose
-        # multipliers are positive.
+        # A channel has the harmonics (M, K) of the M directions whose multipliers
+        # are positive.
         self._active_rows = [original[:0]] * len(original)
 
     def _target(self) -> Array:

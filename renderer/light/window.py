@@ -33,7 +33,7 @@ from renderer.light.program import shortest
 
 # Exchange steps. Eight are usual.
 _MAX_ROUNDS = 100
-# How far the kernel may be below zero, as a fraction of its largest value.
+# The kernel may be below zero by this fraction of its largest value.
 _MAX_DEPTH = 1e-9
 
 

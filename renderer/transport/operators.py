@@ -242,7 +242,7 @@ class TransferOperator:
         """
         unclamped = self._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
-        # At the bounds themselves the gradient passes, as in `renderer.image.clamp`.
+        # The gradient passes at the bounds themselves, as in `renderer.image.clamp`.
         is_passing = unclamped.eq_(clamped)
         rows = self._pixel_rows
         canvas = background.images
@@ -254,7 +254,7 @@ class TransferOperator:
             image_shape = (*batch, *image_shape)
         images = canvas.clone(memory_format=torch.contiguous_format)
         encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
-        # On a CPU, index_copy_ takes twice as long as scatter_.
+        # index_copy_ takes twice as long as scatter_ on a CPU.
         images.scatter_(-1, rows, encoded)
         return images.view(image_shape), is_passing, clamped
 
@@ -265,7 +265,7 @@ class TransferOperator:
 
         The gradient by the images has the shape (*B, 3, size, size).
         """
-        # From two axes, torch selects ten times as fast as from three.
+        # torch selects ten times as fast from two axes as from three.
         by_channel = image_gradient.reshape(-1, self._image_shape[1] * self._image_shape[2])
         covered = by_channel.index_select(1, self.pixels)
         if is_passing.ndim > 2:
@@ -294,8 +294,8 @@ class TransferOperator:
                 f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
                 f"give {self.basis.size} rows"
             )
-        # In small images, this takes half the time of `require_bounded`, which
-        # finds and names the fault.
+        # This takes half the time of `require_bounded` in small images.
+        # `require_bounded` finds and names the fault.
         values = lights.detach().reshape(-1)
         if not torch.dot(values, values).item() <= LARGEST**2:
             require_bounded(lights=lights)
@@ -304,7 +304,7 @@ class TransferOperator:
         """Compute `radiance` without a graph, in a new tensor of the dtype of the lights."""
         dtype = self.transfer.dtype
         nonzero = lights.index_select(-2, self.nonzero)
-        # In small images, even a call that converts nothing takes notable time.
+        # Even a call that converts nothing takes notable time in small images.
         if lights.dtype != dtype:
             nonzero = nonzero.to(dtype)
         if self._shared is not None:
@@ -781,7 +781,7 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     by_channel = albedo.T
     zeros = by_channel.new_zeros(COLORS, len(fragments.pixels))
     by_pixel = zeros.index_copy(1, fragments.pixel, by_channel)
-    # In float64, index_select takes three times as long.
+    # index_select takes three times as long in float64.
     pixel_of_sample = fragments.pixel.expand(COLORS, -1)
     difference = (by_channel - by_pixel.gather(1, pixel_of_sample)).abs_()
     is_equal = difference <= torch.finfo(dtype).eps * by_channel

@@ -106,7 +106,7 @@ class Patches:
         )
         smallest = torch.finfo(areas.dtype).tiny
         fractions = areas / patch_areas.clamp(min=smallest)[pixel]
-        # Without backs, the patch of a back is that of the front.
+        # A closed mesh has no backs. Their patches are then those of the fronts.
         of_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
         return Patches(pieces, view, fractions[:, None], of_side)
 
