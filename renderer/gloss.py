@@ -375,9 +375,9 @@ def sample_gloss(
         roughness_factor, metallic_factor = sample_textures(sources, mesh, fragments)
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
-    if (roughness < LEAST).any():
+    if (roughness < MIN_ROUGHNESS).any():
         warnings.warn(
-            f"Roughness below {LEAST} is shaded as {LEAST}, "
+            f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}, "
             "the smallest roughness that light of degree 40 shows.",
             stacklevel=2,
         )

@@ -24,8 +24,6 @@ from renderer.validation import as_array, require_whole
 
 # Affine matrix that turns the y axis to the z axis.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
-# Largest number of vertices that `subdivide` accepts. They take about 5 GB.
-MOST_VERTICES = 10**7
 # Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
 # Kinds of NumPy types (f: floating, i: signed, u: unsigned) of the arrays of a mesh.
@@ -453,7 +451,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
 
     Args:
         mesh: The mesh.
-        vertices: The number, from 0 to `MOST_VERTICES`.
+        vertices: The number, from 0 to `MAX_VERTICES`.
 
     Returns:
         The subdivided mesh, or the given mesh if it has enough vertices.

@@ -41,9 +41,6 @@ MAX_TEXELS = 10**6
 # `rotate` accepts a matrix R if no entry of R Rᵀ - I is larger. A matrix whose
 # entries were rounded to four digits passes.
 ORTHONORMAL = 1e-3
-# Lights have at most this degree. A glossy surface of roughness 0.2 shows
-# harmonics up to about this degree.
-MAX_DEGREE = 40
 # Diffuse shading ignores the bands above this degree. They change the
 # irradiance under a parallel beam by at most 0.015 of the beam's irradiance.
 DIFFUSE_DEGREE = 20

@@ -33,8 +33,6 @@ from renderer.validation import as_tensor
 
 # The sun's zenith angle in radians, from overhead to the horizon, inclusive.
 ZENITH = (0.0, math.pi / 2)
-# Turbidity from a clear to a hazy sky. The turbidity of pure air would be 1.
-TURBIDITY = (2.0, 10.0)
 
 _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
 # The order m of each coefficient.
