@@ -16,6 +16,7 @@ from renderer.fragments import Fragments
 from renderer.gloss import Gloss, at_samples
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.mesh import Mesh
+from renderer.settings import ImageSettings
 from renderer.transport.rays import NO_FACE, Rays, Surface
 from renderer.vectors import unit, unit_vectors
 
