@@ -637,12 +637,14 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
 
 @cache
 def _radiance_above_least(grid: int) -> NDArray[Any]:
-    """Return the matrix (N, 49) from a light to its radiance in the N directions of a grid.
+    """Return the matrix (N, 49) from the coefficients of a light to its radiance in N directions.
 
-    `LEAST_RADIANCE` times the mean radiance is subtracted.
+    `LEAST_RADIANCE` times the mean radiance of the light is subtracted. The
+    directions are the vertices of an icosphere with `grid` subdivisions.
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
+    # Coefficient 0 alone determines the mean radiance.
     rows[:, 0] *= 1 - LEAST_RADIANCE
     return rows
 

@@ -190,15 +190,18 @@ class _Series(torch.autograd.Function):
     """The sums Σ_k c_k Y_k(n) of C channels at N unit normals.
 
     The normals have the shape (3, N), the coefficients (K, C) and the result
-    (C, N). The bands of either parity are a homogeneous polynomial, whose value
-    follows from its slope.
+    (C, N). On the sphere, the bands of even degree are together one homogeneous
+    polynomial, and so are the bands of odd degree. The value of a polynomial
+    follows from its slope (see the top of this module).
     """
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
         degree = math.isqrt(len(coefficients)) - 1
+        # Band 0 is constant.
         value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
         slope = normals.new_zeros(3, coefficients.shape[1], 1)
+        # The degrees of the two polynomials are the degree and the one below.
         for power in range(max(degree - 1, 1), degree + 1):
             # Shape (3 axes, monomials, K).
             slope_matrices = _slopes(power).to(coefficients)[..., : len(coefficients)]

@@ -397,9 +397,10 @@ class OperatorStack:
         first = self._first_entry[shown]
         count = self._first_entry[shown + 1] - first
         image = torch.arange(len(shown)).repeat_interleave(count)
-        # Entry number n of the result is number n - (entries of the images
-        # before) of its operator.
-        offset = first - count.cumsum(0) + count
+        # The entries of an image are consecutive in the result and in the stack.
+        # The offset leads from their positions in the result to those in the stack.
+        first_in_result = count.cumsum(0) - count
+        offset = first - first_in_result
         entry = torch.arange(len(image)) + offset[image]
         entry = entry.to(self.pixels.device, non_blocking=True)
         image = image.to(self.pixels.device, non_blocking=True)

@@ -131,7 +131,7 @@ def read_map(path: str | Path) -> Tensor:
     if not (np.abs(radiance) <= LARGEST).all():
         raise InputError(
             f"environment map {path} holds NaN, infinity or radiance beyond {LARGEST:g}: "
-            "mend its texels"
+            "replace these values and save it again"
         )
     return torch.from_numpy(radiance)
 

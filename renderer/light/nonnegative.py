@@ -286,7 +286,9 @@ class _Program:
     def add(self, rows: Sequence[Array]) -> None:
         """Add directions, given by their harmonics (M, K) for each channel, and solve again.
 
-        Directions whose multiplier is zero are dropped.
+        Directions whose multiplier is zero are dropped. The loop takes Newton
+        steps on t until the solution x is on the sphere |x − c| = r, or inside
+        of it with t = 1.
         """
         rows = [np.concatenate(pair) for pair in zip(self._active_rows, rows, strict=True)]
         for _ in range(_MAX_RADIUS_STEPS):
@@ -294,16 +296,20 @@ class _Program:
             nearest, self._active_rows = self._project(target, rows)
             displacement = nearest - self._center
             distance = float(np.linalg.norm(displacement))
-            left = self._radius - distance
-            is_inside = self._t == 1 and left > 0
-            if is_inside or abs(left) <= _RADIUS_TOLERANCE * self._radius:
+            missing = self._radius - distance
+            is_inside = self._t == 1 and missing > 0
+            is_on_sphere = abs(missing) <= _RADIUS_TOLERANCE * self._radius
+            if is_inside or is_on_sphere:
                 break
-            added = nearest - target
-            motions = list(map(_motion, self._offset, added, self._active_rows))
+            # The constraints moved each channel by Rᵀ μ.
+            moved_by_constraints = nearest - target
+            motions = list(map(_motion, self._offset, moved_by_constraints, self._active_rows))
             direction = np.stack([motion.light for motion in motions])
-            step = self._step_to_sphere(direction, displacement, left * (self._radius + distance))
+            missing_squared = missing * (self._radius + distance)
+            step = self._step_to_sphere(direction, displacement, missing_squared)
             self._t += step
             if all(motion.keeps_rows(step) for motion in motions):
+                # The solution is affine in t up to here, so the step is exact.
                 displacement = displacement + step * direction
                 break
         scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
@@ -315,15 +321,18 @@ class _Program:
         nearest, active_rows = zip(*solved, strict=True)
         return np.stack(nearest), list(active_rows)
 
-    def _step_to_sphere(self, direction: Array, displacement: Array, left: float) -> float:
+    def _step_to_sphere(
+        self, direction: Array, displacement: Array, missing_squared: float
+    ) -> float:
         """Return the step on t after which |displacement + step direction| is the radius.
 
-        `left` is the squared radius minus the squared displacement. The step
-        keeps t between its minimum and 1.
+        This is the root of a quadratic equation. `missing_squared` is the squared
+        radius minus the squared displacement. The step keeps t between its
+        minimum and 1.
         """
         speed = float((direction * direction).sum())
         slope = float((direction * displacement).sum())
-        root = math.sqrt(max(slope**2 + speed * left, 0))
+        root = math.sqrt(max(slope**2 + speed * missing_squared, 0))
         step = (root - slope) / max(speed, _TINY)
         return min(max(step, self._min_t - self._t), 1 - self._t)
 

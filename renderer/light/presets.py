@@ -233,6 +233,7 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)
-    if not luminance > 0:
-        raise InputError(f"environment map {path} is black: give a map with light in it")
-    return (coefficients * (mean_luminance(probe(_REFERENCE_PROBE)) / luminance)).float()
+    if luminance <= 0:
+        raise InputError(f"environment map {path} is black: give a map with positive radiance")
+    scale = mean_luminance(probe(_REFERENCE_PROBE)) / luminance
+    return (coefficients * scale).float()

@@ -124,11 +124,16 @@ def local_transfer(
     paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
     weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None]
     weights = weights / fragments.samples**2
-    # Several paths, from the samples of a pixel, contribute to one entry.
-    key_of_path = fragments.pixel[paths.point] * basis.size + paths.function
-    keys, entry_of_path = key_of_path.unique(return_inverse=True)
-    summed = weights.new_zeros(len(keys), albedo.shape[1]).index_add_(0, entry_of_path, weights)
-    return SparseTransfer(keys % basis.size, keys // basis.size, summed)
+    # All paths with the same pixel and the same function belong to one entry. The
+    # pair of both is written as one number, which is sorted faster.
+    pair_of_path = fragments.pixel[paths.point] * basis.size + paths.function
+    pairs, entry_of_path = pair_of_path.unique(return_inverse=True)
+    zeros = weights.new_zeros(len(pairs), albedo.shape[1])
+    return SparseTransfer(
+        function=pairs % basis.size,
+        pixel=pairs // basis.size,
+        weight=zeros.index_add_(0, entry_of_path, weights),
+    )
 
 
 def local_radiance(

@@ -359,7 +359,11 @@ class TransferOperator:
         return self._kept_background["prepared"]
 
     def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
-        """Prepare background images (*B, 3, size, size) for lights (*B, coefficients, 3)."""
+        """Flatten background images, and compute what they add to the covered pixels.
+
+        The images have the shape (*B, 3, size, size), and the lights
+        (*B, coefficients, 3).
+        """
         flat = images.flatten(-2)
         at_pixels = flat.index_select(-1, self.pixels)
         if self.settings.encoding != "linear":
@@ -958,7 +962,11 @@ def _glossy_box_filter(
 
 
 def _diffuse_rows(gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int) -> Tensor:
-    """Return the diffuse radiance per albedo (S, K) of samples below their coat."""
+    """Return the diffuse radiance of samples per unit of albedo and of each coefficient.
+
+    The shape is (S, K) for unit normals (S, 3) and K coefficients of environment
+    light. The light passes the coat of gloss twice.
+    """
     entering = harmonics.basis(normals, degree) * gloss.entering_bands(degree).T
     return entering * gloss.diffuse(normals, to_camera)[:, None]
 
