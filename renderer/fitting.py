@@ -70,13 +70,14 @@ PLAUSIBLE = 3
 # squares of what the best channel shows of a uniform light. It bounds light that
 # the object does not show.
 SMOOTH = 1e-6
-# Pixel values from here on are clipped: the scene may be brighter.
+# Pixels of the photograph with this linear value or more count as clipped. The
+# scene may have been brighter there.
 CLIPPED = 0.995
 # The light is solved for as many times, each time with the clipped pixels of the
 # solution before.
 CLIPPING_ROUNDS = 3
-# Smallest radiance in the directions of a grid, as a fraction of the mean radiance.
-# The radiance between these directions is then positive.
+# The light is at least this fraction of its mean radiance in the directions of a
+# grid. This margin keeps it positive in the directions between them.
 LEAST_RADIANCE = 0.01
 # Largest number of iterations of non-negative least squares per direction. Three
 # are usual.
@@ -552,7 +553,7 @@ class _Descent:
         return moved
 
     def _residuals(self, values: np.ndarray) -> np.ndarray:
-        """Return the residuals (N,) of the camera of the five values."""
+        """Return the residuals (N,) of the target, for the camera of the five values."""
         return self._target.fitted(self._camera_of(values)).residuals.numpy()
 
     def _jacobian(self, values: np.ndarray) -> np.ndarray:

@@ -268,7 +268,8 @@ def _closed_parts(faces: bytes) -> np.ndarray | None:
     corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
     edges = corners[:, EDGES].reshape(-1, 2)
     vertex_count = corners.max(initial=0) + 1
-    # One number for each directed edge, and that of the opposite direction.
+    # Each edge from vertex a to vertex b gets the number a · V + b, and in the
+    # opposite direction b · V + a. In a closed mesh, both sets of numbers are equal.
     forward = edges @ [vertex_count, 1]
     backward = edges @ [1, vertex_count]
     by_forward = np.argsort(forward)
@@ -276,7 +277,8 @@ def _closed_parts(faces: bytes) -> np.ndarray | None:
     is_repeated = (np.diff(forward[by_forward]) == 0).any()
     if is_repeated or not np.array_equal(forward[by_forward], backward[by_backward]):
         return None
-    # A face has three edges in a row, so an edge divided by 3 is its face.
+    # Row i of the sorted lists is one edge of two faces. The edges 3 f to 3 f + 2
+    # are those of face f.
     neighbors = np.stack([by_forward, by_backward], axis=1) // 3
     return connected_component_labels(neighbors, node_count=len(corners))
 

@@ -408,10 +408,12 @@ class OperatorStack:
 
 
 def _rank_in_row(row: Tensor, counts: Tensor) -> Tensor:
-    """Return how many earlier items have the same row, for the rows (A,) of items.
+    """Return for each item how many earlier items have the same row, shape (A,).
 
-    `counts` is the number of items in each row.
+    `row` (A,) is the row of each item, and `counts` the number of items of each
+    row. For example, the rows 1, 0, 1 give 0, 0, 1.
     """
+    # The items of a row are neighbors in this order, earlier items first.
     order = row.argsort(stable=True)
     first_in_order = counts.cumsum(0) - counts
     rank_in_order = torch.arange(len(row)) - first_in_order[row[order]]

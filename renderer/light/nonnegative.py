@@ -172,9 +172,10 @@ def _project_with_mean(light: Array) -> Array:
 
 
 def _mix_to_nonnegative(light: Array, brighter: Array, rows: Array) -> Array:
-    """Return light + s (brighter - light), (K,), for the smallest s ≥ 0 that gives rows · x ≥ 0.
+    """Mix a light (K,) with a brighter one, so that it is non-negative in R directions.
 
-    The rows (R, K) are the harmonics of R directions.
+    The result is light + s (brighter - light) with the smallest possible s ≥ 0.
+    The rows (R, K) are the harmonics of the directions.
     """
     radiance = rows @ light
     added = rows @ (brighter - light)
@@ -369,10 +370,11 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
 
     The second result holds the rows with positive multipliers.
 
-    All constraints together are G (x - original) ≥ h. Non-negative least
-    squares minimize |E u − f| for E = [Gᵀ; hᵀ], f = (0, ..., 0, 1) and u ≥ 0.
-    The residual r gives x - original = −r_j / r_(K+1) (algorithm LDP of Lawson
-    and Hanson).
+    All constraints together are G d ≥ h for the difference d = x - original.
+    Algorithm LDP of Lawson and Hanson finds the shortest d. It solves a problem of
+    non-negative least squares: the u ≥ 0 that minimizes |E u − f|, with the rows
+    of Gᵀ and then hᵀ in E, and f = (0, ..., 0, 1). With the residual
+    r = E u − f of size K + 1, the result is d_j = −r_j / r_(K+1).
     """
     if not len(rows):
         return original, rows
@@ -380,19 +382,22 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
     scale = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
-    sides = np.concatenate([rows, axes, -axes])
+    # These are G and h. Dividing h by the norm of the light divides d by it, too.
+    left_sides = np.concatenate([rows, axes, -axes])
     from_low = (low - original)[is_bounded]
     from_high = (original - high)[is_bounded]
-    bounds = np.concatenate([-rows @ original, from_low, from_high])
-    dual = np.concatenate([sides.T, bounds[None] / scale])
-    multipliers, _ = nnls(dual, np.eye(size + 1)[size])
+    right_sides = np.concatenate([-rows @ original, from_low, from_high])
+    dual = np.concatenate([left_sides.T, right_sides[None] / scale])
+    last_unit_vector = np.eye(size + 1)[size]
+    multipliers, _ = nnls(dual, last_unit_vector)
     residual = dual @ multipliers
     residual[size] -= 1
     if residual[size] > -(_MIN_DIP_DEPTH**2):
         # The bounds leave no room beyond rounding.
         return original.clip(low, high), rows
     nearest = original - residual[:size] / residual[size] * scale
-    return nearest.clip(low, high), rows[multipliers[: len(rows)] > 0]
+    is_active = multipliers[: len(rows)] > 0
+    return nearest.clip(low, high), rows[is_active]
 
 
 def _find_dips(lights: Array, dark: Array, limits: _NodeLimits) -> tuple[Array, Array]:

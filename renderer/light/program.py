@@ -8,9 +8,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 
-# Relative error of the inequalities, and of the duality gap.
+# `shortest` stops if the errors of the inequalities and of the duality gap, the sum
+# of the products of slacks and multipliers, are at most this fraction.
 _TOLERANCE = 1e-9
-# Relative error of y = sidesᵀ multipliers.
+# It also requires that y = sidesᵀ multipliers holds up to this relative error.
 _STATIONARITY_TOLERANCE = 1e-6
 # Steps of the method. 15 to 40 are usual.
 _MAX_STEPS = 80

@@ -172,12 +172,14 @@ class Transport:
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
+        # Patches are only needed for bounces. Rays then hit the pieces of patches.
         self._patches = Patches.of(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         self._directions = sphere(rays.DIRECTIONS)
         self._sky = basis.radiance(self._directions)
         self.colors = False
         if self._patches:
+            # The radiance that patches send, shape (N, size, 3), or (N, size, 1) if gray.
             self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
             self.colors = self._sent.shape[2] > 1
 
