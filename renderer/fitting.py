@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 POLAR = (20, 40, 60, 80, 100)
 AZIMUTHS = 16
 FIRST_WIDTH = 2.0
-# Pixels per side of the images of the search.
+# `fit_scene` first searches for cameras in images of this many pixels per side.
 COARSE = 32
 # Descents start from as many of the best cameras of the search.
 KEPT = 3
-# Largest number of steps of a descent.
+# Largest number of Gauss-Newton steps from one camera.
 STEPS = 20
 # Relative change of the squared error, or of the camera, at which a descent ends.
 LEAST_GAIN = 1e-3
@@ -491,7 +491,7 @@ class _Target(NamedTuple):
         return decode(image, self.options.encoding).flatten(1)
 
     def scene(self, camera: Camera) -> FittedScene:
-        """Fit the light of a camera and measure how well they fit."""
+        """Fit the light for a camera, and compare the render with the target."""
         fit = self.fitted(camera, WHOLE, FINAL_GRID)
         image = self.rendered(camera, fit.light)
         is_inside = self.mask > WHOLE

@@ -365,7 +365,9 @@ def _even(degree: int) -> int:
 def _slopes(degree: int) -> Tensor:
     """Return the slope of r^degree Y_k in monomials, shape (3 axes, monomials, (degree + 1)²).
 
-    Columns of band 0 and of bands of the other parity are zero.
+    The polynomial r^degree Y_k, with the length r of the normal, belongs to the
+    harmonic of index k (see `harmonics.homogeneous_gradients`). Columns of band 0
+    and of bands of the other parity are zero.
     """
     band = harmonics.bands(degree)
     gradients = harmonics.homogeneous_gradients(degree)[:, : degree**2]

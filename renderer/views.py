@@ -221,7 +221,7 @@ class TransferOperators(Sequence[TransferOperator]):
         targets = []
         covered = []
         for stack in self._stacks:
-            # The operator in the stack that each image shows.
+            # This is the index in the stack of the operator that each image shows.
             shown = torch.arange(len(stack.shown)).repeat_interleave(lights_per_view)
             rows = slice(first_row, first_row + len(shown))
             first_row = rows.stop

@@ -242,7 +242,10 @@ def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
 
 @contextmanager
 def _recorded_omissions() -> Iterator[list[str]]:
-    """Return a list that grows by each omission that trimesh writes to its log."""
+    """Record what trimesh writes to its log about omissions while a `with` block runs.
+
+    The list holds a sentence for each omission.
+    """
     recorder = _OmissionRecorder()
     log = trimesh.util.log
     level = log.level

@@ -369,6 +369,8 @@ def irradiance_error(
         Relative errors of shape (...), float64. The error is 0 if both lights
         are dark.
     """
+    # Harmonics are orthonormal, so the mean square over all normals is in proportion
+    # to the sum of the squared coefficients of the irradiance.
     size = max(lights.shape[-2], given.shape[-2])
     factors = lambertian_factors(math.isqrt(size) - 1)[:, None].to(given.device)
     approximate = _pad_bands(lights.double(), size) * factors
