@@ -2,10 +2,11 @@
 
     python -m benchmarks.gpu --out gpu.jsonl
 
-The command checks first (tests/train/system/test_gpu.py), then measures. A question that fails has a line with its
-error, and the next one is asked. Meshes, data and networks are the project's own. Where there are several GPUs,
-`training` runs on one and on all of them. --device cpu rehearses what needs no CUDA. A machine without an index of packages installs what
-`pip download -d wheels ".[test]"` brings elsewhere: pip install --no-index --find-links wheels ".[test]"
+The command checks first (tests/train/system/test_gpu.py), then measures. A question that fails has a line
+with its error, and the next one is asked. Meshes, data and networks are the project's own. Where there are
+several GPUs, `training` runs on one and on all of them. --device cpu rehearses what needs no CUDA. A machine
+without an index of packages installs what `pip download -d wheels ".[test]"` brings elsewhere: pip install
+--no-index --find-links wheels ".[test]"
 """
 
 import argparse

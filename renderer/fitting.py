@@ -1,18 +1,21 @@
 """Estimate the camera and the light of a photograph of a mesh.
 
-All pixels outside the mesh are set to one gray, so that the image shows outline and shading at once. For each camera,
-the best light is the solution of a convex quadratic program: images are linear in the light, and its radiance must not
-be negative. So the differences of the pixels are a function of the camera alone (variable projection, Golub and
-Pereyra 1973), whose squares the Gauss-Newton method minimizes.
+All pixels outside of the mesh are set to one gray value, so that an image shows
+silhouette and shading at once. For each camera, the best light is the solution
+of a convex quadratic program, because images are linear in the light and the
+radiance of the light must not be negative. The differences of the pixels are
+therefore a function of the camera alone (variable projection, Golub and Pereyra
+1973). The Gauss-Newton method minimizes the sum of their squares.
 
-Light and albedo appear as their product: an albedo twice as large halves the light.
+Light and albedo only appear as their product: doubling the albedo halves the
+light.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +27,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, nnls
 from torch import Tensor
 
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.camera import Camera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.shapes import sphere
@@ -37,36 +40,81 @@ from renderer.rendering import precompute_transfer, render
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
-POLAR, AZIMUTHS = (20, 40, 60, 80, 100), 16  # cameras to begin with: degrees off +z, and so many around it
-COARSE, KEPT = 32, 3  # Pixels per side of the first search, and how many of its best cameras start a descent.
-STEPS = 20  # Steps of descent from each camera.
-LEAST_GAIN = 1e-3  # Relative change of the squared error, or of the camera, at which a descent ends.
-# Steps of the differences by polar angle, azimuth, relative width, right and up, as multiples of 1 / size.
+# The search begins with cameras at these angles from +z in degrees, and at as
+# many azimuths for each of them. All have the same width in world units.
+POLAR = (20, 40, 60, 80, 100)
+AZIMUTHS = 16
+FIRST_WIDTH = 2.0
+# `fit_scene` first searches for cameras in images of this many pixels per side.
+COARSE = 32
+# Descents start from as many of the best cameras of the search.
+KEPT = 3
+# Largest number of Gauss-Newton steps from one camera.
+STEPS = 20
+# Relative change of the squared error, or of the camera, at which a descent ends.
+LEAST_GAIN = 1e-3
+# Steps of the numerical derivatives by polar angle, azimuth, relative width, right
+# and up, as multiples of 1 / size. A step to the right is half a pixel.
 DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
-SAMPLES = 8  # Samples per side of a pixel.
-DISTINCT = math.radians(2)  # Cameras whose axes differ by less count as one.
-PLAUSIBLE = 3  # Cameras with this multiple of the least squared error are compared at the full size.
-# Weight of the squared Laplacian of the light, or of its difference from what the best channel lets expect, relative to
-# what that channel shows of a constant light. It bounds light that is not seen.
+# Smallest angle between +z or -z and the camera in a descent, in radians.
+POLE_DISTANCE = 0.02
+# Samples per side of a pixel.
+SAMPLES = 8
+# Cameras whose axes differ by a smaller angle in radians count as one.
+DISTINCT = math.radians(2)
+# Cameras of the search are compared at the full size if their squared error is at
+# most this multiple of the smallest one.
+PLAUSIBLE = 3
+# Weight of the squared Laplacian of the light, or of its difference from the
+# expected light of a channel (see `_light_of_channels`). It is relative to the
+# squares of what the best channel shows of a uniform light. It bounds light that
+# the object does not show.
 SMOOTH = 1e-6
-CLIPPED = 0.995  # Pixel values from here on are clipped: the scene may be brighter.
-CLIPPING_ROUNDS = 3  # Solutions of the light, each with the clipped pixels of the solution before.
-LEAST_RADIANCE = 0.01  # Of the mean radiance, in the directions of a grid. Between them, radiance is then above zero.
-MOST_EXCHANGES = 100  # Iterations of non-negative least squares per direction; three are usual.
-FIRST_DIRECTIONS = 16  # Every so many directions of a grid constrain the first solution.
-SEARCH_GRID, FINAL_GRID = 2, 5  # Subdivisions of the grid of directions, for the camera and for the returned light.
-# Pixels with a larger share are the object's. A hundredth of a background may be brighter than the blue of a banana.
+# Pixels of the photograph with this linear value or more count as clipped. The
+# scene may have been brighter there.
+CLIPPED = 0.995
+# The light is solved for as many times, each time with the clipped pixels of the
+# solution before.
+CLIPPING_ROUNDS = 3
+# The light is at least this fraction of its mean radiance in the directions of a
+# grid. This margin keeps it positive in the directions between them.
+LEAST_RADIANCE = 0.01
+# Largest number of iterations of non-negative least squares per direction. Three
+# are usual.
+MOST_EXCHANGES = 100
+# One of as many directions of a grid constrains the first solution.
+FIRST_DIRECTIONS = 16
+# Subdivisions of the grid of directions while a camera is sought, and for the
+# light that is returned.
+SEARCH_GRID = 2
+FINAL_GRID = 5
+# Pixels in which the object has a larger share belong to the object. At a smaller
+# limit, the background could outshine the object: a hundredth of a bright
+# background may be brighter than the blue of a banana.
 WHOLE = 0.999
-BORDER = 2  # Other pixels take their color from the object's pixels that are so near.
-MARGIN = 1.6  # The side of an object's window, in those of its box.
-OPAQUE = 127  # A mask with larger values holds the object.
-USUAL_POLAR = math.radians(60)  # The first guess of how far the camera looks from straight down.
-TILTED = 1e-3  # Radians that a window may be turned about its middle.
-LEAST = 16  # Pixels that the object must cover.
+# Pixels on the border of the object take their color from the object's pixels at
+# this distance or less.
+BORDER = 2
+# Side of the window of an object, as a multiple of the longer side of its box.
+MARGIN = 1.6
+# A pixel of a mask belongs to the object if its value is larger.
+OPAQUE = 127
+# First guess of the camera's angle from +z, in radians.
+USUAL_POLAR = math.radians(60)
+# If the axes of a window change by more, the window is cut anew.
+TILTED = 1e-3
+# Number of pixels that the object must cover.
+LEAST = 16
+COLORS = 3
 
 
 class FittedPhotograph(NamedTuple):
-    """A scene whose camera looks at the mesh's middle, and the part of the photograph that this camera shows."""
+    """The result of `fit_photograph`.
+
+    Attributes:
+        scene: Camera and light. The camera looks at the center of the mesh.
+        window: The part of the photograph that this camera shows.
+    """
 
     scene: FittedScene
     window: Window
@@ -77,10 +125,12 @@ class FittedScene(NamedTuple):
 
     Attributes:
         camera: The camera.
-        light: Coefficients, shape (49, 3), of a radiance that is nowhere negative.
-        error: Root mean square of the differences in linear light over the object's pixels, divided by that of the
-            photograph.
-        overlap: Intersection over union of the rendered and the given outline.
+        light: SH coefficients of a light with non-negative radiance, shape
+            (49, 3).
+        error: Root mean square of the differences in linear light over the
+            pixels of the object, divided by that of the photograph.
+        overlap: Intersection over union of the rendered and the given
+            silhouette.
     """
 
     camera: Camera
@@ -101,18 +151,21 @@ def fit_photograph(
 ) -> FittedPhotograph:
     """Find the camera and the light of an object anywhere in a photograph.
 
-    The object's window is turned to it (`renderer.photograph`). Which way is up there depends on how high the camera
-    stands, so that the window and the camera are found anew if a first fit says that the window was tilted.
+    The object is seen through a window, as by a camera that is turned towards it
+    (`renderer.photograph`). Which way is up in the window depends on how high the
+    camera stands. Window and camera are therefore found again if the first fit
+    shows that the window was tilted.
 
     Args:
-        photograph: Pixels of 8 bits, shape (H, W, 3). Its camera is upright, and its optical axis passes through the
-            photograph's middle.
+        photograph: Pixels of 8 bits, shape (H, W, 3). Its camera is upright, and
+            its optical axis passes through the center of the photograph.
         mask: White where the object is, shape (H, W).
         mesh: The mesh, normalized and upright.
         size: Pixels per side that are compared.
-        fov: Angle across a square `MARGIN` times as wide as the object, in radians. None for a camera without
-            perspective.
-        encoding: Encoding of the photograph and of the images that are to be rendered, linear or srgb.
+        fov: Angle across a square `MARGIN` times as wide as the object, in
+            radians. None for a camera without perspective.
+        encoding: Encoding of the photograph and of the images that are to be
+            rendered, "linear" or "srgb".
         **options: Further arguments of `fit_scene`.
 
     Returns:
@@ -121,53 +174,96 @@ def fit_photograph(
     Raises:
         InputError: If the mask holds no object.
     """
-    rows, columns = (np.flatnonzero((mask > OPAQUE).any(axis)) for axis in (1, 0))
+    is_object = mask > OPAQUE
+    rows = np.flatnonzero(is_object.any(axis=1))
+    columns = np.flatnonzero(is_object.any(axis=0))
     if not len(rows):
-        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
+        raise InputError(
+            "no object is found: give a mask that is white where it is, or a box around it"
+        )
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
-    whole = Photograph(photograph, None if fov is None else side / 2 / math.tan(fov / 2))
-    options = {**options, "fov": fov, "encoding": encoding}
+    focal_length = None if fov is None else side / 2 / math.tan(fov / 2)
+    camera_image = Photograph(photograph, focal_length)
+    fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
 
-    def fit(window: Window, start: Camera | None) -> FittedScene:
-        linear = window.cut(photograph, size, encoding)
-        share = window.cut(mask[..., None], size, beyond=0)[0]
-        return fit_scene(linear, share, mesh, start=start, **options)
-
-    window = whole.window(center, side, np.array([0.0, math.sin(USUAL_POLAR), math.cos(USUAL_POLAR)]))
-    scene = fit(window, None)
-    above = _direction_above(scene.camera, window)
-    above[0] = 0  # The photograph's camera is upright.
-    upright = whole.window(center, side, above)
+    up_at_usual_angle = np.array([0.0, math.sin(USUAL_POLAR), math.cos(USUAL_POLAR)])
+    window = camera_image.window(center, side, up_at_usual_angle)
+    scene = fit.fit(window, None)
+    up = _up_direction(scene.camera, window)
+    # The camera of the photograph is upright.
+    up[0] = 0
+    upright = camera_image.window(center, side, up)
     if np.abs(upright.axes - window.axes).max() > TILTED:
         window = upright
-        scene = fit(window, scene.camera)
+        scene = fit.fit(window, scene.camera)
     camera = scene.camera
-    above = _direction_above(camera, window)
-    middle = window.pixels(*(np.array([camera.right, camera.up]) * side / camera.width))
-    turned = _turned_to_mesh(camera)
-    return FittedPhotograph(scene._replace(camera=turned), whole.window(np.array(middle), side, above))
+    up = _up_direction(camera, window)
+    shift = np.array([camera.right, camera.up]) * side / camera.width
+    mesh_center = np.array(window.pixels(*shift))
+    turned_scene = scene._replace(camera=_turned_to_mesh(camera))
+    return FittedPhotograph(turned_scene, camera_image.window(mesh_center, side, up))
 
 
-def _direction_above(camera: Camera, window: Window) -> NDArray[Any]:
-    """Return the world's z axis in the axes of the photograph's camera, of a camera that shows a window."""
+@dataclass(frozen=True)
+class _WindowFit:
+    """A photograph with a mask and a mesh, which is fitted in windows of the photograph.
+
+    `options` are arguments of `fit_scene`.
+    """
+
+    photograph: NDArray[Any]
+    mask: NDArray[Any]
+    mesh: Mesh
+    size: int
+    options: dict[str, Any]
+
+    def fit(self, window: Window, start: Camera | None) -> FittedScene:
+        """Fit camera and light in one window, from a camera nearby if one is given."""
+        linear = window.cut(self.photograph, self.size, self.options["encoding"])
+        share = window.cut(self.mask[..., None], self.size, beyond=0)[0]
+        return fit_scene(linear, share, self.mesh, start=start, **self.options)
+
+
+def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
+    """Return the world's z axis in the axes of the photograph's camera.
+
+    `camera` is the camera that shows the window.
+    """
     return window.axes.T @ camera.axes()[:, 2]
 
 
 def _turned_to_mesh(camera: Camera) -> Camera:
-    """Turn a camera at its place, so that it looks at the mesh's middle.
+    """Return a camera at the same place that looks at the center of the mesh.
 
-    A camera with perspective sees the mesh from another angle than that of its optical axis if the mesh is not in the
-    middle of the image.
+    If the mesh is not in the center of the image, a camera with perspective sees
+    it from another angle than that of the optical axis.
     """
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
     x, y, z = camera.eye()[:3].tolist()
     distance = math.hypot(x, y, z)
-    polar = math.acos(z / distance)
-    azimuth = math.atan2(y, x)
-    width = camera.width * distance / camera.distance
-    return replace(camera, polar=polar, azimuth=azimuth, width=width, right=0.0, up=0.0, distance=distance)
+    return replace(
+        camera,
+        polar=math.acos(z / distance),
+        azimuth=math.atan2(y, x),
+        width=camera.width * distance / camera.distance,
+        right=0.0,
+        up=0.0,
+        distance=distance,
+    )
+
+
+@dataclass(frozen=True)
+class _RenderOptions:
+    """Arguments of `render` and of `precompute_transfer`, as `fit_scene` has them."""
+
+    albedo_scale: float
+    encoding: str
+    normals: str
+    rasterizer: str
+    samples: int = SAMPLES
+    bounces: int = 0
 
 
 def fit_scene(
@@ -183,23 +279,28 @@ def fit_scene(
     rasterizer: str = "auto",
     start: Camera | None = None,
 ) -> FittedScene:
-    """Find the camera and the environment light under which renders of a normalized mesh resemble a photograph most.
+    """Find the camera and the light whose render of a mesh resembles a photograph most.
 
-    The camera is upright, and its optical axis may lie outside the image's middle (`Camera.right`, `Camera.up`).
+    The light is environment light. The camera is upright, and its optical axis may
+    lie outside of the center of the image (`Camera.right`, `Camera.up`).
 
     Args:
-        photograph: Linear values in [0, 1], shape (3, size, size). Values of 1 count as clipped.
+        photograph: Linear values in [0, 1], shape (3, size, size). Values of 1
+            count as clipped.
         mask: The object's share of each pixel in [0, 1], shape (size, size).
         mesh: The mesh, normalized and upright.
-        fov: Angle between the image's sides in radians. None for a camera without perspective.
+        fov: Angle between the sides of the image in radians. None for a camera
+            without perspective.
         albedo_scale: Factor of the mesh's albedo.
-        encoding: Encoding of the images that are to be rendered with the result, linear or srgb. It says whether the
-            mesh's colors are decoded, as in `render`. The photograph is linear in either case.
-        normals: flat or smooth.
-        bounces: Bounces of the returned light, with shadows. Without them, the light of a concave mesh is too bright
-            or too dim. The search for the camera ignores shadows.
-        rasterizer: auto, opengl, numba or numpy.
-        start: A camera near the one that is sought. None searches for one.
+        encoding: Encoding of the images that are to be rendered with the result,
+            "linear" or "srgb". With "srgb", the colors of the mesh are decoded, as
+            in `render`. The photograph is linear in either case.
+        normals: "flat" or "smooth".
+        bounces: Bounces of the returned light, with shadows. Without them, the
+            light of a concave mesh is too bright or too dim. The search for the
+            camera ignores shadows.
+        rasterizer: "auto", "opengl", "numba" or "numpy".
+        start: A camera near the one that is sought. None to search for one.
 
     Returns:
         The camera, the light, and how well they fit.
@@ -208,13 +309,20 @@ def fit_scene(
         InputError: If the mask holds no object, or if shapes do not fit.
     """
     size = photograph.shape[-1]
-    if photograph.shape != (3, size, size) or mask.shape != (size, size):
+    if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
-        raise InputError(f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)")
-    if float(mask.sum()) < LEAST:
-        raise InputError(f"the mask covers {float(mask.sum()):.0f} pixels of {size}²: give one that shows the object")
-    options = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals, "rasterizer": rasterizer}
-    photograph, mask = photograph.double(), mask.double()
+        raise InputError(
+            f"photograph and mask of shapes {given} do not fit: "
+            "give (3, size, size) and (size, size)"
+        )
+    covered = float(mask.sum())
+    if covered < LEAST:
+        raise InputError(
+            f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object"
+        )
+    options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
+    photograph = photograph.double()
+    mask = mask.double()
     fine = _Target.of(photograph, mask, mesh, size, options)
     if start is None:
         coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
@@ -222,28 +330,34 @@ def fit_scene(
     else:
         starts = [start]
     _, camera = fine.ranked(fine.descended(camera) for camera in starts)[0]
-    return fine._replace(options={**options, "bounces": bounces}).scene(camera)
+    with_bounces = replace(options, bounces=bounces)
+    return fine._replace(options=with_bounces).scene(camera)
 
 
 def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
-    """Search for cameras at a coarse size, of which one is near the best one."""
+    """Return a few cameras, one of which should be near the best one.
+
+    They are sought in small images.
+    """
     mesh = coarse.mesh
-    cameras = [
-        camera.seeing(float(np.linalg.norm(mesh.vertices, axis=1).max()))
-        for polar in POLAR
-        for camera in orbit_cameras(AZIMUTHS, 2.0, math.radians(polar), fov=fov)
-    ]
-    framed = [camera for _, camera in coarse.ranked(_framed(camera, mesh, mask) for camera in cameras)]
-    # Of a round object, all azimuths fit alike: so the best of each polar angle, too.
-    of_polar = {camera.polar: camera for camera in reversed(framed)}
-    starts = dict.fromkeys([*framed[:KEPT], *of_polar.values()])
+    radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
+    cameras = []
+    for polar in POLAR:
+        for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, math.radians(polar), fov=fov):
+            cameras.append(_framed(camera.seeing(radius), mesh, mask))
+    framed = [camera for _, camera in coarse.ranked(cameras)]
+    # All azimuths fit a round object equally well. The best camera of each polar
+    # angle is therefore a start, too.
+    best_of_polar = {camera.polar: camera for camera in reversed(framed)}
+    starts = dict.fromkeys([*framed[:KEPT], *best_of_polar.values()])
     descended = coarse.ranked(coarse.descended(camera) for camera in starts)
-    least = descended[0][0]
-    return _distinct([camera for error, camera in descended if error <= PLAUSIBLE * least])[:KEPT]
+    smallest_error, _ = descended[0]
+    plausible = [camera for error, camera in descended if error <= PLAUSIBLE * smallest_error]
+    return _distinct(plausible)[:KEPT]
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
-    """Keep the first of all cameras whose axes differ by less than `DISTINCT`."""
+    """Return the cameras, except those whose axes are near the axes of an earlier one."""
     kept: list[Camera] = []
     for camera in cameras:
         cosines = [float((camera.axes() * other.axes()).sum(1).min()) for other in kept]
@@ -252,153 +366,246 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
     return kept
 
 
+class _LightFit(NamedTuple):
+    """The best light for a camera.
+
+    Attributes:
+        residuals: Differences of the pixels and square roots of the penalties,
+            whose squares sum to the error, shape (N,).
+        light: SH coefficients, shape (49, 3).
+        coverage: Rendered coverage of each pixel, shape (size²,).
+    """
+
+    residuals: Tensor
+    light: Tensor
+    coverage: Tensor
+
+
 class _Target(NamedTuple):
-    """What renders should look like: image (3, size²), linear, gray where the mask (size²,) is 0."""
+    """The image that renders should resemble.
+
+    Attributes:
+        image: Linear values, shape (3, size²), gray where the mask is 0.
+        mask: The object's share of each pixel, shape (size²,).
+        gray: Linear value outside of the object, 0 or 1.
+        mesh: The mesh.
+        size: Pixels per side.
+        options: How the mesh is rendered.
+    """
 
     image: Tensor
     mask: Tensor
     gray: float
     mesh: Mesh
     size: int
-    options: dict[str, Any]
+    options: _RenderOptions
 
     @staticmethod
-    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: dict[str, Any]) -> _Target:
-        inside = (mask > WHOLE).double()[None]
-        near, weight = (F.avg_pool2d(values, 2 * BORDER + 1, 1, BORDER) for values in (photograph * inside, inside))
-        photograph = torch.where(inside > 0, photograph, near / weight.clamp(min=1e-9))  # without background
-        photograph, mask = (
-            F.interpolate(image[None], (size, size), mode="area")[0] for image in (photograph * mask, mask[None])
-        )
-        gray = 0.0 if float(photograph.sum()) > 1.5 * float(mask.sum()) else 1.0  # far from the object's own
-        image = photograph + gray * (1 - mask)
+    def of(
+        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
+    ) -> _Target:
+        """Resample a photograph (3, H, H) and a mask (H, H), and remove the background.
+
+        Pixels on the border of the object show a mixture of object and background.
+        They get the mean color of the object's pixels around them.
+        """
+        is_inside = (mask > WHOLE).double()[None]
+        window = 2 * BORDER + 1
+        near = F.avg_pool2d(photograph * is_inside, window, 1, BORDER)
+        weight = F.avg_pool2d(is_inside, window, 1, BORDER)
+        color = torch.where(is_inside > 0, photograph, near / weight.clamp(min=1e-9))
+        object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
+        mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
+        # The gray value is far from the object's own brightness.
+        is_bright = float(object_image.sum()) > 0.5 * COLORS * float(mask.sum())
+        gray = 0.0 if is_bright else 1.0
+        image = object_image + gray * (1 - mask)
         return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
 
-    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> tuple[Tensor, Tensor, Tensor]:
+    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> _LightFit:
         """Fit the light for a camera.
 
         Args:
             camera: The camera.
-            least: The light is fitted to the pixels of which mesh and mask cover at least this share.
-            grid: Subdivisions of the grid of directions in which the light is at least `LEAST_RADIANCE`.
-
-        Returns:
-            The residuals, whose squares sum to the error with the penalty, the light (49, 3) and the coverage (size²,).
+            least: Share of a pixel that both mesh and mask must cover, so that the
+                pixel counts.
+            grid: Subdivisions of the grid of directions in which the light is at
+                least `LEAST_RADIANCE`.
         """
-        [operator] = precompute_transfer(self.mesh, camera, self.size, samples=SAMPLES, **self.options)
-        units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, 3)
-        shown = operator.radiance(units).permute(1, 0, 2)  # (3, 49, P)
-        coverage = self.mask.new_zeros(self.size**2).index_copy(0, operator.pixels, operator.coverage.double())
-        behind = self.gray * (1 - coverage)
-        image = self.image[:, operator.pixels]
-        seen = (torch.minimum(coverage, self.mask)[operator.pixels] >= least).expand(3, -1)
-        clipped = image >= CLIPPED
-        used = seen
+        [operator] = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
+        units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, COLORS)
+        # Radiance of the P covered pixels per unit of each coefficient, (3, 49, P).
+        shown = operator.radiance(units).permute(1, 0, 2)
+        pixels = operator.pixels
+        no_coverage = self.mask.new_zeros(self.size**2)
+        coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
+        background = self.gray * (1 - coverage)
+        image = self.image[:, pixels]
+        is_seen = torch.minimum(coverage, self.mask)[pixels] >= least
+        is_seen = is_seen.expand(COLORS, -1)
+        is_clipped = image >= CLIPPED
+        is_used = is_seen
         for _ in range(CLIPPING_ROUNDS):
-            known = shown * used[:, None]
-            squares = known @ shown.mT
+            used = shown * is_used[:, None]
+            squares = used @ shown.mT
             penalty = self.penalty(squares)
-            wanted = (known @ (image - behind[operator.pixels])[..., None])[..., 0]
+            wanted = (used @ (image - background[pixels])[..., None])[..., 0]
             light, expected = _light_of_channels(squares, wanted, penalty, grid)
-            predicted = (light.T[:, None] @ shown)[:, 0] + behind[operator.pixels]
-            brighter = seen & ~(clipped & (predicted > 1))  # A clipped pixel may be brighter than the photograph.
-            if torch.equal(brighter, used):
+            predicted = (light.T[:, None] @ shown)[:, 0] + background[pixels]
+            # A clipped pixel may be brighter than the photograph shows.
+            is_explained = is_seen & ~(is_clipped & (predicted > 1))
+            if torch.equal(is_explained, is_used):
                 break
-            used = brighter
-        whole = behind.repeat(3, 1).index_copy(1, operator.pixels, predicted)
-        residuals = torch.cat(
-            [(whole.clamp(max=1) - self.image).flatten(), (penalty.sqrt() * (light - expected).T).flatten()]
-        )
-        return residuals, light, coverage
+            is_used = is_explained
+        rendered = background.repeat(COLORS, 1).index_copy(1, pixels, predicted)
+        differences = rendered.clamp(max=1) - self.image
+        penalties = penalty.sqrt() * (light - expected).T
+        residuals = torch.cat([differences.flatten(), penalties.flatten()])
+        return _LightFit(residuals, light, coverage)
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-        """Sort cameras by the squared error of their best light, which is returned with each."""
-        errors = [(float(self.fitted(camera)[0].square().sum()), camera) for camera in cameras]
+        """Return the squared error of each camera with its best light, smallest first."""
+        errors = [
+            (float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras
+        ]
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
-        """Weights (49,) of a light's squared coefficients, in proportion to the squares (3, 49, 49) of what they show,
-        so that the result does not depend on the albedo's scale."""
+        """Return the weights (49,) of the squared coefficients of a light in the error.
+
+        They are in proportion to the squares (3, 49, 49) of what the coefficients
+        show, so the result does not depend on the scale of the albedo.
+        """
         brightest = squares[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
         return SMOOTH * brightest * (1 + (band * (band + 1)).square())
 
     def descended(self, camera: Camera) -> Camera:
-        """Return the camera after descent by the Gauss-Newton method in a trust region.
-
-        The light is fitted anew for each camera (variable projection), and differentiated with it. Differences over
-        half a pixel average the steps that samples make.
-        """
-        width = camera.width
-
-        def moved(values: np.ndarray) -> Camera:
-            polar, azimuth, wider, right, up = values.tolist()
-            turned = replace(camera, polar=polar, azimuth=azimuth, width=width * wider)
-            if isinstance(turned, PerspectiveCamera):
-                turned = replace(turned, distance=turned.distance * wider)
-            return replace(turned, right=width * right, up=width * up)
-
-        def residuals(values: np.ndarray) -> np.ndarray:
-            return self.fitted(moved(values))[0].numpy()
-
-        def jacobian(values: np.ndarray) -> np.ndarray:
-            steps = np.diag(np.array(DIFFERENCES) / self.size)
-            columns = [(residuals(values + step) - residuals(values - step)) / (2 * step.sum()) for step in steps]
-            return np.stack(columns, axis=1)
-
-        start = np.array([camera.polar, camera.azimuth, 1.0, camera.right / width, camera.up / width])
-        lowest = [0.02, -np.inf, 0.5, -1.0, -1.0]
-        highest = [math.pi - 0.02, np.inf, 2.0, 1.0, 1.0]
-        start = start.clip(lowest, highest)
-        bounds = (lowest, highest)
-        stop = {"ftol": LEAST_GAIN, "xtol": LEAST_GAIN, "max_nfev": STEPS}
-        found = least_squares(residuals, start, jacobian, bounds, x_scale="jac", **stop)
-        return moved(found.x)
+        """Return the camera after descent from a camera."""
+        return _Descent(self, camera).run()
 
     def rendered(self, camera: Camera, light: Tensor) -> Tensor:
         """Render the mesh in linear light, shape (3, size²)."""
-        options = {"samples": SAMPLES, **self.options}
-        image = render(self.mesh, camera, light, self.size, self.gray, **options)[0]
-        return decode(image, self.options["encoding"]).flatten(1)
+        options = asdict(self.options)
+        [image] = render(self.mesh, camera, light, self.size, self.gray, **options)
+        return decode(image, self.options.encoding).flatten(1)
 
     def scene(self, camera: Camera) -> FittedScene:
-        """Fit the light of a camera and measure the result."""
-        _, light, coverage = self.fitted(camera, WHOLE, FINAL_GRID)
-        image = self.rendered(camera, light)
-        inside = self.mask > WHOLE
-        error = (image - self.image)[:, inside].norm() / self.image[:, inside].norm()
-        overlap = torch.minimum(coverage, self.mask).sum() / torch.maximum(coverage, self.mask).sum()
-        return FittedScene(camera, light, float(error), float(overlap))
+        """Fit the light for a camera, and compare the render with the target."""
+        fit = self.fitted(camera, WHOLE, FINAL_GRID)
+        image = self.rendered(camera, fit.light)
+        is_inside = self.mask > WHOLE
+        target = self.image[:, is_inside]
+        error = (image - self.image)[:, is_inside].norm() / target.norm()
+        intersection = torch.minimum(fit.coverage, self.mask).sum()
+        overlap = intersection / torch.maximum(fit.coverage, self.mask).sum()
+        return FittedScene(camera, fit.light, float(error), float(overlap))
 
 
-def _light_of_channels(squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int) -> tuple[Tensor, Tensor]:
-    """Fit the light of the channel that the object shows best, and then of the others, which are expected to resemble
-    it: a yellow object hardly says from where blue light comes.
+class _Descent:
+    """The Gauss-Newton method in a trust region, over five values of a camera.
+
+    The values are polar angle, azimuth, the width relative to the first camera's,
+    and the shifts right and up in units of the first camera's width. The light is
+    fitted anew for each camera (variable projection). Central differences over
+    half a pixel smooth the steps that the error makes at single samples.
+    """
+
+    def __init__(self, target: _Target, camera: Camera):
+        self._target = target
+        self._camera = camera
+
+    def run(self) -> Camera:
+        """Return the camera with the smallest error that is found."""
+        camera = self._camera
+        right = camera.right / camera.width
+        up = camera.up / camera.width
+        lowest = [POLE_DISTANCE, -np.inf, 0.5, -1.0, -1.0]
+        highest = [math.pi - POLE_DISTANCE, np.inf, 2.0, 1.0, 1.0]
+        start = np.array([camera.polar, camera.azimuth, 1.0, right, up]).clip(lowest, highest)
+        found = least_squares(
+            self._residuals,
+            start,
+            self._jacobian,
+            bounds=(lowest, highest),
+            x_scale="jac",
+            ftol=LEAST_GAIN,
+            xtol=LEAST_GAIN,
+            max_nfev=STEPS,
+        )
+        return self._camera_of(found.x)
+
+    def _camera_of(self, values: np.ndarray) -> Camera:
+        """Return the camera of the five values."""
+        polar, azimuth, relative_width, right, up = values.tolist()
+        width = self._camera.width
+        moved = replace(
+            self._camera,
+            polar=polar,
+            azimuth=azimuth,
+            width=width * relative_width,
+            right=width * right,
+            up=width * up,
+        )
+        # The distance changes with the width, so that the angle of view stays.
+        if isinstance(moved, PerspectiveCamera):
+            moved = replace(moved, distance=moved.distance * relative_width)
+        return moved
+
+    def _residuals(self, values: np.ndarray) -> np.ndarray:
+        """Return the residuals (N,) of the target, for the camera of the five values."""
+        return self._target.fitted(self._camera_of(values)).residuals.numpy()
+
+    def _jacobian(self, values: np.ndarray) -> np.ndarray:
+        """Return the derivatives (N, 5) of the residuals, by central differences."""
+        columns = []
+        for step in np.diag(np.array(DIFFERENCES) / self._target.size):
+            difference = self._residuals(values + step) - self._residuals(values - step)
+            columns.append(difference / (2 * step.sum()))
+        return np.stack(columns, axis=1)
+
+
+def _light_of_channels(
+    squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int
+) -> tuple[Tensor, Tensor]:
+    """Fit the light of the channel that the object shows best, and then of the other channels.
+
+    The other channels are expected to resemble the first one, because the object
+    may show little of them. For example, a yellow object hardly shows from where
+    blue light comes.
 
     Args:
-        squares: The products of what the light's coefficients show, shape (3, 49, 49).
-        wanted: Their products with what is to be shown, shape (3, 49).
-        penalty: Weights of the squared differences from the expected light, shape (49,).
+        squares: Products of what the coefficients of the light show, shape
+            (3, 49, 49).
+        wanted: Products of what the coefficients show with what is to be shown,
+            shape (3, 49).
+        penalty: Weights of the squared differences from the expected light, shape
+            (49,).
         grid: Subdivisions of the grid of directions.
 
     Returns:
-        The lights and the expected lights, shapes (49, 3). In the first channel, none is expected.
+        The light and the expected light, shape (49, 3) each. The expected light of
+        the first channel is zero.
     """
-    regular = squares + torch.diag(penalty)
+    regularized = squares + torch.diag(penalty)
     best = int(squares[:, 0, 0].argmax())
-    seen = _nonnegative_light(regular[best, None], wanted[best, None], grid)[:, 0]
-    brightness = (wanted @ seen) / ((squares @ seen) @ seen).clamp(min=torch.finfo(torch.float64).tiny)
-    expected = seen[:, None] * brightness.clamp(min=0)
+    best_light = _nonnegative_light(regularized[best, None], wanted[best, None], grid)[:, 0]
+    shown_squared = (squares @ best_light) @ best_light
+    tiny = torch.finfo(torch.float64).tiny
+    brightness = (wanted @ best_light) / shown_squared.clamp(min=tiny)
+    expected = best_light[:, None] * brightness.clamp(min=0)
     expected[:, best] = 0
-    return _nonnegative_light(regular, wanted + (penalty[:, None] * expected).T, grid), expected
+    wanted_and_expected = wanted + (penalty[:, None] * expected).T
+    return _nonnegative_light(regularized, wanted_and_expected, grid), expected
 
 
 def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
-    """Minimize xᵀ S x / 2 − wᵀ x for each channel over lights x of nowhere negative radiance.
+    """Minimize xᵀ S x / 2 − wᵀ x for each channel, over lights x of non-negative radiance.
 
-    With S = L Lᵀ and y = Lᵀ x, this is the projection of L⁻¹ w onto the cone {y: G y ≥ 0}, where G = R L⁻ᵀ and R holds
-    the harmonics in the directions of a grid. By Moreau's decomposition, it is L⁻¹ w + Gᵀ μ with the non-negative μ
-    that minimizes |L⁻¹ w + Gᵀ μ|.
+    With S = L Lᵀ and y = Lᵀ x, this is the projection of L⁻¹ w onto the cone
+    {y: G y ≥ 0}. Here G = R L⁻ᵀ, and the rows of R are the harmonics in the
+    directions of a grid. By Moreau's decomposition, the projection is L⁻¹ w + Gᵀ μ
+    with the non-negative μ that minimizes |L⁻¹ w + Gᵀ μ|.
 
     Args:
         squares: The positive definite matrices S, shape (C, 49, 49).
@@ -412,41 +619,60 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
     lights = []
     for square, vector in zip(squares.numpy(), wanted.numpy(), strict=True):
         lower = np.linalg.cholesky(square)
-        free = solve_triangular(lower, vector, lower=True)
+        unconstrained = solve_triangular(lower, vector, lower=True)
         sides = solve_triangular(lower, rows.T, lower=True)
-        nearest = free
-        # Few directions matter, so others join when radiance is negative there. The result is that of all directions.
-        known = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
-        negative = free @ sides < 0
-        while negative.any():
-            multipliers, _ = nnls(sides[:, known], -free, maxiter=MOST_EXCHANGES * len(known))
-            nearest = free + sides[:, known] @ multipliers
-            negative = (nearest @ sides < 0) & ~known
-            known |= negative
+        nearest = unconstrained
+        # Few directions matter. The first solution has some of them, and others
+        # join if radiance is negative there. The result is that of all directions.
+        is_constrained = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
+        is_negative = unconstrained @ sides < 0
+        while is_negative.any():
+            iterations = MOST_EXCHANGES * len(is_constrained)
+            multipliers, _ = nnls(sides[:, is_constrained], -unconstrained, maxiter=iterations)
+            nearest = unconstrained + sides[:, is_constrained] @ multipliers
+            is_negative = (nearest @ sides < 0) & ~is_constrained
+            is_constrained |= is_negative
         lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
     return torch.from_numpy(np.stack(lights, axis=1))
 
 
 @cache
 def _radiance_above_least(grid: int) -> NDArray[Any]:
-    """Map a light's coefficients to its radiance in the directions of a grid, less `LEAST_RADIANCE` of its mean:
-    shape (N, 49)."""
+    """Return the matrix (N, 49) from the coefficients of a light to its radiance in N directions.
+
+    `LEAST_RADIANCE` times the mean radiance of the light is subtracted. The
+    directions are the vertices of an icosphere with `grid` subdivisions.
+    """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
+    # Coefficient 0 alone determines the mean radiance.
     rows[:, 0] *= 1 - LEAST_RADIANCE
     return rows
 
 
 def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
-    """The camera with a width and a position at which the mesh's box in the image is that of the mask."""
+    """Return a camera whose image of the mesh has the bounding box of the mask.
+
+    Width and shift of the camera change. The area of the box is matched, and not
+    its width and height separately. Boxes are in coordinates from -1 to 1, with x
+    to the right and y up.
+    """
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
-    low, high = points.min(0), points.max(0)
-    rows, columns = (np.flatnonzero((mask > 0.5).any(axis).numpy()) for axis in (1, 0))
+    low = points.min(0)
+    high = points.max(0)
     size = len(mask)
-    left, right = 2 * columns[0] / size - 1, 2 * (columns[-1] + 1) / size - 1
-    bottom, top = 1 - 2 * (rows[-1] + 1) / size, 1 - 2 * rows[0] / size
-    factor = math.sqrt(float(np.prod(high - low)) / ((right - left) * (top - bottom)))  # of the image's width
+    rows = np.flatnonzero((mask > 0.5).any(1).numpy())
+    columns = np.flatnonzero((mask > 0.5).any(0).numpy())
+    left = 2 * columns[0] / size - 1
+    right = 2 * (columns[-1] + 1) / size - 1
+    bottom = 1 - 2 * (rows[-1] + 1) / size
+    top = 1 - 2 * rows[0] / size
+    # The factor of the camera's width.
+    factor = math.sqrt(float(np.prod(high - low)) / ((right - left) * (top - bottom)))
     width = camera.width * factor
-    shift = np.array([left + right, bottom + top]) / 2 - (low + high) / 2 / factor
-    wider = {} if isinstance(camera, OrthographicCamera) else {"distance": camera.distance * factor}
-    return replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2, **wider)
+    mask_center = np.array([left + right, bottom + top]) / 2
+    shift = mask_center - (low + high) / 2 / factor
+    framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
+    if isinstance(framed, PerspectiveCamera):
+        framed = replace(framed, distance=framed.distance * factor)
+    return framed

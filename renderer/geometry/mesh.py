@@ -1,7 +1,7 @@
-"""Triangle meshes with colors: the data class, normalizing, and subdividing for attacks that move vertices.
+"""Triangle meshes with colors, and operations on them: normalize, subdivide, concatenate.
 
-World axes are right-handed with z up. Colors stay as authored for display (sRGB-encoded); linear
-light needs them decoded.
+World axes are right-handed with z up. Colors are stored as they are displayed
+(sRGB-encoded). Computing with light needs them decoded.
 """
 
 from __future__ import annotations
@@ -22,8 +22,12 @@ from renderer.geometry.skin import Skin
 from renderer.settings import MAX_VERTICES
 from renderer.validation import as_array, require_whole
 
+# Affine matrix that turns the y axis to the z axis.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
-_KINDS = {  # NumPy's letters for the types that the arrays of a mesh may have
+# Value of `Mesh.texture_ids` for a face without a texture.
+NO_TEXTURE = -1
+# Kinds of NumPy types (f: floating, i: signed, u: unsigned) of the arrays of a mesh.
+_KINDS = {
     "vertices": "fiu",
     "faces": "iu",
     "corner_colors": "fiu",
@@ -31,30 +35,58 @@ _KINDS = {  # NumPy's letters for the types that the arrays of a mesh may have
     "texture_ids": "iu",
     "gloss": "fiu",
 }
+# Attributes of a mesh that have a row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
-EDGES = ((0, 1), (1, 2), (2, 0))  # corners of a face
-_QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
+# Corners of a face at the two ends of each of its edges.
+EDGES = ((0, 1), (1, 2), (2, 0))
+# Corners of the quarters of a face. Points 0 to 2 are the corners of the face,
+# and points 3 to 5 are the midpoints of its `EDGES`.
+_QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+# Gloss of a face of a matte mesh, when it is joined with a glossy mesh.
+_MATTE = np.array([[1, 0, 0]], dtype=np.float32)
+# Gloss texture that changes nothing, for a texture without one.
+_NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
+# Factors that put red, green and blue in the bits from 0, 8 and 16.
+_PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """F triangles over V vertices, with colors held per corner so that seams need no split vertices.
+    """F triangles over V vertices, with colors at the corners of each triangle.
 
-    vertices       (V, 3) float64, world coordinates
-    faces          (F, 3) int64, counter-clockwise seen from outside
-    corner_colors  (F, 3, 3) float32, RGB in [0, 1], sRGB-encoded
-    corner_uvs     (F, 3, 2) float32, origin at the bottom left of the texture; zeros where there is none
-    texture_ids    (F,) int32, index into `textures`, -1 where there is none
-    textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
-    gloss          (F, 3) float32: roughness, metallic and strength in [0, 1] (`renderer.Gloss`); None for a matte mesh
-    gloss_textures tuple of (H, W, 2) uint8, for each of `textures`, that multiply roughness and metallic; or empty
-    skin           the joints that carry the vertices, None without joints
+    Corners at one vertex may have different colors, so a seam between colors
+    needs no second vertex.
 
-    InputError: arrays of other shapes, no faces, faces of vertices that are not there.
+    Attributes:
+        vertices: Positions in world coordinates, shape (V, 3), float64.
+        faces: Indices of the vertices of each face, shape (F, 3), int64,
+            counter-clockwise from outside.
+        corner_colors: sRGB-encoded colors in [0, 1], shape (F, 3, 3), float32.
+        corner_uvs: Texture coordinates, with the origin at the bottom left of
+            the texture, shape (F, 3, 2), float32. Zeros without a texture.
+        texture_ids: Index of the texture of each face, shape (F,), int32, or
+            `NO_TEXTURE`.
+        textures: sRGB-encoded textures, shape (H, W, 3) each, uint8. Row 0 is
+            the top.
+        gloss: Roughness, metallic and strength of each face in [0, 1]
+            (`renderer.Gloss`), shape (F, 3), float32. None for a matte mesh.
+        gloss_textures: For each of the textures, factors of roughness and
+            metallic, shape (H, W, 2) each, uint8. Empty without such textures.
+        skin: Joints that carry the vertices. None without joints.
 
-    >>> square = Mesh.plain([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
-    >>> square.face_areas().tolist(), square.face_normals()[0].tolist(), square.closed
-    ([0.5, 0.5], [0.0, 0.0, 1.0], False)
+    Raises:
+        InputError: If an array has another shape or type, there are no faces, or
+            an index is out of range.
+
+    Example:
+        >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+        >>> square = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
+        >>> square.face_areas().tolist()
+        [0.5, 0.5]
+        >>> square.face_normals()[0].tolist()
+        [0.0, 0.0, 1.0]
+        >>> square.closed
+        False
     """
 
     vertices: np.ndarray
@@ -68,118 +100,191 @@ class Mesh:
     skin: Skin | None = None
 
     def __post_init__(self) -> None:
+        """Convert lists to arrays, and check shapes, types and indices."""
         for name, kinds in _KINDS.items():
             value = getattr(self, name)
-            if not isinstance(value, np.ndarray) and not (name == "gloss" and value is None):
+            is_no_gloss = name == "gloss" and value is None
+            if not isinstance(value, np.ndarray) and not is_no_gloss:
                 object.__setattr__(self, name, as_array(name, value, kinds))
-        count = len(self.faces) if self.faces.ndim else 0
-        vertex_count = len(self.vertices) if self.vertices.ndim else 0
-        for name, shape in (
-            ("vertices", (vertex_count, 3)),
-            ("faces", (count, 3)),
-            ("corner_colors", (count, 3, 3)),
-            ("corner_uvs", (count, 3, 2)),
-            ("texture_ids", (count,)),
-            ("gloss", (count, 3)),
-        ):
-            values = getattr(self, name)
-            if name == "gloss" and values is None:
-                continue
-            if values.shape != shape or values.dtype.kind not in _KINDS[name]:
-                raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
-        require_range("the number of faces", count, 1, np.inf)
-        if not 0 <= self.faces.min() <= self.faces.max() < vertex_count:
-            raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}")
-        for name, channels in (("textures", 3), ("gloss_textures", 2)):
-            object.__setattr__(self, name, _as_textures(name, getattr(self, name), channels))
+        self._require_shapes()
+        self._require_indices()
+        object.__setattr__(self, "textures", _as_textures("textures", self.textures, 3))
+        factors = _as_textures("gloss_textures", self.gloss_textures, 2)
+        object.__setattr__(self, "gloss_textures", factors)
         if self.texture_ids.max() >= len(self.textures):
-            raise InputError(f"texture_ids name textures that are not there: give indices below {len(self.textures)}")
+            raise InputError(
+                f"texture_ids name textures that are not there: "
+                f"give indices below {len(self.textures)}"
+            )
+
+    def _require_shapes(self) -> None:
+        """Raise `InputError` if an array has another shape or type."""
+        vertex_count = len(self.vertices) if self.vertices.ndim else 0
+        face_count = len(self.faces) if self.faces.ndim else 0
+        shapes = {
+            "vertices": (vertex_count, 3),
+            "faces": (face_count, 3),
+            "corner_colors": (face_count, 3, 3),
+            "corner_uvs": (face_count, 3, 2),
+            "texture_ids": (face_count,),
+        }
+        if self.gloss is not None:
+            shapes["gloss"] = (face_count, 3)
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape or values.dtype.kind not in _KINDS[name]:
+                raise InputError(
+                    f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}"
+                )
+
+    def _require_indices(self) -> None:
+        """Raise `InputError` if there are no faces, or they have vertices that are not there."""
+        require_range("the number of faces", len(self.faces), 1, np.inf)
+        vertex_count = len(self.vertices)
+        if not 0 <= self.faces.min() <= self.faces.max() < vertex_count:
+            raise InputError(
+                f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}"
+            )
 
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
-        """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
+        """Make a mesh without textures.
+
+        Args:
+            vertices: Positions in world coordinates, shape (V, 3).
+            faces: Indices of vertices, shape (F, 3), counter-clockwise from
+                outside.
+            color: sRGB-encoded color in [0, 1], shape (3,), or one per vertex,
+                shape (V, 3).
+
+        Returns:
+            The mesh.
+
+        Raises:
+            InputError: If an argument has another shape or is out of range.
+        """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
-        corners = as_array("faces", faces)
-        with np.errstate(invalid="ignore"):  # NaN is refused below
-            faces = corners.astype(np.int64)
-        if not np.array_equal(faces, corners):
+        given_faces = as_array("faces", faces)
+        # NaN becomes an arbitrary integer here, and is refused below.
+        with np.errstate(invalid="ignore"):
+            faces = given_faces.astype(np.int64)
+        if not np.array_equal(faces, given_faces):
             raise InputError("faces holds numbers that are not whole: give indices of vertices")
         color = as_array("color", color).astype(np.float32)
         if not color.size or not (color.min() >= 0 and color.max() <= 1):
-            raise InputError(f"color={reprlib.repr(color.tolist())}: give red, green and blue from 0 to 1")
+            given = reprlib.repr(color.tolist())
+            raise InputError(f"color={given}: give red, green and blue from 0 to 1")
         try:
             vertex_colors = np.broadcast_to(color, vertices.shape)
-            corner_colors = vertex_colors.take(faces, axis=0, mode="clip")  # missing vertices are refused below
+            # The constructor refuses indices out of range, which are clipped here.
+            corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
-            raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
+            raise InputError(
+                f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)"
+            ) from error
         return Mesh(
             vertices=vertices,
             faces=faces,
             corner_colors=corner_colors,
             corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
-            texture_ids=np.full(len(faces), -1, dtype=np.int32),
+            texture_ids=np.full(len(faces), NO_TEXTURE, dtype=np.int32),
         )
 
     def face_normals(self) -> np.ndarray:
-        """(F, 3) unit normals, outward for counter-clockwise faces; the zero vector for zero-area faces."""
+        """Return the outward unit normals of the faces, shape (F, 3).
+
+        A face without area has the zero vector.
+        """
         return plain_face_normals(self.vertices, self.faces)
 
     def face_areas(self) -> np.ndarray:
-        """(F,) areas in squared world units."""
-        return np.linalg.norm(doubled_area_vectors(self.vertices, self.faces), axis=1) / 2
+        """Return the areas of the faces in squared world units, shape (F,)."""
+        doubled = doubled_area_vectors(self.vertices, self.faces)
+        return np.linalg.norm(doubled, axis=1) / 2
 
     @cached_property
     def vertex_normals(self) -> np.ndarray:
-        """(V, 3) of `renderer.geometry.normals.vertex_normals`."""
+        """Return `renderer.geometry.normals.vertex_normals` of the mesh, shape (V, 3)."""
         return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
 
     @cached_property
     def displayable(self) -> bool:
-        """Whether all colors are in [0, 1]."""
-        return bool(self.corner_colors.min() >= 0 and self.corner_colors.max() <= 1)  # NaN is not
+        """Return whether all colors are in [0, 1]. NaN is not."""
+        return bool(self.corner_colors.min() >= 0 and self.corner_colors.max() <= 1)
 
     @cached_property
     def one_color_per_face(self) -> bool:
-        """Whether the corners of each face have the same color."""
+        """Return whether the corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     def moved(self, vertices: np.ndarray) -> Mesh:
-        """The mesh with vertices (V, 3) in place of its own, and its packed textures; without a skin."""
+        """Return a copy with other vertex positions, without a skin.
+
+        Args:
+            vertices: Positions, shape (V, 3).
+        """
         mesh = replace(self, vertices=vertices, skin=None)
-        mesh.__dict__["packed_textures"] = self.packed_textures  # which take long to pack
+        # Packing textures takes long, so the copy shares the packed ones.
+        mesh.__dict__["packed_textures"] = self.packed_textures
         return mesh
 
     @cached_property
     def packed_textures(self) -> tuple[np.ndarray, ...]:
-        """Textures (H, W) int32, red, green and blue in the bits from 0, 8 and 16: one number is looked up faster."""
-        return tuple(texture.astype(np.int32) @ np.array([1, 2**8, 2**16], dtype=np.int32) for texture in self.textures)
+        """Return the textures with one number per texel, shape (H, W) each, int32.
+
+        Red, green and blue are in the bits from 0, 8 and 16. One number is
+        looked up faster than three.
+        """
+        return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
 
     @cached_property
     def closed(self) -> bool:
-        """Whether no face is ever seen from behind: every part is watertight, its faces counter-clockwise from outside.
-        Then each edge occurs once in either direction, and the faces that edges connect enclose a positive volume."""
-        part = _closed_parts(self.faces.astype(np.int64).tobytes())
-        first = (self.vertices - self.vertices.mean(axis=0))[self.faces[:, 0]]
-        volumes = np.einsum("fi,fi->f", first, doubled_area_vectors(self.vertices, self.faces))
-        return part is not None and bool((np.bincount(part, volumes) > 0).all())
+        """Return whether no face is ever seen from behind.
+
+        Every connected part of the mesh is then watertight, with faces that are
+        counter-clockwise from outside. This is so if each edge occurs once in
+        either direction, and if the faces of a part enclose a positive volume.
+        """
+        part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
+        if part_of_face is None:
+            return False
+        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces[:, 0]]
+        # Six times the volume of the tetrahedron of each face and the center.
+        volumes = np.einsum("fi,fi->f", corners, doubled_area_vectors(self.vertices, self.faces))
+        return bool((np.bincount(part_of_face, volumes) > 0).all())
 
 
-@lru_cache(maxsize=1)  # for instances of a solid, which have the same faces
+# The last result is kept, because the instances of a solid have the same faces.
+@lru_cache(maxsize=1)
 def _closed_parts(faces: bytes) -> np.ndarray | None:
-    """(F,) the connected part of each face (F, 3) of int64, or None where an edge is not once in either direction."""
-    from trimesh.graph import connected_component_labels  # trimesh takes half a second
+    """Return the connected part (F,) of each face, or None for an open mesh.
+
+    The argument holds faces (F, 3) of int64. In a closed mesh, each edge occurs
+    once in either direction.
+    """
+    # Importing trimesh takes half a second.
+    from trimesh.graph import connected_component_labels
 
     corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
-    edges, count = corners[:, EDGES].reshape(-1, 2), corners.max(initial=0) + 1
-    forth, back = edges @ [count, 1], edges @ [1, count]
-    by_forth, by_back = np.argsort(forth), np.argsort(back)
-    if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
+    edges = corners[:, EDGES].reshape(-1, 2)
+    vertex_count = corners.max(initial=0) + 1
+    # Each edge from vertex a to vertex b gets the number a · V + b, and in the
+    # opposite direction b · V + a. In a closed mesh, both sets of numbers are equal.
+    forward = edges @ [vertex_count, 1]
+    backward = edges @ [1, vertex_count]
+    by_forward = np.argsort(forward)
+    by_backward = np.argsort(backward)
+    is_repeated = (np.diff(forward[by_forward]) == 0).any()
+    if is_repeated or not np.array_equal(forward[by_forward], backward[by_backward]):
         return None
-    return connected_component_labels(np.stack([by_forth, by_back], axis=1) // 3, node_count=len(corners))
+    # Row i of the sorted lists is one edge of two faces. The edges 3 f to 3 f + 2
+    # are those of face f.
+    neighbors = np.stack([by_forward, by_backward], axis=1) // 3
+    return connected_component_labels(neighbors, node_count=len(corners))
 
 
 def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
-    """Convert textures to arrays (height, width, channels) of 8 bits."""
+    """Convert textures to arrays (height, width, channels) of uint8, or raise `InputError`."""
     expected = f"a list of arrays (height, width, {channels}) of uint8"
     if not isinstance(textures, list | tuple):
         raise InputError(f"{name} is {describe(textures)}: give {expected}")
@@ -187,44 +292,52 @@ def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray
     for array in arrays:
         if array.ndim != 3 or array.shape[2] != channels or array.dtype != np.uint8:
             raise InputError(f"{name} holds {describe(array)}: give {expected}")
-    unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
-    return textures if isinstance(textures, tuple) and unchanged else tuple(arrays)
+    is_unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
+    return textures if isinstance(textures, tuple) and is_unchanged else tuple(arrays)
 
 
 def require_mesh(name: str, value: object) -> None:
     """Check that an argument is a mesh whose colors can be displayed.
 
+    Args:
+        name: Name of the argument in the error.
+        value: The argument.
+
     Raises:
-        InputError: If it is of another type, such as a path, or a color is not in [0, 1].
+        InputError: If it has another type, such as a path, or a color is not in
+            [0, 1].
     """
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
-        advice = f"give a renderer.Mesh, such as renderer.load_mesh({path}) or renderer.Mesh.plain(vertices, faces)"
-        raise InputError(f"{name} is {describe(value)}: {advice}")
+        raise InputError(
+            f"{name} is {describe(value)}: give a renderer.Mesh, "
+            f"such as renderer.load_mesh({path}) or renderer.Mesh.plain(vertices, faces)"
+        )
     if not value.displayable:
-        raise InputError(f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255")
+        raise InputError(
+            f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255"
+        )
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh with the faces of all, in order; vertices are not merged. The joints are the first one's."""
-    faces, texture_ids, vertices, textures = [], [], 0, 0
-    matte, plain = np.array([[1, 0, 0]], dtype=np.float32), np.full((1, 1, 2), 255, dtype=np.uint8)
-    gloss, factors = None, tuple[np.ndarray, ...]()
-    if any(mesh.gloss is not None for mesh in meshes):
-        rows = [matte.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss for mesh in meshes]
-        gloss = np.concatenate(rows)
-    if any(mesh.gloss_textures for mesh in meshes):
-        parts = (mesh.gloss_textures or (plain,) * len(mesh.textures) for mesh in meshes)
-        factors = tuple(texture for part in parts for texture in part)
-    skin = meshes[0].skin
-    if skin is not None:
-        still = [np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32) for mesh in meshes]
-        rows = [mesh.skin.carried if mesh.skin else zeros for mesh, zeros in zip(meshes, still, strict=True)]
-        skin = replace(skin, carried=np.concatenate(rows))
+    """Join meshes to one mesh with the faces of all of them, in order.
+
+    Vertices are not merged. The joints are those of the first mesh, and do not
+    carry the vertices of meshes without joints.
+
+    Args:
+        meshes: At least one mesh.
+    """
+    faces = []
+    texture_ids = []
+    vertex_count = 0
+    texture_count = 0
     for mesh in meshes:
-        faces.append(mesh.faces + vertices)
-        texture_ids.append(np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + textures).astype(np.int32))
-        vertices, textures = vertices + len(mesh.vertices), textures + len(mesh.textures)
+        faces.append(mesh.faces + vertex_count)
+        shifted = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
+        texture_ids.append(shifted.astype(np.int32))
+        vertex_count += len(mesh.vertices)
+        texture_count += len(mesh.textures)
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),
@@ -232,21 +345,66 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
         texture_ids=np.concatenate(texture_ids),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
-        gloss=gloss,
-        gloss_textures=factors,
-        skin=skin,
+        gloss=_joined_gloss(meshes),
+        gloss_textures=_joined_gloss_textures(meshes),
+        skin=_joined_skin(meshes),
     )
 
 
+def _joined_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
+    """Return the gloss of the faces of all meshes, or None if all are matte."""
+    if all(mesh.gloss is None for mesh in meshes):
+        return None
+    rows = []
+    for mesh in meshes:
+        rows.append(_MATTE.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss)
+    return np.concatenate(rows)
+
+
+def _joined_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
+    """Return a gloss texture for each texture of all meshes, or nothing if no mesh has any."""
+    if not any(mesh.gloss_textures for mesh in meshes):
+        return ()
+    joined: list[np.ndarray] = []
+    for mesh in meshes:
+        joined += mesh.gloss_textures or (_NEUTRAL_GLOSS,) * len(mesh.textures)
+    return tuple(joined)
+
+
+def _joined_skin(meshes: Sequence[Mesh]) -> Skin | None:
+    """Return the skin of the first mesh, extended by the vertices of all meshes."""
+    skin = meshes[0].skin
+    if skin is None:
+        return None
+    rows = []
+    for mesh in meshes:
+        uncarried = np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32)
+        rows.append(mesh.skin.carried if mesh.skin else uncarried)
+    return replace(skin, carried=np.concatenate(rows))
+
+
 def normalize(mesh: Mesh) -> Mesh:
-    """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
-    float32: so files hold the vertices exactly, and a mesh that is read back covers the same pixels.
+    """Return a copy of a mesh that is centered and scaled to the cube [-1, 1]³.
 
-    The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
-    InputError where there is no positive area, which `load_mesh` ensures.
+    The centroid of the faces, weighted with their areas, moves to the origin.
+    (This is also the average of the vertices, weighted with the areas around
+    them, as in the paper's appendix.) The largest magnitude of a coordinate
+    becomes 1. The vertices are rounded to float32, which files hold exactly, so
+    a mesh that is read back covers the same pixels.
 
-    >>> float(np.abs(normalize(renderer.solid("bottle")).vertices).max())
-    1.0
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        The normalized mesh, with float64 vertices.
+
+    Raises:
+        InputError: If the surface has no area. `load_mesh` ensures that it has.
+
+    Example:
+        >>> bottle = normalize(renderer.solid("bottle"))
+        >>> float(np.abs(bottle.vertices).max())
+        1.0
     """
     require_mesh("mesh", mesh)
     areas = mesh.face_areas()
@@ -256,14 +414,25 @@ def normalize(mesh: Mesh) -> Mesh:
     center = np.average(centroids, axis=0, weights=areas)
     centered = mesh.vertices - center
     largest = np.abs(centered).max()
-    scaled, matrix = (centered / largest).astype(np.float32).astype(np.float64), np.eye(4)
+    scaled = (centered / largest).astype(np.float32).astype(np.float64)
+    matrix = np.eye(4)
     matrix[:3] = np.column_stack([np.eye(3), -center]) / largest
-    return replace(mesh, vertices=scaled, skin=mesh.skin and mesh.skin.transformed(matrix))
+    skin = mesh.skin and mesh.skin.transformed(matrix)
+    return replace(mesh, vertices=scaled, skin=skin)
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """The mesh under an affine matrix (4, 4). A mirroring one reverses the faces, so that normals stay outward."""
-    order = [0, 1, 2] if np.linalg.det(matrix[:3, :3]) >= 0 else [0, 2, 1]
+    """Return a copy of a mesh under an affine transformation.
+
+    A matrix that mirrors reverses the corners of the faces, so that normals stay
+    outward.
+
+    Args:
+        mesh: The mesh.
+        matrix: Affine matrix, shape (4, 4).
+    """
+    is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
+    order = [0, 2, 1] if is_mirroring else [0, 1, 2]
     return replace(
         mesh,
         vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
@@ -275,19 +444,32 @@ def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
 
 
 def subdivide(mesh: Mesh, vertices: float) -> Mesh:
-    """The same surface with more vertices than `vertices`: every face is divided into four until there are enough.
+    """Divide every face into four, until there are more vertices than a number.
 
-    New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
-    colors (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
-    indices, and the quarters of face f are the faces 4f to 4f + 3. A mesh with enough vertices comes back as it is.
+    The surface stays the same. New vertices are the midpoints of edges. Faces
+    that share an edge share the new vertex, so a closed mesh stays closed. Colors
+    (sRGB-encoded) and texture coordinates are interpolated. The old vertices
+    keep their indices, and the quarters of face f are the faces 4f to 4f + 3.
 
-    >>> table = renderer.solid("table")
-    >>> finer = subdivide(table, vertices=1000)
-    >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
-    (True, 0)
+    Args:
+        mesh: The mesh.
+        vertices: The number, from 0 to `MAX_VERTICES`.
+
+    Returns:
+        The subdivided mesh, or the given mesh if it has enough vertices.
+
+    Raises:
+        InputError: If the number is not whole or out of range.
+
+    Example:
+        >>> table = renderer.solid("table")
+        >>> finer = subdivide(table, vertices=1000)
+        >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
+        (True, 0)
     """
     require_mesh("mesh", mesh)
-    is_whole_float = isinstance(vertices, float) and vertices.is_integer()  # such as 1e4
+    # Whole numbers such as 1e4 are accepted.
+    is_whole_float = isinstance(vertices, float) and vertices.is_integer()
     require_whole("vertices", int(vertices) if is_whole_float else vertices)
     require_range("vertices", vertices, 0, MAX_VERTICES)
     while len(mesh.vertices) <= vertices:
@@ -296,38 +478,66 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
 
 
 def refine(mesh: Mesh, area: float) -> Mesh:
-    """The same surface with faces of at most an area: larger ones are divided into four until none is left.
-    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge."""
-    large = mesh.face_areas() > area
-    if not large.any():
+    """Divide faces into four until none has more than some area.
+
+    The surface stays the same. The faces come in another order. The old vertices
+    keep their indices, and new vertices may lie on the edge of a neighbor.
+
+    Args:
+        mesh: The mesh.
+        area: Largest area of a face in squared world units.
+
+    Returns:
+        The refined mesh, or the given mesh if no face is larger.
+    """
+    is_large = mesh.face_areas() > area
+    if not is_large.any():
         return mesh
-    if large.all():
+    if is_large.all():
         return refine(_quartered(mesh), area)
-    small, finer = select_faces(mesh, ~large), refine(_quartered(select_faces(mesh, large)), area)
-    halves = {name: (getattr(small, name), getattr(finer, name)) for name in PER_FACE}
-    joined: dict[str, Any] = {name: np.concatenate(both) for name, both in halves.items() if both[0] is not None}
-    return replace(finer, **joined)
+    small = select_faces(mesh, ~is_large)
+    refined = refine(_quartered(select_faces(mesh, is_large)), area)
+    joined: dict[str, Any] = {}
+    for name in PER_FACE:
+        rows_of_small = getattr(small, name)
+        if rows_of_small is not None:
+            joined[name] = np.concatenate([rows_of_small, getattr(refined, name)])
+    return replace(refined, **joined)
 
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
-    """Some of the faces, over all vertices."""
-    per_face = {name: getattr(mesh, name) for name in PER_FACE}
-    return replace(mesh, **{name: values[faces] for name, values in per_face.items() if values is not None})
+    """Return a copy of a mesh with some of its faces and all of its vertices.
+
+    Args:
+        mesh: The mesh.
+        faces: Indices, a mask or a slice of the faces to keep.
+    """
+    kept = {}
+    for name in PER_FACE:
+        rows = getattr(mesh, name)
+        if rows is not None:
+            kept[name] = rows[faces]
+    return replace(mesh, **kept)
 
 
 def _quartered(mesh: Mesh) -> Mesh:
-    count = len(mesh.vertices)
-    ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
-    edges, edge = np.unique(ends @ [count, 1], return_inverse=True)  # one number is sorted faster than a pair
-    ends = np.stack(np.divmod(edges, count), axis=1)
-    middles, skin = mesh.vertices[ends].mean(axis=1), mesh.skin
+    """Divide every face of a mesh into four."""
+    vertex_count = len(mesh.vertices)
+    ends_of_corners = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
+    # One number for each edge is sorted faster than a pair of vertices.
+    keys, edge_of_corner = np.unique(ends_of_corners @ [vertex_count, 1], return_inverse=True)
+    edge_ends = np.stack(np.divmod(keys, vertex_count), axis=1)
+    midpoints = mesh.vertices[edge_ends].mean(axis=1)
+    skin = mesh.skin
     if skin is not None:
-        skin = replace(skin, carried=np.concatenate([skin.carried, skin.carried[ends].mean(axis=1)]))
-    around = np.concatenate([mesh.faces, count + edge.reshape(-1, 3)], axis=1)
+        carried = np.concatenate([skin.carried, skin.carried[edge_ends].mean(axis=1)])
+        skin = replace(skin, carried=carried)
+    # The vertices of the six points of each face, shape (F, 6).
+    points = np.concatenate([mesh.faces, vertex_count + edge_of_corner.reshape(-1, 3)], axis=1)
     return replace(
         mesh,
-        vertices=np.concatenate([mesh.vertices, middles]),
-        faces=around[:, _QUARTERS].reshape(-1, 3),
+        vertices=np.concatenate([mesh.vertices, midpoints]),
+        faces=points[:, _QUARTERS].reshape(-1, 3),
         corner_colors=_interpolated(mesh.corner_colors),
         corner_uvs=_interpolated(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
@@ -337,6 +547,7 @@ def _quartered(mesh: Mesh) -> Mesh:
 
 
 def _interpolated(corners: np.ndarray) -> np.ndarray:
-    """Values (4F, 3, D) at the corners of the quarters, of values (F, 3, D) at the corners of the faces."""
-    middles = corners[:, EDGES].mean(axis=2)
-    return np.concatenate([corners, middles], axis=1)[:, _QUARTERS].reshape(-1, *corners.shape[1:])
+    """Return values (4F, 3, D) at the corners of quarters, from values (F, 3, D) of faces."""
+    midpoints = corners[:, EDGES].mean(axis=2)
+    points = np.concatenate([corners, midpoints], axis=1)
+    return points[:, _QUARTERS].reshape(-1, *corners.shape[1:])

@@ -1,4 +1,4 @@
-"""Norm-balls, and the nearest values within a box and a ball."""
+"""Norm-balls, and the projection onto the intersection of a box and a norm-ball."""
 
 from __future__ import annotations
 
@@ -8,30 +8,57 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
+# Newton steps to the surface of a ball. Four are usual. If more were needed, the
+# result would be inside of the ball instead of on its surface.
+_MAX_STEPS = 20
+# Relative error of the squared distance from the center, in units of the dtype's eps.
+_ROUNDING_UNITS = 8
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Values (A, ...), each within a radius of its center, in the norm "linf" or "l2"."""
+    """A norm-ball for each of A rows of values.
+
+    Attributes:
+        center: Centers of the balls, shape (A, ...).
+        radius: Radius of each ball.
+        norm: "linf" for the maximum norm, or "l2" for the Euclidean norm over
+            all values of a row.
+    """
 
     center: Tensor
     radius: float
     norm: str
 
     def unflatten(self, *shape: int) -> Ball:
-        """The ball of values (A, *shape), of a ball of values (A, D)."""
+        """Return the ball of values (A, *shape) that corresponds to this ball of values (A, D)."""
         return Ball(self.center.unflatten(1, shape), self.radius, self.norm)
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """The lowest and the highest values, where the norm is "linf"."""
+        """Return the lowest and the highest values in a ball of the norm "linf"."""
         return self.center - self.radius, self.center + self.radius
 
 
 def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = None) -> Tensor:
-    """The values from `low` to `high`, numbers or tensors, that are nearest to values (A, ...) in the Euclidean sense.
-    within: a ball, whose centers lie there."""
+    """Project values onto a box, or onto the intersection of a box and a norm-ball.
+
+    The result is the nearest point in the Euclidean sense.
+
+    Args:
+        values: Values, shape (A, ...).
+        low: Lowest values of the box, a number or a tensor that broadcasts.
+        high: Highest values of the box, a number or a tensor that broadcasts.
+        within: Norm-ball whose centers lie in the box. None for the box alone.
+
+    Returns:
+        The projections, with the shape of the values.
+
+    Example:
+        >>> ball = Ball(torch.zeros(1, 2), radius=1.0, norm="l2")
+        >>> nearest_in_box(torch.tensor([[0.0, 3.0]]), -2, 2, ball).tolist()
+        [[0.0, 1.0]]
+    """
     if within is None:
         return values.clamp(low, high)
     if within.norm == "linf":
@@ -40,24 +67,36 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
 
 
 def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
-    """With a multiplier λ for the ball, the nearest point is the box's nearest to c + (v - c) / (1 + λ).
+    """Project values v (A, ...) onto the intersection of a box and an L2 ball.
 
-    Its squared distance from the center c is a concave and piecewise linear function of s = 1 / (1 + λ)². From s = 0
-    on, Newton's steps therefore end where the distance is the radius, without going beyond.
+    With a multiplier λ for the ball, the projection is the box's nearest point
+    to c + (v - c) / (1 + λ), in which c is the center. Its squared distance from
+    c is a concave and piecewise linear function of s = 1 / (1 + λ)². Newton's
+    method from s = 0 therefore reaches the radius without passing it.
     """
-    offset, squared = values - ball.center, ball.radius**2
-    fraction, slope, distance = offset.new_zeros(()), _square(offset), offset.new_zeros(())
-    for _ in range(_STEPS):
-        step = (squared - distance) / slope.clamp(min=torch.finfo(values.dtype).tiny)
-        fraction = (fraction + step.clamp(min=0)).clamp(max=1)
-        target = torch.where(fraction < 1, ball.center + fraction.sqrt() * offset, values)
+    offset = values - ball.center
+    squared_radius = ball.radius**2
+    rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
+    # The current s, and the squared distance and its derivative by s. They have
+    # the shape (A, 1, ...), or () before the first step.
+    s = offset.new_zeros(())
+    squared_distance = offset.new_zeros(())
+    slope = _squared_norm(offset)
+    for _ in range(_MAX_STEPS):
+        missing = squared_radius - squared_distance
+        step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
+        s = (s + step.clamp(min=0)).clamp(max=1)
+        # The target at s = 1 is the values themselves, without rounding.
+        target = torch.where(s < 1, ball.center + s.sqrt() * offset, values)
         nearest = target.clamp(low, high)
-        slope, distance = _square(offset * (nearest == target)), _square(nearest - ball.center)
-        if not ((fraction < 1) & (squared - distance > 8 * torch.finfo(values.dtype).eps * squared)).any():
+        slope = _squared_norm(offset * (nearest == target))
+        squared_distance = _squared_norm(nearest - ball.center)
+        is_short = (s < 1) & (squared_radius - squared_distance > rounding)
+        if not is_short.any():
             break
     return nearest
 
 
-def _square(offsets: Tensor) -> Tensor:
-    """(A, 1, ...): the squared length of offsets (A, ...)."""
+def _squared_norm(offsets: Tensor) -> Tensor:
+    """Return the squared L2 norm of each row of offsets (A, ...), shape (A, 1, ...)."""
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

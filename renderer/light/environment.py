@@ -1,11 +1,14 @@
-"""Environment maps: files (.npy, .hdr, .exr) in and out, and the map that a light's coefficients stand for.
+"""Environment maps: read them, write them, and compute them from SH coefficients.
 
-Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `harmonics.equirectangular`: row 0 is up (+z), the
-middle column faces +x and azimuth grows to the left, as seen from inside.
+An environment map is a tensor (H, W, 3) of linear RGB radiance in the layout of
+`harmonics.equirectangular`. Row 0 faces up (+z), the middle column faces +x, and
+azimuth grows to the left, as seen from inside the sphere.
 
-Blender's Environment Texture lies so too and needs no rotation. Mitsuba 3's `envmap` has y up and the middle column
-towards +z, as OpenEXR defines such maps: a `to_world` of the rows (0, 0, 1), (1, 0, 0), (0, 1, 0) brings it here. Both
-shade with albedo / π where this project leaves out the π: a strength of π gives the same image.
+Blender's Environment Texture has the same layout and needs no rotation. Mitsuba
+3's `envmap` has y up and the middle column towards +z, as OpenEXR defines such
+maps. A `to_world` matrix with the rows (0, 0, 1), (1, 0, 0) and (0, 1, 0)
+rotates it to our layout. Blender and Mitsuba shade with albedo / π, while this
+project leaves out the π, so a strength of π gives the same image there.
 """
 
 import math
@@ -23,23 +26,54 @@ from renderer.io.images import read_numbers, write_numbers
 from renderer.light.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
-FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
-BLOCK = 2**12  # directions at a time: they stay in the cache
-NEGATIVE = 1e-4  # of the brightest radiance: what filters that scale maps leave
-LARGEST_MAP = 4096  # MB, which a damaged header may exceed
+# `read_panorama` refuses maps with fewer rows. The midpoint rule of `project`
+# would give a map of uniform radiance a direction: an error of 16 % at 4 rows.
+FEWEST_ROWS = 8
+# `light_radiance` evaluates as many directions at a time, which fit into the
+# CPU cache.
+BLOCK = 2**12
+# `read_panorama` accepts negative radiance up to this fraction of the maximum.
+# Filters that scale maps leave such values.
+NEGATIVE = 1e-4
+# Largest image in MB that OpenImageIO reads. A damaged header may claim more.
+LARGEST_MAP = 4096
+# RGBE stores the channels of a texel as bytes with a common exponent.
+_RGBE_BITS = 8
+_CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
+_ALPHA_NAMES = ("a", "alpha")
+_COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
 def to_map(coefficients: Tensor, height: int) -> Tensor:
-    """Radiance (height, 2 · height, 3) float64 of a light's coefficients ((degree + 1)², 3), at the texels' centers.
+    """Compute the environment map of a light.
 
-    Negative where the series rings. `renderer.light.harmonics.project` takes it back, off by its midpoint rule along z:
-    at degree 6 by up to 22.2 / height² of the coefficients' L2 norm (3.4e-4 at a height of 256).
+    The radiance is negative in places where the SH series rings. The function
+    `harmonics.project` inverts this one up to the error of its midpoint rule
+    along z. At degree 6, this error is at most 22.2 / height² of the L2 norm of
+    the coefficients (3.4e-4 at a height of 256).
+
+    Args:
+        coefficients: SH coefficients, shape ((degree + 1)², 3).
+        height: Number of rows. The map has twice as many columns.
+
+    Returns:
+        Radiance at the centers of the texels, shape (height, 2 height, 3),
+        float64.
     """
-    return light_radiance(coefficients, equirectangular(height, 2 * height)[0])
+    directions, _ = equirectangular(height, 2 * height)
+    return light_radiance(coefficients, directions)
 
 
 def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Radiance (..., 3) of a light's coefficients ((degree + 1)², 3) from directions (..., 3), in their dtype."""
+    """Evaluate the radiance of a light from some directions.
+
+    Args:
+        coefficients: SH coefficients, shape ((degree + 1)², 3).
+        directions: Directions of any length, shape (..., 3).
+
+    Returns:
+        Radiance, shape (..., 3), in the dtype of the directions.
+    """
     degree = math.isqrt(len(coefficients)) - 1
     blocks = directions.flatten(0, -2).split(BLOCK)
     radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
@@ -47,116 +81,202 @@ def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
 
 
 def negative_fraction(radiance: Tensor) -> float:
-    """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a fraction of its magnitude."""
-    power = radiance * equirectangular(*radiance.shape[:2])[1][..., None]
-    return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
+    """Return the share of negative radiance in an environment map.
+
+    This is the integral over the sphere of max(-radiance, 0), divided by the
+    integral of |radiance|, over all channels.
+
+    Args:
+        radiance: Environment map, shape (H, W, 3).
+
+    Returns:
+        Fraction in [0, 1]. It is 0 for a black map.
+    """
+    _, solid_angles = equirectangular(*radiance.shape[:2])
+    power = radiance * solid_angles[..., None]
+    magnitude = power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny)
+    return float((-power).clamp(min=0).sum() / magnitude)
 
 
 def read_map(path: str | Path) -> Tensor:
-    """Radiance (H, W, 3) float32 of an .npy, .hdr or .exr file, taken as linear and in the file's own unit.
+    """Read an environment map from a file.
 
-    Alpha is dropped and gray repeated; an .npy array is (H, W, C) with 1, 3 or 4 channels. Of an .exr file with
-    layers, the unnamed one counts, or else the first that has red, green and blue.
-    InputError: missing, unreadable, no such map, NaN, infinity or radiance beyond 1e12 (the sun has 1.6e9 cd/m²).
+    Values are taken as linear RGB in the unit of the file. An alpha channel is
+    dropped, and a single gray channel becomes all three. If an .exr file has
+    layers, the layer without a name is read, or else the first layer that has
+    red, green and blue.
+
+    Args:
+        path: An .npy, .hdr or .exr file. The array of an .npy file has the
+            shape (H, W, C) with 1, 3 or 4 channels.
+
+    Returns:
+        Radiance, shape (H, W, 3), float32.
+
+    Raises:
+        InputError: If the file does not exist, cannot be read or is not such a
+            map, or if its radiance is NaN, infinite or above 1e12. (The sun has
+            1.6e9 cd/m².)
     """
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
         texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
         radiance = texels[..., _color_channels(names)]
-    except Exception as error:  # both libraries raise many kinds for a damaged header
+    except Exception as error:
+        # NumPy and OpenImageIO raise many kinds of errors for a damaged file.
         message = str(error).partition("\n")[0]
         raise InputError(f"environment map {path} cannot be read: {message}") from error
-    if not (np.abs(radiance) <= LARGEST).all():  # NaN is not
-        raise InputError(f"environment map {path} holds NaN, infinity or radiance beyond {LARGEST:g}: mend its texels")
+    # NaN fails the comparison.
+    if not (np.abs(radiance) <= LARGEST).all():
+        raise InputError(
+            f"environment map {path} holds NaN, infinity or radiance beyond {LARGEST:g}: "
+            "replace these values and save it again"
+        )
     return torch.from_numpy(radiance)
 
 
 def read_panorama(path: str | Path) -> Tensor:
-    """`read_map` of a map that can be one of the whole sphere, with zero for radiance from -NEGATIVE of the largest on.
-    InputError: less; another shape, such as a mirror ball's; too few texels to be told from its midpoints."""
+    """Read an environment map that covers the whole sphere and has no negative radiance.
+
+    Args:
+        path: An .npy, .hdr or .exr file, as for `read_map`.
+
+    Returns:
+        Radiance of at least 0, shape (H, W, 3), float32. Negative radiance of at
+        most `NEGATIVE` times the maximum becomes zero.
+
+    Raises:
+        InputError: As for `read_map`. Also if the map has fewer than
+            `FEWEST_ROWS` rows, is not about twice as wide as high (such as a
+            mirror ball), or has more negative radiance.
+    """
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
-        advice = f"give an equirectangular one, twice as wide as high, of {FEWEST_ROWS} rows or more"
-        raise InputError(f"environment map {path} has {width} × {height} texels: {advice}")
-    if radiance.min() < -NEGATIVE * radiance.max():
-        raise InputError(f"environment map {path} has negative radiance, down to {radiance.min():.3g}: mend its texels")
+        raise InputError(
+            f"environment map {path} has {width} × {height} texels: "
+            f"give an equirectangular one, twice as wide as high, of {FEWEST_ROWS} rows or more"
+        )
+    minimum = radiance.min()
+    if minimum < -NEGATIVE * radiance.max():
+        raise InputError(
+            f"environment map {path} has negative radiance, down to {minimum:.3g}: "
+            "clip the map at 0 and save it again"
+        )
     return radiance.clamp(min=0)
 
 
 def write_map(path: str | Path, radiance: Tensor) -> None:
-    """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
+    """Write an environment map to a file.
 
-    RGBE has no sign and one exponent for three channels: radiance below zero becomes zero (`negative_fraction` says how
-    much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
-    InputError where the suffix is another or the file cannot be written.
+    An .npy or .exr file stores float32 and keeps negative radiance. An .hdr file
+    stores RGBE, which has no sign and one exponent for three channels. There,
+    negative radiance becomes zero (`negative_fraction` returns how much that
+    is), and the error is at most 2⁻⁸ of the largest channel of the texel.
+
+    Args:
+        path: An .npy, .hdr or .exr file. Its folder is created.
+        radiance: Environment map, shape (H, W, 3).
+
+    Raises:
+        InputError: If the suffix is another one or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix.lower() == ".npy":
+        if suffix == ".npy":
             write_numbers(path, radiance.numpy())
+        elif suffix == ".hdr":
+            _write_image(path, _to_rgbe_precision(radiance), "hdr")
         else:
-            file_format = "hdr" if path.suffix.lower() == ".hdr" else "openexr"
-            texels = _to_rgbe_precision(radiance) if file_format == "hdr" else radiance
-            image = _openimageio().ImageBuf(texels.contiguous().numpy())
-            with replacing(path) as temporary:
-                if not image.write(str(temporary), "unknown", file_format):
-                    raise OSError(image.geterror())
-    except (OSError, ValueError) as error:  # OpenImageIO takes no name that is not UTF-8
+            _write_image(path, radiance, "openexr")
+    except (OSError, ValueError) as error:
+        # OpenImageIO raises ValueError for a name that is not UTF-8.
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 
 
+def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
+    """Write texels (H, W, 3) in a format of OpenImageIO, replacing the file at once."""
+    image = _openimageio().ImageBuf(texels.contiguous().numpy())
+    with replacing(path) as temporary:
+        if not image.write(str(temporary), "unknown", file_format):
+            raise OSError(image.geterror())
+
+
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
+    """Read the texels (H, W, C) of an .npy file and the names of their channels."""
     array = read_numbers(path)
-    names = {1: "Y", 3: "RGB", 4: "RGBA"}.get(array.shape[-1]) if array.ndim == 3 else None
+    names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
-        raise InputError(f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels")
+        raise InputError(
+            f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels"
+        )
     return array, names
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
+    """Read the texels (H, W, C) of an .hdr or .exr file and the names of their channels."""
     image = _openimageio().ImageBuf(str(path))
-    if not image.read():  # the library's get_pixels would end the process
+    # `get_pixels` would end the process if the file could not be read.
+    if not image.read():
         raise InputError(image.geterror())
-    texels, spec = image.get_pixels("float"), image.spec()
+    texels = image.get_pixels("float")
+    spec = image.spec()
     if image.file_format_name not in ("hdr", "openexr"):
         raise InputError(f"it is a {image.file_format_name} image, give an .hdr or .exr file")
-    if spec.roi != spec.roi_full or image.orientation != 1:
+    is_cropped = spec.roi != spec.roi_full
+    is_turned = image.orientation != 1
+    if is_cropped or is_turned:
         raise InputError("it is stored cropped or turned, save it whole, its top row first")
     return texels, spec.channelnames
 
 
 def _to_rgbe_precision(radiance: Tensor) -> Tensor:
-    """Radiance rounded to what RGBE holds: the library truncates, which darkens and tints the light."""
+    """Round radiance (H, W, 3) to values that RGBE holds exactly.
+
+    OpenImageIO truncates instead, which would darken and tint the light.
+    """
     radiance = radiance.clamp(min=0)
     _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
-    unit = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - 8)
-    return (radiance / unit).round().clamp(max=255) * unit
+    unit = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - _RGBE_BITS)
+    return (radiance / unit).round().clamp(max=2**_RGBE_BITS - 1) * unit
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Indices of red, green and blue, equal for a gray channel."""
-    split = [name.casefold().rpartition(".")[::2] for name in names]  # (layer, channel)
-    for layer, _ in split:  # the library puts the unnamed layer first
-        for colors in (("r", "g", "b"), ("red", "green", "blue")):
-            channels = [(layer, color) for color in colors]
-            if set(channels) <= set(split):
-                return [split.index(channel) for channel in channels]
-    gray = [index for index, (_, channel) in enumerate(split) if channel not in ("a", "alpha")]
+    """Return the indices of the red, green and blue channel, which are equal for a gray image.
+
+    The name of a channel is "CHANNEL" or "LAYER.CHANNEL", in any case.
+    """
+    layers = []
+    channels = []
+    for name in names:
+        layer, _, channel = name.casefold().rpartition(".")
+        layers.append(layer)
+        channels.append(channel)
+    layers_and_channels = list(zip(layers, channels, strict=True))
+    # The library puts the layer without a name first.
+    for layer in layers:
+        for colors in _COLOR_NAMES:
+            wanted = [(layer, color) for color in colors]
+            if set(wanted) <= set(layers_and_channels):
+                return [layers_and_channels.index(channel) for channel in wanted]
+    gray = [index for index, channel in enumerate(channels) if channel not in _ALPHA_NAMES]
     if len(gray) == 1:
         return gray * 3
     raise InputError(f"its channels are {', '.join(names)}, give R, G and B, or one gray channel")
 
 
 def _openimageio() -> ModuleType:
-    import OpenImageIO  # takes long to import
+    """Import OpenImageIO, which takes long, and limit its threads and its memory."""
+    import OpenImageIO
 
-    OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
+    # A pool of threads beside torch's own would slow both down.
+    OpenImageIO.attribute("threads", 1)
     OpenImageIO.attribute("exr_threads", -1)
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)
     return OpenImageIO

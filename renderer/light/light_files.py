@@ -17,11 +17,25 @@ from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.validation import as_path, as_tensor, require_kind
 
+# Errors that reading a damaged or foreign .json file can raise.
+_DAMAGED_FILE_ERRORS = (
+    KeyError,
+    ValueError,
+    TypeError,
+    RuntimeError,
+    OverflowError,
+    RecursionError,
+    OSError,
+)
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
-def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
-    """Write a light to a .json file, from which `read_light` reads float32 back to the bit.
+def save_light(
+    path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS
+) -> None:
+    """Write a light to a .json file.
+
+    `read_light` reads the same float32 numbers back, to the bit.
 
     The pattern of a projector is also written as a .png file of eight bits
     beside it, in which white is the projector's power.
@@ -29,7 +43,7 @@ def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalB
     Args:
         path: The .json file.
         coefficients: Coefficients of the light, RGB, shape (size, 3).
-        basis: The basis of the light. The default is harmonics of degree 6.
+        basis: The basis of the light. The default is SH of degree 6.
 
     Raises:
         InputError: If the coefficients have another shape or hold NaN, or the
@@ -64,8 +78,8 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     """Read a light from a .json file.
 
     Args:
-        path: The file, as `save_light` writes it. A file of rows [r, g, b] alone
-            holds coefficients of harmonics.
+        path: The file, as `save_light` writes it. A file that is only a list of
+            rows [r, g, b] holds SH coefficients.
         kinds: The classes of bases that the file may describe.
 
     Returns:
@@ -89,17 +103,10 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (
-        KeyError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-        OverflowError,
-        RecursionError,
-        OSError,
-    ) as error:
+    except _DAMAGED_FILE_ERRORS as error:
         raise InputError(f"{path} does not describe a light ({error}): write it again") from error
-    is_bounded = bool((coefficients.abs() <= FACTOR).all())  # NaN is not.
+    # NaN fails the comparison.
+    is_bounded = bool((coefficients.abs() <= FACTOR).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)
         advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"

@@ -1,16 +1,24 @@
-"""The window that cuts a light off after a degree without ringing.
+"""The window that truncates a light at a degree without ringing.
 
-A window multiplies the coefficients of band l by w_l, which is the convolution of the light with the kernel
+A window multiplies the coefficients of band l by w_l. This is the convolution
+of the light with a kernel, where P_l are the Legendre polynomials and θ is the
+angle between two directions:
 
     k(cos θ) = Σ_l (2l + 1) / 4π w_l P_l(cos θ).
 
-Where the kernel is nowhere negative, light that is nowhere negative stays so, and w_0 = 1 keeps its mean. Of such
-kernels, the one here gives a point source the irradiance of the smallest error, Σ_l (2l + 1) A_l² (1 - w_l)², in which
-A_l are the factors of diffuse surfaces (`harmonics.lambertian_factors`). In the odd bands from the third on they are
-zero; there, half of the smallest takes their place, which raises the error by less than 10⁻⁵ of it.
+If the kernel is non-negative, a non-negative light stays so. With w_0 = 1, the
+light keeps its mean.
 
-This is a convex quadratic program with a constraint for each angle. The exchange method (Hettich and Kortanek 1993,
-"Semi-infinite programming", section 7) solves it at some angles and adds those where the kernel is negative.
+Of these kernels, `nonnegative_window` computes the one that gives a point
+source the smallest irradiance error, Σ_l (2l + 1) A_l² (1 - w_l)². The factors
+A_l of `harmonics.lambertian_factors` are zero in the odd bands from the third
+on. Half of the smallest positive factor takes their place, which raises the
+error by less than 10⁻⁵ of it.
+
+This is a convex quadratic program with a constraint for each angle. The
+exchange method (Hettich and Kortanek 1993, "Semi-infinite programming", section
+7) solves it for some angles, adds those at which the kernel is negative, and
+repeats.
 """
 
 import math
@@ -23,67 +31,97 @@ from torch import Tensor
 from renderer.light.harmonics import bands, lambertian_factors, per_degree
 from renderer.light.program import shortest
 
-_ROUNDS = 100  # eight are usual
-_DEPTH = 1e-9  # of a dip below zero that is left, of the kernel's largest value
+# Exchange steps. Eight are usual.
+_MAX_ROUNDS = 100
+# The kernel may be below zero by this fraction of its largest value.
+_MAX_DEPTH = 1e-9
 
 
 @per_degree
 def nonnegative_window(degree: int) -> Tensor:
-    """The best non-negative window of a degree, by which each coefficient of a light is multiplied.
+    """Compute the non-negative window with the smallest irradiance error of a point source.
 
-    The rms irradiance error of a point source is 0.17, 0.073 and 0.039 of its rms irradiance at degrees 6, 12 and 19.
+    The rms error is 0.17, 0.073 and 0.039 of the rms irradiance of the source
+    at degrees 6, 12 and 19.
 
     Args:
-        degree: of the light, from 0 to 20.
+        degree: Degree of the light, from 0 to 20.
 
     Returns:
-        ((degree + 1)²,) float64 factors from 0 to 1, the same for all coefficients of a band, and 1 for the first.
+        Factors in [0, 1] of each coefficient, shape ((degree + 1)²,), float64.
+        They are equal within a band, and 1 for the first coefficient.
     """
-    weight = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_weights(degree)[np.arange(degree + 1) ** 2].numpy()
-    return best_window(np.ones(degree + 1), weight)
+    first_of_band = np.arange(degree + 1) ** 2
+    weights = irradiance_weights(degree)[first_of_band].numpy()
+    # A point source has the energy 2l + 1 in band l.
+    weights = np.sqrt(2 * np.arange(degree + 1) + 1) * weights
+    return best_window(np.ones(degree + 1), weights)
 
 
 def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
-    """Find the window under which a lobe is nowhere negative and nearest to itself.
+    """Compute the window that changes a lobe least and makes it non-negative.
+
+    A lobe is a function of the angle θ from its axis, Σ (2l + 1) s_l P_l(cos θ).
+    The window minimizes Σ weight_l² (w_l - 1)² such that
+    Σ (2l + 1) s_l w_l P_l is non-negative.
 
     Args:
-        spectrum: Positive factors s_l of the lobe in each band, shape (degree + 1,); ones for a point.
+        spectrum: Positive factors s_l of the lobe in each band, shape
+            (degree + 1,). Ones are the lobe of a point source.
         weight: Weight of w_l - 1 in each band, shape (degree + 1,).
 
     Returns:
-        Factors w_l of each coefficient, shape ((degree + 1)²,), float64, 1 for the first. They minimize
-        Σ weight_l² (w_l - 1)² such that Σ (2l + 1) s_l w_l P_l is nowhere negative.
+        Factors w_l of each coefficient, shape ((degree + 1)²,), float64. They
+        are equal within a band, and 1 for the first coefficient.
     """
     degree = len(weight) - 1
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         factors = _best_factors(cosines, weight, spectrum)
         series = (2 * np.arange(degree + 1) + 1) * spectrum * factors
-        turning = legendre.legroots(legendre.legder(series))
-        candidates = np.concatenate([turning.real.clip(-1, 1), [-1.0, 1.0]])
+        # The series has its minimum at a root of its derivative or at an end.
+        stationary = legendre.legroots(legendre.legder(series))
+        candidates = np.concatenate([stationary.real.clip(-1, 1), [-1.0, 1.0]])
         values = legendre.legval(candidates, series)
-        negative = candidates[values < -_DEPTH * values.max()]
+        negative = candidates[values < -_MAX_DEPTH * values.max()]
         if not len(negative):
             break
         cosines = np.concatenate([cosines, negative])
-    factors[1:] /= max(1 - values.min(), 1)  # towards the constant kernel 1, until no dip is left
+    # Mixing with the constant kernel 1 lifts what is left below zero.
+    factors[1:] /= max(1 - values.min(), 1)
     return torch.from_numpy(factors)[bands(degree)]
 
 
 @per_degree
 def irradiance_weights(degree: int) -> Tensor:
-    """The factors ((degree + 1)²,) of diffuse surfaces, of that of the first coefficient; in place of zero, half of the
-    smallest up to the next degree."""
+    """Compute the weight of each coefficient in the irradiance, relative to the first one.
+
+    The weights are |A_l| / A_0, with the factors A_l of `lambertian_factors`.
+    Where A_l is zero, half of the smallest positive factor up to the next
+    degree takes its place.
+
+    Args:
+        degree: Degree of the light.
+
+    Returns:
+        Positive weights, shape ((degree + 1)²,), float64.
+    """
     factors = lambertian_factors(degree + 1).abs()
-    weights = factors.clamp(min=factors[factors > 0].min() / 2) / factors[0]
+    smallest = factors[factors > 0].min()
+    weights = factors.clamp(min=smallest / 2) / factors[0]
     return weights[: (degree + 1) ** 2]
 
 
 def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
-    """The factors (degree + 1,) of the least error under which the lobe of a spectrum is not negative at the cosines
-    (N,); by the change weight (w - 1) of w = 1, which has none."""
-    kernel = legendre.legvander(cosines, len(weight) - 1) * (2 * np.arange(len(weight)) + 1) * spectrum
+    """Return the factors w_l (degree + 1,) of the best window for N angles.
+
+    The windowed lobe is non-negative at the cosines (N,) of these angles. The
+    program is solved for the vector weight (w - 1) without the first band, whose
+    length is the error.
+    """
+    degree = len(weight) - 1
+    kernel = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
     change = shortest(kernel[:, 1:] / weight[1:], -kernel.sum(1))
     return np.concatenate([[1.0], 1 + change / weight[1:]])

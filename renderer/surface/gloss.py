@@ -1,18 +1,28 @@
-"""Gloss of a mesh's surface in the words of glTF 2.0, and what it reflects at a view's samples.
+"""Gloss (specular reflection) of surfaces in the terms of glTF 2.0.
 
-With metallic m, strength s and albedo ρ, the F of `renderer.surface.microfacets` is (1 - m) s times that of a dielectric, which
-is white, and m times Schlick's with F0 = ρ and F90 = 1, which has the metal's color. Radiance per irradiance is
+A surface has roughness, metallic m and strength s (glTF's `specularFactor`), and
+an albedo ρ. Its specular reflection has two parts, both of `renderer.surface.microfacets`.
+A dielectric one with the factor (1 - m) s is white. A metallic one with the
+factor m has the color of the metal: it is Schlick's approximation with
+F0 = ρ and F90 = 1. The reflected radiance per irradiance is
 
     ρ (diffuse + colored) + white.
 
-The diffuse part lies below the coat. With E(μ), the fraction of a beam that the coat reflects (`coat_albedo`), and its
-mean E_avg = 2 ∫ E(μ) μ dμ, the diffuse part of light from direction l, seen from direction v, is
+The diffuse surface lies below the dielectric layer, which is called coat here.
+The unit vectors n, l and v are the normal, the direction to the light and the
+direction to the camera. Let E(μ) be the fraction of a beam with the cosine μ
+that the coat reflects (`coat_albedo`), and E_avg = 2 ∫ E(μ) μ dμ its mean. Then
 
-    (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
+    diffuse = (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
 
-(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). It is reciprocal. Together with the coat,
-a white surface reflects each beam entirely: s E(n·l) + (1 - s E(n·l)) = 1. Of environment light, the coat lets the
-irradiance Σ (A_l - s B_l) U_lm Y_lm(n) through, with the B_l of `coat_bands`.
+(Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). This
+is reciprocal. A white surface with its coat reflects each beam entirely: the coat
+reflects s E(n·l), and the surface below reflects 1 - s E(n·l). Of environment
+light with the coefficients U_lm, the irradiance Σ (A_l - s B_l) U_lm Y_lm(n)
+passes the coat, with the A_l of `lambertian_factors` and the B_l of `coat_bands`.
+
+Shapes use these letters: a view has S samples of a mesh with F faces. K is the
+number of SH coefficients, (degree + 1)².
 """
 
 from __future__ import annotations
@@ -50,16 +60,33 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+_NAMES = ("roughness", "metallic", "strength")
+# Percentile of the roughness of a texture that `smoothest` returns. Fewer texels
+# are smoother.
+_SMOOTHEST_PERCENT = 1
+# Irradiance 1 of uniform light is radiance 1/π, whose first SH coefficient is:
+_UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
+
 
 @dataclass(frozen=True, eq=False)
 class Gloss:
-    """Roughness, metallic and strength (`specularFactor` of KHR_materials_specular) of a surface, each in [0, 1]: a
-    number for all of a mesh, or a tensor (), or (F,) for its faces. Roughness below 0.2 is taken for 0.2. textured:
-    multiplied by the mesh's gloss textures, which it replaces otherwise.
+    """Specular reflection of a surface.
 
-    >>> varnished = Gloss(roughness=0.3).on(renderer.solid("orange"))
-    >>> varnished.gloss.shape == varnished.faces.shape
-    True
+    Each of the three values is a number in [0, 1] for all of a mesh, a tensor of
+    shape (), or a tensor of shape (F,) with a number for each face.
+
+    Attributes:
+        roughness: Roughness as in glTF. Below 0.2, it is taken for 0.2.
+        metallic: Fraction of the surface that is metal.
+        strength: Factor of the dielectric reflection (`specularFactor` of
+            KHR_materials_specular).
+        textured: Whether the gloss textures of the mesh multiply the values.
+            Otherwise the textures are ignored.
+
+    Example:
+        >>> varnished = Gloss(roughness=0.3).on(renderer.solid("orange"))
+        >>> varnished.gloss.shape == varnished.faces.shape
+        True
     """
 
     roughness: float | Float[Tensor, ...] = 0.5
@@ -68,30 +95,61 @@ class Gloss:
     textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:
-        """The mesh with this gloss in place of its own. InputError: another shape, values beyond [0, 1], NaN."""
+        """Return a copy of a mesh with this gloss instead of its own.
+
+        Args:
+            mesh: The mesh.
+
+        Raises:
+            InputError: If a value is out of range, NaN or has another shape.
+        """
         require_mesh("mesh", mesh)
-        columns = [values.detach().cpu().expand(len(mesh.faces)) for values in self.checked(len(mesh.faces))]
+        face_count = len(mesh.faces)
+        columns = []
+        for values in self.checked(face_count):
+            columns.append(values.detach().cpu().expand(face_count))
         textures = mesh.gloss_textures if self.textured else ()
-        return replace(mesh, gloss=torch.stack(columns, dim=1).float().numpy(), gloss_textures=textures)
+        by_face = torch.stack(columns, dim=1).float().numpy()
+        return replace(mesh, gloss=by_face, gloss_textures=textures)
 
     def checked(self, faces: int) -> list[Tensor]:
-        """Roughness, metallic and strength as tensors (1,) or (F,), of so many faces. InputError: as `on`."""
+        """Return roughness, metallic and strength as tensors of shape (1,) or (F,).
+
+        Args:
+            faces: Number of faces of the mesh, F.
+
+        Raises:
+            InputError: If a value is out of range, NaN or has another shape.
+        """
         require_flag("textured", self.textured)
         checked = []
-        for name in ("roughness", "metallic", "strength"):
+        for name in _NAMES:
             given = getattr(self, name)
             values = as_tensor(f"gloss: {name}", given)
             if isinstance(given, int | float):
-                values = torch.tensor(float(given), dtype=torch.float64)  # a plain number keeps its precision
+                # A Python number keeps its precision.
+                values = torch.tensor(float(given), dtype=torch.float64)
             require_bounded(**{name: values})
-            if values.shape not in ((), (1,), (faces,)) or not (values.min() >= 0 and values.max() <= 1):
-                raise InputError(f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]")
+            has_shape = values.shape in ((), (1,), (faces,))
+            if not has_shape or not (values.min() >= 0 and values.max() <= 1):
+                raise InputError(
+                    f"gloss: {name} of shape {tuple(values.shape)}: "
+                    f"give one number or {faces}, in [0, 1]"
+                )
             checked.append(values.reshape(-1))
         return checked
 
 
 class SampleGloss(NamedTuple):
-    """At the samples of a view: (S,) each, or (1,) where all have the same."""
+    """The gloss at the samples of a view.
+
+    Each tensor has the shape (S,), or (1,) if all samples have the same value.
+
+    Attributes:
+        roughness: Roughness in [0.2, 1].
+        metallic: Fraction that is metal in [0, 1].
+        strength: Factor of the dielectric reflection in [0, 1].
+    """
 
     roughness: Tensor
     metallic: Tensor
@@ -99,70 +157,118 @@ class SampleGloss(NamedTuple):
 
     @property
     def metal(self) -> bool:
-        """Whether any of it is metallic, or may become so."""
+        """Return whether any sample is metallic, or may become so by differentiation."""
         return self.metallic.requires_grad or bool(self.metallic.any())
 
     def at(self, samples: Tensor | slice) -> SampleGloss:
-        """Of some samples."""
+        """Return the gloss at some of the samples.
+
+        Args:
+            samples: Indices of samples, or a slice.
+        """
         return SampleGloss(*(at_samples(values, samples) for values in self))
 
     def to(self, like: Tensor) -> SampleGloss:
+        """Return the gloss in the dtype and on the device of another tensor.
+
+        Args:
+            like: The other tensor.
+        """
         return SampleGloss(*(values.to(like) for values in self))
 
     def lobes(self, cosine: Tensor, degree: int) -> tuple[Tensor | None, Tensor]:
-        """(colored, white) functions (M, S) of `renderer.surface.microfacets.lobe_functions` at n·v (S,); None for no color."""
+        """Compute the specular lobes as functions of the direction to the camera.
+
+        Args:
+            cosine: Cosine between normal and direction to the camera, n·v, shape
+                (S,).
+            degree: Degree of the light.
+
+        Returns:
+            The colored and the white lobe, in the M functions of
+            `renderer.surface.microfacets.lobe_functions`, shape (M, S) each. The colored
+            lobe is None if no sample is metallic.
+        """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)
-        white, *of_metals = lobe_functions(cosine, self.roughness, degree, terms)
-        white = (1 - self.metallic) * self.strength * white
+        dielectric, *of_metals = lobe_functions(cosine, self.roughness, degree, terms)
+        white = (1 - self.metallic) * self.strength * dielectric
         if not of_metals:
             return None, white
-        return self.metallic * of_metals[0], white + self.metallic * of_metals[1]
+        schlick, edge = of_metals
+        return self.metallic * schlick, white + self.metallic * edge
 
     def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor | None, Tensor]:
-        """(colored, white) reflection (S,) of an even sky of irradiance 1. normals, toward the camera: (S, 3) unit."""
-        constant = math.sqrt(4 * math.pi) / math.pi  # the band's coefficient of such a sky
-        colored, white = self.lobes((normals * toward).sum(1).clamp(0, 1), 0)
-        return colored if colored is None else colored[0] * constant, white[0] * constant
-
-    def entering(self, cosine: Tensor) -> Tensor:
-        """Compute 1 - s E(μ), the fraction of light from a direction that passes the coat. Differentiable.
-
-        Args:
-            cosine: Cosine μ between normal and direction, any shape; negative ones count as 0.
-
-        Returns:
-            The fraction, of the shape of `cosine`.
-        """
-        return 1 - self.strength * coat_albedo(cosine.clamp(0, 1), self.roughness)
-
-    def entering_bands(self, degree: int) -> Tensor:
-        """Compute A_l - s B_l, by which environment light below the coat becomes irradiance. Differentiable.
-
-        Args:
-            degree: Degree of the light, at most `DIFFUSE_DEGREE`.
-
-        Returns:
-            A factor for each coefficient of the light, shape ((degree + 1)², S), or (..., 1) of an even gloss.
-        """
-        reflected = coat_bands(degree).to(self.roughness) @ along(self.roughness)
-        factors = lambertian_factors(degree).to(self.roughness)
-        return factors[:, None] - self.strength * reflected[bands(degree)]
-
-    def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
-        """Compute (1 - m) (1 - s E(n·v)) / (1 - s E_avg), by which the light below the coat is seen. Differentiable.
+        """Compute the specular reflection of uniform light of irradiance 1.
 
         Args:
             normals: Unit normals, shape (S, 3).
             toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
 
         Returns:
-            Factors of albedo and of the light that passes the coat, shape (S,).
+            The colored and the white radiance, shape (S,) each. The colored one
+            is None if no sample is metallic.
+        """
+        cosine = (normals * toward).sum(1).clamp(0, 1)
+        colored, white = self.lobes(cosine, degree=0)
+        white_radiance = white[0] * _UNIFORM_COEFFICIENT
+        if colored is None:
+            return None, white_radiance
+        return colored[0] * _UNIFORM_COEFFICIENT, white_radiance
+
+    def entering(self, cosine: Tensor) -> Tensor:
+        """Compute the fraction of light that passes the coat, 1 - s E(μ).
+
+        The result is differentiable.
+
+        Args:
+            cosine: Cosine μ between normal and direction, any shape. Negative
+                ones count as 0.
+
+        Returns:
+            Fractions in [0, 1], with the shape of `cosine`.
+        """
+        return 1 - self.strength * coat_albedo(cosine.clamp(0, 1), self.roughness)
+
+    def entering_bands(self, degree: int) -> Tensor:
+        """Compute the factors A_l - s B_l of environment light below the coat.
+
+        With these factors, the coefficients of the light become the irradiance of
+        the diffuse surface. The result is differentiable.
+
+        Args:
+            degree: Degree of the light, at most `DIFFUSE_DEGREE`.
+
+        Returns:
+            A factor for each coefficient, shape (K, S), or (K, 1) if all samples
+            have the same gloss.
+        """
+        reflected = coat_bands(degree).to(self.roughness) @ along(self.roughness)
+        factors = lambertian_factors(degree).to(self.roughness)
+        return factors[:, None] - self.strength * reflected[bands(degree)]
+
+    def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
+        """Compute how much of the diffuse radiance below the coat the camera sees.
+
+        This is the factor (1 - m) (1 - s E(n·v)) / (1 - s E_avg) of the albedo and
+        of the light that passes the coat. The result is differentiable.
+
+        Args:
+            normals: Unit normals, shape (S, 3).
+            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+
+        Returns:
+            Factors, shape (S,).
         """
         leaving = self.entering((normals * toward).sum(1))
         return (1 - self.metallic) * leaving / (1 - self.strength * coat_mean(self.roughness))
 
-    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, ViewFrame]:
-        """Compute the radiance per unit coefficient of environment light, along the axes of a view. Differentiable.
+    def transfer(
+        self, normals: Tensor, toward: Tensor, degree: int
+    ) -> tuple[Tensor | None, Tensor, ViewFrame]:
+        """Compute the specular radiance per unit of each coefficient of environment light.
+
+        The coefficients are those in the axes of the view. The result is
+        differentiable.
 
         Args:
             normals: Unit normals, shape (S, 3).
@@ -170,62 +276,146 @@ class SampleGloss(NamedTuple):
             degree: Degree of the light.
 
         Returns:
-            What is multiplied by the albedo, shape (K, S), K = (degree + 1)², or None for no color; what is not, of the
-            same shape; and the frame of the view, which turns coefficients into those of the world (`to_world`).
+            The colored radiance, which the albedo multiplies, shape (K, S), or
+            None if no sample is metallic; the white radiance, shape (K, S); and
+            the frame of the view, which turns coefficients to world axes
+            (`to_world`).
         """
         frame = ViewFrame.of(normals, toward)
         colored, white = self.lobes(frame.cosine, degree)
-        return colored if colored is None else frame.harmonics(colored), frame.harmonics(white), frame
+        colored_transfer = None if colored is None else frame.harmonics(colored)
+        return colored_transfer, frame.harmonics(white), frame
 
     def along(self, normals: Tensor, toward: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """(colored, white) radiance (...) per irradiance from directions (..., 3); all unit vectors. Differentiable."""
+        """Compute the specular radiance per irradiance from single directions.
+
+        The result is differentiable.
+
+        Args:
+            normals: Unit normals, shape (..., 3).
+            toward: Unit vectors to the camera, shape (..., 3).
+            directions: Unit vectors to the light, shape (..., 3).
+
+        Returns:
+            The colored radiance, which the albedo multiplies, and the white
+            radiance, shape (...) each.
+        """
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
-        return self.metallic * schlick, self.metallic * edge + (1 - self.metallic) * self.strength * dielectric
+        white = self.metallic * edge + (1 - self.metallic) * self.strength * dielectric
+        return self.metallic * schlick, white
 
 
 def smoothest(mesh: Mesh) -> float:
-    """The least roughness of faces that have gloss, of textures all but a hundredth included; 1 where none has."""
+    """Return the smallest roughness of the faces of a mesh that have gloss.
+
+    The hundredth of a texture that is smoothest does not count. The result is 1
+    for a matte mesh.
+
+    Args:
+        mesh: The mesh.
+    """
     if mesh.gloss is None:
         return 1.0
-    factors = [*(np.percentile(texture[..., 0], 1) / 255 for texture in mesh.gloss_textures), 1.0]  # -1: no texture
-    by_face = mesh.gloss[:, 0] * np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
-    return float(by_face.min(initial=1, where=mesh.gloss[:, 1:].any(1)))
+    factors = [
+        np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures
+    ]
+    # The last factor is that of faces without a texture, whose index is -1.
+    factors.append(1.0)
+    factor_of_face = np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
+    roughness = mesh.gloss[:, 0] * factor_of_face
+    has_gloss = mesh.gloss[:, 1:].any(1)
+    return float(roughness.min(initial=1, where=has_gloss))
 
 
 def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
-    """Values (S, ...) of some samples; all of (1, ...), which all samples share."""
+    """Return the values at some samples.
+
+    Args:
+        values: Values of all samples, shape (S, ...), or (1, ...) if all samples
+            share one.
+        samples: Indices of samples, or a slice.
+
+    Returns:
+        The chosen values, or the shared one.
+    """
     return values if len(values) == 1 else values[samples]
 
 
-def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -> SampleGloss | None:
-    """That of the mesh, or a gloss in its place, in which it is differentiable; float64. None where there is neither.
-    InputError: as `Gloss.on`."""
+def sample_gloss(
+    mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
+) -> SampleGloss | None:
+    """Look up the gloss at the samples of a view.
+
+    The result is differentiable in a given gloss. A warning is issued if
+    roughness is raised to its minimum.
+
+    Args:
+        mesh: The mesh.
+        fragments: Samples of the view.
+        gloss: Gloss instead of that of the mesh. None for that of the mesh.
+
+    Returns:
+        The gloss in float64, or None for a matte surface.
+
+    Raises:
+        InputError: If a value is out of range, NaN or has another shape.
+    """
     textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
     if gloss is None:
-        if mesh.gloss is None:
-            return None
-        rows = mesh.gloss[:1] if (mesh.gloss == mesh.gloss[0]).all() else mesh.gloss
-        gloss = Gloss(*torch.from_numpy(rows).unbind(1))
+        gloss = _gloss_of_mesh(mesh)
+    if gloss is None:
+        return None
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
-    by_face = [column if len(column) == 1 else column.index_select(0, fragments.faces) for column in columns]
-    values = [column if len(column) == 1 else column.index_select(0, fragments.face) for column in by_face]
-    roughness, metallic, strength = values
+    roughness, metallic, strength = (_by_sample(column, fragments) for column in columns)
     if textures:
-        sources = [Texture.of(torch.from_numpy(texture).to(fragments.coverage) / 255) for texture in textures]
-        factors = sample_textures(sources, mesh, fragments)
-        roughness, metallic = roughness * factors[0], metallic * factors[1]
+        sources = []
+        for texture in textures:
+            factors = torch.from_numpy(texture).to(fragments.coverage) / 255
+            sources.append(Texture.of(factors))
+        roughness_factor, metallic_factor = sample_textures(sources, mesh, fragments)
+        roughness = roughness * roughness_factor
+        metallic = metallic * metallic_factor
     if (roughness < MIN_ROUGHNESS).any():
         warnings.warn(
-            f"roughness below {MIN_ROUGHNESS}: shaded as {MIN_ROUGHNESS}, the least that light of degree 40 shows",
+            f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}, "
+            "the smallest roughness that light of degree 40 shows.",
             stacklevel=2,
         )
     return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, strength)
 
 
+def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
+    """Return the gloss of a mesh, with one row if all faces agree, or None if it is matte."""
+    if mesh.gloss is None:
+        return None
+    is_even = (mesh.gloss == mesh.gloss[0]).all()
+    rows = mesh.gloss[:1] if is_even else mesh.gloss
+    roughness, metallic, strength = torch.from_numpy(rows).unbind(1)
+    return Gloss(roughness, metallic, strength)
+
+
+def _by_sample(column: Tensor, fragments: Fragments) -> Tensor:
+    """Return values (S,) of the samples, given values (F,) of the faces, or one value as it is."""
+    if len(column) == 1:
+        return column
+    return column.index_select(0, fragments.faces).index_select(0, fragments.face)
+
+
 def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
-    """(S, 3) unit vectors at the samples, or (1, 3) where all have the same, in the dtype of the vertices (V, 3);
-    differentiable in them."""
+    """Compute unit vectors from the samples to the camera.
+
+    Args:
+        fragments: Samples of the view.
+        vertices: Positions, shape (V, 3).
+
+    Returns:
+        Unit vectors, shape (S, 3), or (1, 3) without perspective, where all are
+        equal. They have the dtype of the vertices, and are differentiable in
+        them.
+    """
+    # The last number is 1 for a position, and 0 for a direction.
     eye = fragments.eye.to(vertices)
     if not eye[3]:
         return eye[None, :3]
-    return unit((eye[:3] - fragments.interpolate(vertices[fragments.corners])).T).T
+    points = fragments.interpolate(vertices[fragments.corners])
+    return unit((eye[:3] - points).T).T

@@ -1,22 +1,33 @@
-"""Diffuse shading of a view's fragments, differentiable in the vertices, the light and the albedo.
+"""Shading of the surface samples of a view, differentiable in vertices, light and albedo.
 
-The radiance of a pixel is the box filter over its s² samples i, of albedo ρ and unit normal n:
+The radiance of a pixel is the mean (box filter) over its s² samples i, with
+albedo ρ_i and unit normal n_i:
 
-    L = 1/s² Σ_i ρ_i E(n_i),    E(n) = Σ_lm A_l U_lm Y_lm(n),    A_l = π, 2π/3, π/4, 0, −π/24, 0, π/64, ...
+    L = 1/s² Σ_i ρ_i E(n_i),    E(n) = Σ_lm A_l U_lm Y_lm(n),
 
-E is the irradiance of a diffuse surface (Ramamoorthi and Hanrahan 2001; the paper's appendix B.2). Bands of even degree
-from 2 on are one homogeneous polynomial p of degree d on the sphere, whose value follows from its slope by Euler's
-theorem, p(n) = n · ∇p(n) / d. So one product of monomials with the slope's coefficients gives both E and ∂E/∂n, of
-which the part tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by the normal (appendix D).
+with the harmonics Y_lm, the coefficients U_lm of the light, and the factors
+A_l = π, 2π/3, π/4, 0, −π/24, 0, π/64, ... E is the irradiance of a diffuse
+surface (Ramamoorthi and Hanrahan 2001; the paper's appendix B.2).
 
-Visibility and texture coordinates are fixed (Section 3 and appendix B.3): the derivative by the vertices contains
-how normals turn and not how outlines move. For the light alone, `renderer.transport.operators` is faster.
+On the sphere, the bands of even degree from 2 on are together one homogeneous
+polynomial p of degree d. By Euler's theorem, its value follows from its gradient
+(called slope here): p(n) = n · ∇p(n) / d. One product of monomials with the
+coefficients of the slope therefore gives both E and ∇E. The part of the slope
+that is tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by
+the normal (the paper's appendix D).
+
+Visibility and texture coordinates are fixed (the paper's Section 3 and appendix
+B.3). The derivative by the vertices contains how normals turn, but not how
+silhouette edges move. For derivatives by the light alone,
+`renderer.transport.operators` is faster.
+
+Shapes use these letters: a view has S samples in P pixels of a mesh with V
+vertices and F faces. K is the number of coefficients, (degree + 1)².
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -35,7 +46,9 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-BLOCK = 2**14  # normals at a time
+# Normals that are shaded at a time, so that their values stay in the CPU cache.
+BLOCK = 2**14
+COLORS = 3
 
 
 def radiance(
@@ -45,12 +58,27 @@ def radiance(
     albedo: Float[Tensor, "S 3"],
     normals: Float[Tensor, "V 3"] | None = None,
 ) -> Float[Tensor, "3 P"]:
-    """Linear radiance of the P covered pixels, weighted with coverage, in the dtype of `vertices`.
+    """Compute the linear radiance of the covered pixels of a matte surface.
 
-    light: of any degree. albedo: linear, at the S samples (`renderer.surface.albedo`). normals: of the vertices, to shade with
-    them interpolated (`normals_in_sight`); None: a normal per face. InputError: NaN in any of them.
+    The result is differentiable in the vertices, the light and the albedo.
+
+    Args:
+        fragments: Samples of the view.
+        vertices: Positions, shape (V, 3).
+        light: SH coefficients of any degree, shape (K, 3).
+        albedo: Linear albedo at the samples (`renderer.surface.albedo`), shape (S, 3).
+        normals: Normals of the vertices (`normals_in_sight`), shape (V, 3), for
+            smooth shading. None for flat shading with the normals of the faces.
+
+    Returns:
+        Radiance, weighted with coverage, shape (3, P), in the dtype of the
+        vertices.
+
+    Raises:
+        InputError: If an argument holds NaN.
     """
-    require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
+    # The vertices and the light are checked where they are used.
+    require_bounded(albedo=albedo)
     wide = torch.promote_types(vertices.dtype, torch.float32)
     albedo = albedo.to(wide)
     if normals is None:
@@ -58,11 +86,14 @@ def radiance(
         planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
         shade = irradiance(planes, light, wide).index_select(1, face)
     else:
-        pixel, weights = fragments.pixel, albedo / fragments.samples**2
+        pixel = fragments.pixel
+        weights = albedo / fragments.samples**2
         shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
     seen = shade * weights.T
-    if fragments.samples > 1:  # a sample is a pixel otherwise
-        seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
+    # Samples are pixels if there is one per pixel. Then there is nothing to sum.
+    if fragments.samples > 1:
+        zeros = seen.new_zeros(COLORS, len(fragments.pixels))
+        seen = zeros.index_add(1, pixel, seen)
     return seen.to(vertices.dtype)
 
 
@@ -74,58 +105,109 @@ def glossy_radiance(
     normals: Float[Tensor, "V 3"] | None,
     gloss: SampleGloss,
 ) -> Float[Tensor, "3 P"]:
-    """`radiance` of a surface with gloss at the samples (`renderer.surface.gloss`); differentiable in that, too."""
+    """Compute the linear radiance of the covered pixels of a glossy surface.
+
+    The result is differentiable in the vertices, the light, the albedo and the
+    gloss.
+
+    Args:
+        fragments: Samples of the view.
+        vertices: Positions, shape (V, 3).
+        light: SH coefficients of any degree, shape (K, 3).
+        albedo: Linear albedo at the samples, shape (S, 3).
+        normals: Normals of the vertices, as for `radiance`.
+        gloss: Gloss at the samples (`renderer.surface.gloss`).
+
+    Returns:
+        Radiance, weighted with coverage, shape (3, P), in the dtype of the
+        vertices.
+
+    Raises:
+        InputError: If an argument holds NaN.
+    """
     wide = torch.promote_types(vertices.dtype, torch.float32)
     if normals is None:
         planes = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shaded = unit(planes).T[fragments.face].to(wide)
+        shaded_normals = unit(planes).T[fragments.face].to(wide)
     else:
-        shaded = unit(smooth_normals(fragments, normals.to(wide)).T).T
-    toward = toward_camera(fragments, vertices.to(wide))
-    albedo, light, gloss = albedo.to(wide), light.to(wide), gloss.to(shaded)
-    below = albedo * gloss.diffuse(shaded, toward)[:, None]
+        shaded_normals = unit(smooth_normals(fragments, normals.to(wide)).T).T
+    to_camera = toward_camera(fragments, vertices.to(wide))
+    albedo = albedo.to(wide)
+    light = light.to(wide)
+    gloss = gloss.to(shaded_normals)
+    # The albedo of the diffuse surface below the coat.
+    albedo_below = albedo * gloss.diffuse(shaded_normals, to_camera)[:, None]
     blocks = []
-    for first in range(0, len(shaded), BLOCK):
+    for first in range(0, len(shaded_normals), BLOCK):
         some = slice(first, first + BLOCK)
-        seen = shaded[some], at_samples(toward, some)
-        colored, white, frame = gloss.at(some).transfer(*seen, harmonics.degree_of(light))
-        in_view = frame.from_world(light).T
-        shine = in_view @ white
-        if colored is not None:
-            shine = shine + albedo[some].T * (in_view @ colored)
-        lost = _coat_irradiance(shaded[some].T, light, gloss.at(some))
-        blocks.append(shine - below[some].T * lost)
-    shine = torch.cat([light.new_zeros(3, 0), *blocks], dim=1) / fragments.samples**2
-    diffuse = radiance(fragments, vertices, light, below, normals)
-    return diffuse + shine.new_zeros(3, len(fragments.pixels)).index_add(1, fragments.pixel, shine).to(diffuse)
+        reflected = _reflected_by_lobes(
+            shaded_normals[some], at_samples(to_camera, some), light, albedo[some], gloss.at(some)
+        )
+        lost = _coat_irradiance(shaded_normals[some].T, light, gloss.at(some))
+        blocks.append(reflected - albedo_below[some].T * lost)
+    shine = torch.cat([light.new_zeros(COLORS, 0), *blocks], dim=1) / fragments.samples**2
+    diffuse = radiance(fragments, vertices, light, albedo_below, normals)
+    zeros = shine.new_zeros(COLORS, len(fragments.pixels))
+    return diffuse + zeros.index_add(1, fragments.pixel, shine).to(diffuse)
+
+
+def _reflected_by_lobes(
+    normals: Tensor, to_camera: Tensor, light: Tensor, albedo: Tensor, gloss: SampleGloss
+) -> Tensor:
+    """Return the radiance (3, S) that the specular lobes reflect at samples.
+
+    The unit normals have the shape (S, 3), the unit vectors to the camera (S, 3)
+    or (1, 3), and the albedo (S, 3).
+    """
+    colored, white, frame = gloss.transfer(normals, to_camera, harmonics.degree_of(light))
+    light_in_view = frame.from_world(light).T
+    reflected = light_in_view @ white
+    if colored is not None:
+        reflected = reflected + albedo.T * (light_in_view @ colored)
+    return reflected
 
 
 def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tensor:
-    """Compute the irradiance (3, S) that the coat reflects at samples with unit normals (3, S)."""
+    """Return the irradiance (3, S) that the coat reflects at samples with unit normals (3, S)."""
     degree = min(harmonics.degree_of(light), harmonics.DIFFUSE_DEGREE)
     light = light[: (degree + 1) ** 2]
-    reflected = coat_bands(degree).to(light)[harmonics.bands(degree)]  # (K, nodes)
-    of_roughness = along(gloss.roughness)  # (nodes, S) or (nodes, 1)
+    # The reflected factor of each coefficient at the nodes of a table over
+    # roughness, shape (K, nodes).
+    reflected = coat_bands(degree).to(light)[harmonics.bands(degree)]
+    # The weight of each node, shape (nodes, S), or (nodes, 1) if all samples have
+    # the same roughness.
+    of_roughness = along(gloss.roughness)
     if len(gloss.roughness) == 1:
         return gloss.strength * _Series.apply(normals, (reflected @ of_roughness) * light)
-    lights = (reflected[..., None] * light[:, None]).flatten(1)  # (K, nodes × 3)
-    by_node = _Series.apply(normals, lights).unflatten(0, (-1, 3))  # (nodes, 3, S)
+    # One light for each node, shape (K, nodes × 3).
+    lights = (reflected[..., None] * light[:, None]).flatten(1)
+    # The irradiance under each of them, shape (nodes, 3, S).
+    by_node = _Series.apply(normals, lights).unflatten(0, (-1, COLORS))
     return gloss.strength * (by_node * of_roughness[:, None]).sum(0)
 
 
 class _Series(torch.autograd.Function):
-    """Σ c_k Y_k(n) of coefficients (K, C) at unit normals (3, N), shape (C, N), by the polynomials of `_Irradiance` for
-    both parities."""
+    """The sums Σ_k c_k Y_k(n) of C channels at N unit normals.
+
+    The normals have the shape (3, N), the coefficients (K, C) and the result
+    (C, N). On the sphere, the bands of even degree are together one homogeneous
+    polynomial, and so are the bands of odd degree. The value of a polynomial
+    follows from its slope (see the top of this module).
+    """
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, coefficients: Tensor) -> Tensor:
         degree = math.isqrt(len(coefficients)) - 1
+        # Band 0 is constant.
         value = (coefficients[0] / math.sqrt(4 * math.pi))[:, None]
         slope = normals.new_zeros(3, coefficients.shape[1], 1)
+        # The degrees of the two polynomials are the degree and the one below.
         for power in range(max(degree - 1, 1), degree + 1):
-            slopes = _slopes(power).to(coefficients)[..., : len(coefficients)]  # (3, J, K)
-            by_axis = slopes @ coefficients[: slopes.shape[2]]
-            part = by_axis.mT @ harmonics.monomials(normals, power - 1)  # (3, C, N)
+            # Shape (3 axes, monomials, K).
+            slope_matrices = _slopes(power).to(coefficients)[..., : len(coefficients)]
+            by_axis = slope_matrices @ coefficients[: slope_matrices.shape[2]]
+            # Shape (3 axes, C, N).
+            part = by_axis.mT @ harmonics.monomials(normals, power - 1)
             value = value + (part * normals[:, None]).sum(0) / power
             slope = slope + part
         ctx.save_for_backward(normals, slope)
@@ -136,7 +218,8 @@ class _Series(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         normals, slope = ctx.saved_tensors
-        by_normal = by_coefficient = None
+        by_normal = None
+        by_coefficient = None
         if ctx.needs_input_grad[0]:
             by_normal = (slope * upstream).sum(1)
         if ctx.needs_input_grad[1]:
@@ -148,12 +231,23 @@ class _Series(torch.autograd.Function):
 def irradiance(
     normals: Float[Tensor, "3 N"], light: Float[Tensor, "coefficients 3"], dtype: torch.dtype
 ) -> Float[Tensor, "3 N"]:
-    """Irradiance on surfaces with finite normals of any length under a light of (degree + 1)² coefficients.
+    """Compute the irradiance on surfaces, differentiable in the normals and in the light.
 
-    Differentiable in both. Normals become unit vectors in their own dtype, the rest is computed in `dtype`, not half
-    precision. The gradient by bands that cannot reach a diffuse surface is exactly zero.
-    InputError: NaN in the light, or a light of another shape.
-    Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
+    Source: the paper's equation for R in appendix B.2, and its derivative by the
+    normal in appendix D. Here, both are polynomials.
+
+    Args:
+        normals: Finite normals of any length, shape (3, N). They become unit
+            vectors in their own dtype.
+        light: SH coefficients, shape (K, 3).
+        dtype: Type in which everything else is computed, float32 or float64.
+
+    Returns:
+        Irradiance, shape (3 colors, N). The gradient by bands that cannot reach
+        a diffuse surface is exactly zero.
+
+    Raises:
+        InputError: If the light holds NaN or has another shape.
     """
     require_bounded(light=light)
     harmonics.degree_of(light)
@@ -161,105 +255,175 @@ def irradiance(
 
 
 class _Irradiance(torch.autograd.Function):
-    """Finds value and slope together, and keeps the slope for the backward pass: three numbers a channel."""
+    """`irradiance`, which computes value and slope together.
+
+    It keeps the slope for the backward pass, three numbers for each channel.
+    """
 
     @staticmethod
     def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
-        unit, length = unit_vectors(normals)
-        unit = unit.to(light.dtype)
-        blocks = zip(*map(_polynomial(light), unit.split(BLOCK, dim=1)), strict=True)
-        value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
-        absent = torch.nonzero(length == 0).squeeze(1)
-        if len(absent):  # the homogeneous polynomials are not those of `basis` at 0
-            nonzero, rows = _nonzero_harmonics(unit[:, absent], math.isqrt(len(light)) - 1)
+        directions, lengths = unit_vectors(normals)
+        directions = directions.to(light.dtype)
+        polynomial = _IrradiancePolynomial(light)
+        evaluated = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
+        value, slope = (torch.cat(parts, dim=-1) for parts in zip(*evaluated, strict=True))
+        del evaluated
+        absent = torch.nonzero(lengths == 0).squeeze(1)
+        if len(absent):
+            # The homogeneous polynomials differ from `basis` at the zero vector.
+            degree = math.isqrt(len(light)) - 1
+            nonzero, rows = _nonzero_harmonics(directions[:, absent], degree)
             value[:, absent] = light[nonzero].T @ rows
-        ctx.save_for_backward(unit, length, slope if ctx.needs_input_grad[0] else None)
-        ctx.light = light.shape
+        ctx.save_for_backward(directions, lengths, slope if ctx.needs_input_grad[0] else None)
+        ctx.light_shape = light.shape
         return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        unit, length, slope = ctx.saved_tensors
-        by_normal = by_light = None
+        directions, lengths, slope = ctx.saved_tensors
+        by_normal = None
+        by_light = None
         if ctx.needs_input_grad[0]:
             solid = slope[:, 0] * upstream[0]
             solid.addcmul_(slope[:, 1], upstream[1]).addcmul_(slope[:, 2], upstream[2])
-            tangential = solid - unit * (unit * solid).sum(0)
-            by_normal = tangential / length.masked_fill(length == 0, torch.inf)
+            tangential = solid - directions * (directions * solid).sum(0)
+            by_normal = tangential / lengths.masked_fill(lengths == 0, torch.inf)
         if ctx.needs_input_grad[1]:
-            by_light = unit.new_zeros(ctx.light)
-            for block, above in zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True):
-                nonzero, rows = _nonzero_harmonics(block, math.isqrt(ctx.light[0]) - 1)
-                by_light[nonzero] += rows @ above.T
+            degree = math.isqrt(ctx.light_shape[0]) - 1
+            by_light = directions.new_zeros(ctx.light_shape)
+            blocks = zip(directions.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True)
+            for block, upstream_of_block in blocks:
+                nonzero, rows = _nonzero_harmonics(block, degree)
+                by_light[nonzero] += rows @ upstream_of_block.T
         return by_normal, by_light
 
 
-def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """One light's irradiance: unit vectors (3, N) → value (3, N) and slope (3 axes, 3, N), whose tangential part
-    counts."""
-    degree = _even(math.isqrt(len(light)) - 1)
-    per_light = _slopes_per_light(math.isqrt(len(light)) - 1, light.dtype, light.device)
-    slopes = (per_light @ light[: per_light.shape[2]]).mT.flatten(0, 1)  # (3 axes × 3 channels, J + 1)
-    even, linear, constant = slopes[:, :-1], slopes[:, -1:], light[:1].T * math.sqrt(math.pi / 4)
+class _IrradiancePolynomial:
+    """The irradiance under one light as a polynomial of the unit normal.
 
-    def evaluate(unit: Tensor) -> tuple[Tensor, Tensor]:
-        slope = torch.addmm(linear, even, harmonics.monomials(unit, degree - 1)).unflatten(0, (3, 3))
-        value = torch.addmm(constant, linear.view(3, 3).T, unit, alpha=1 - 1 / degree)
-        for by_axis, component in zip(slope, unit, strict=True):
-            value.addcmul_(by_axis, component, value=1 / degree)
+    The slope of the bands from 2 on has J monomials, of degree d - 1. The
+    attributes are the coefficients of the polynomial:
+
+    Attributes:
+        degree: The degree d.
+        even: Slope of the even bands in monomials, shape (3 axes × 3 colors, J).
+        linear: Slope of band 1, which is constant, shape (3 axes × 3 colors, 1).
+        constant: Irradiance of band 0, shape (3 colors, 1).
+    """
+
+    def __init__(self, light: Tensor):
+        light_degree = math.isqrt(len(light)) - 1
+        per_light = _slopes_per_light(light_degree, light.dtype, light.device)
+        by_axis = per_light @ light[: per_light.shape[2]]
+        slopes = by_axis.mT.flatten(0, 1)
+        self.degree = _even(light_degree)
+        self.even = slopes[:, :-1]
+        self.linear = slopes[:, -1:]
+        self.constant = light[:1].T * math.sqrt(math.pi / 4)
+
+    def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the value and the slope at unit vectors (3, N).
+
+        The value has the shape (3 colors, N) and the slope (3 axes, 3 colors, N).
+        Only the tangential part of the slope has a meaning.
+        """
+        # The monomials have no name, so that their memory is released at once.
+        slope = torch.addmm(
+            self.linear, self.even, harmonics.monomials(directions, self.degree - 1)
+        ).unflatten(0, (3, COLORS))
+        # The value is constant + n · linear + p(n). The loop below adds
+        # n · slope / d = p(n) + n · linear / d, so 1 - 1/d of the linear term is left.
+        linear = self.linear.view(3, COLORS).T
+        value = torch.addmm(self.constant, linear, directions, alpha=1 - 1 / self.degree)
+        for by_axis, component in zip(slope, directions, strict=True):
+            value.addcmul_(by_axis, component, value=1 / self.degree)
         return value, slope
-
-    return evaluate
 
 
 @harmonics.per_degree
 def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes in `_polynomial`: by each
-    axis, those of its even bands in monomials, and that of band 1."""
+    """Return the matrices (3 axes, J + 1, K) from a light to the slopes of its irradiance.
+
+    The first J rows are those of the even bands in monomials, and the last row is
+    that of band 1. K counts the first coefficients of the light, up to the degree
+    of `_even`.
+    """
     even = _even(degree)
-    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1)
-    return (slopes * harmonics.lambertian_factors(even))[..., : (degree + 1) ** 2].to(device, dtype)
+    linear = F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))
+    slopes = torch.cat([_slopes(even), linear], dim=1)
+    irradiance_slopes = slopes * harmonics.lambertian_factors(even)
+    return irradiance_slopes[..., : (degree + 1) ** 2].to(device, dtype)
 
 
 def _even(degree: int) -> int:
-    """The degree of the homogeneous polynomial that holds the even bands from 2 on."""
+    """Return the degree of the homogeneous polynomial of a light's even bands from 2 on."""
     return max(min(degree, harmonics.DIFFUSE_DEGREE) - degree % 2, 2)
 
 
 @harmonics.per_degree
 def _slopes(degree: int) -> Tensor:
-    """(3, J, (degree + 1)²): the slope by each axis of r^degree Y_k in monomials, for the bands of the degree's parity
-    from 1 on."""
-    l = harmonics.bands(degree)
-    slopes = harmonics.monomial_coefficients(degree - 1) @ harmonics.homogeneous_gradients(degree)[:, : degree**2]
-    return slopes * ((l > 0) & (l % 2 == degree % 2))
+    """Return the slope of r^degree Y_k in monomials, shape (3 axes, monomials, (degree + 1)²).
+
+    The polynomial r^degree Y_k, with the length r of the normal, belongs to the
+    harmonic of index k (see `harmonics.homogeneous_gradients`). Columns of band 0
+    and of bands of the other parity are zero.
+    """
+    band = harmonics.bands(degree)
+    gradients = harmonics.homogeneous_gradients(degree)[:, : degree**2]
+    slopes = harmonics.monomial_coefficients(degree - 1) @ gradients
+    return slopes * ((band > 0) & (band % 2 == degree % 2))
 
 
-def _nonzero_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
-    """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
+def _nonzero_harmonics(directions: Tensor, degree: int) -> tuple[list[int], Tensor]:
+    """Return the indices of the coefficients that reach a surface, and their irradiance.
+
+    The irradiance per unit of each of these K coefficients, at unit or zero
+    vectors (3, N), has the shape (K, N).
+    """
     nonzero = harmonics.nonzero_coefficients(degree).tolist()
-    factors = harmonics.lambertian_factors(degree).to(unit)[nonzero, None]
-    return nonzero, torch.stack(harmonics.select_rows(unit, nonzero)) * factors
+    factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
+    return nonzero, torch.stack(harmonics.select_rows(directions, nonzero)) * factors
 
 
 def normals_in_sight(
     fragments: Fragments, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float[Tensor, "V 3"]:
-    """`vertex_normals`, in float32 or wider, of the vertices of faces in sight; the others touch no sample."""
-    near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    near[fragments.corners.T.flatten()] = True
-    first, second, third = near.index_select(0, faces.flatten()).view(-1, 3).T
-    around = faces[first | second | third]
+    """Compute `vertex_normals` of the vertices of seen faces.
+
+    Args:
+        fragments: Samples of the view.
+        vertices: Positions, shape (V, 3).
+        faces: Indices of vertices, shape (F, 3).
+
+    Returns:
+        Unit normals, shape (V, 3), float32 or wider. Those of the other vertices
+        are zero or wrong, but touch no sample.
+    """
+    is_seen = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
+    is_seen[fragments.corners.T.flatten()] = True
+    first, second, third = is_seen.index_select(0, faces.flatten()).view(-1, 3).T
+    faces_around = faces[first | second | third]
     vertices = vertices.to(torch.promote_types(vertices.dtype, torch.float32))
-    if len(vertices) < FEW * around.numel():
-        return vertex_normals(vertices, around)
-    own, around = around.unique(return_inverse=True)
-    of_own = vertex_normals(vertices.index_select(0, own), around)
-    return torch.zeros_like(vertices, requires_grad=False).index_copy(0, own, of_own)
+    if len(vertices) < FEW * faces_around.numel():
+        return vertex_normals(vertices, faces_around)
+    used, faces_of_used = faces_around.unique(return_inverse=True)
+    normals = vertex_normals(vertices.index_select(0, used), faces_of_used)
+    return torch.zeros_like(vertices, requires_grad=False).index_copy(0, used, normals)
 
 
 def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float[Tensor, "S 3"]:
-    """Vertex normals interpolated to the S samples, on the side that the camera sees; not of unit length."""
-    at_corners = normals.T.index_select(1, fragments.corners.T.flatten()).unflatten(1, (3, -1))
-    return fragments.interpolate((at_corners * fragments.facing.T.to(normals)).permute(2, 1, 0))
+    """Interpolate vertex normals to the samples, on the side that the camera sees.
+
+    Args:
+        fragments: Samples of the view.
+        normals: Normals of the vertices, shape (V, 3).
+
+    Returns:
+        Normals that are not of unit length, shape (S, 3).
+    """
+    corners = fragments.corners.T.flatten()
+    # Shape (3 components, 3 corners, seen faces).
+    at_corners = normals.T.index_select(1, corners).unflatten(1, (3, -1))
+    toward_camera_side = at_corners * fragments.facing.T.to(normals)
+    return fragments.interpolate(toward_camera_side.permute(2, 1, 0))

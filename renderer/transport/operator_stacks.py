@@ -1,4 +1,4 @@
-"""Many views in one call: stacked transfer operators, whose images and gradients are one batched product."""
+"""Transfer operators of many views, stacked so that images and gradients are one batched product."""
 
 from __future__ import annotations
 
@@ -20,34 +20,44 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster
-FEWEST = 8  # operators in a stack of `TransferOperators`; smaller stacks take longer than a loop
+# Total number of pixels of the images in one stack. Larger stacks are not faster.
+STACKED = 2**16
+# `TransferOperators` uses a loop over operators if a stack would hold fewer,
+# which is faster then.
+FEWEST = 8
+# Rows of a canvas, as a slice or as indices.
 Rows = slice | Tensor
+COLORS = 3
 
 
 class TransferOperators(Sequence[TransferOperator]):
-    """The transfer operators of V views: a sequence of them that also renders all views in one call.
+    """The transfer operators of V views, which also renders all views in one call.
 
-    The first call of `image` copies the operators of small images into stacks, which take about as much memory again.
+    The first call of `image` copies the operators of small images into stacks,
+    which take about as much memory again.
 
-    >>> cameras = renderer.orbit_cameras(5, 2.2)
-    >>> operators = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
-    >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")]).requires_grad_()
-    >>> images = operators.image(lights, background=0.2)
-    >>> images.shape, torch.autograd.grad(images.mean(), lights)[0].shape
-    (torch.Size([5, 2, 3, 16, 16]), torch.Size([2, 49, 3]))
-    >>> len(operators), operators[0].image(lights).shape
-    (5, torch.Size([2, 3, 16, 16]))
+    Example:
+        >>> cameras = renderer.orbit_cameras(5, 2.2)
+        >>> operators = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
+        >>> probes = [renderer.load_light("grace"), renderer.load_light("st_peters")]
+        >>> lights = torch.stack(probes).requires_grad_()
+        >>> images = operators.image(lights, background=0.2)
+        >>> [gradient] = torch.autograd.grad(images.mean(), lights)
+        >>> images.shape, gradient.shape
+        (torch.Size([5, 2, 3, 16, 16]), torch.Size([2, 49, 3]))
+        >>> len(operators), operators[0].image(lights).shape
+        (5, torch.Size([2, 3, 16, 16]))
     """
 
     def __init__(self, operators: Iterable[TransferOperator]):
         """Collect operators.
 
         Args:
-            operators: At least one, of the same image settings, basis of light and dtype.
+            operators: At least one operator. All need the same image settings,
+                basis of light and dtype.
 
         Raises:
-            InputError: If there is none, or one differs from the first.
+            InputError: If there is no operator, or one differs from the first.
         """
         self._operators = list(operators)
         if not self._operators:
@@ -56,7 +66,9 @@ class TransferOperators(Sequence[TransferOperator]):
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
             if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                raise InputError("operators differ in image settings, basis of light or dtype: give equal ones")
+                raise InputError(
+                    "operators differ in image settings, basis of light or dtype: give equal ones"
+                )
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
@@ -65,7 +77,7 @@ class TransferOperators(Sequence[TransferOperator]):
     def __getitem__(self, index: slice) -> TransferOperators: ...
 
     def __getitem__(self, index: int | slice) -> TransferOperator | TransferOperators:
-        """Return the operator of one view, or those of several."""
+        """Return the operator of one view, or the operators of several views."""
         chosen = self._operators[index]
         return TransferOperators(chosen) if isinstance(chosen, list) else chosen
 
@@ -74,11 +86,15 @@ class TransferOperators(Sequence[TransferOperator]):
         return len(self._operators)
 
     def __add__(self, others: Iterable[TransferOperator]) -> list[TransferOperator]:
-        """Return a list of these operators and of others, which may differ."""
+        """Return a list of these operators and of others, which may have other settings."""
         return [*self, *others]
 
     def to(self, device: torch.device | str) -> TransferOperators:
-        """Return the same operators on another device."""
+        """Return the same operators on another device.
+
+        Args:
+            device: The device, such as "cuda".
+        """
         return TransferOperators(operator.to(device) for operator in self)
 
     def image(
@@ -90,37 +106,41 @@ class TransferOperators(Sequence[TransferOperator]):
     ) -> Float[Tensor, "V *lights 3 size size"]:
         """Render all views under B lights, differentiable in the lights and in the background.
 
-        The images equal those of the single operators to rounding.
+        The images equal those of the single operators up to rounding.
 
         Args:
-            lights: Coefficients, shape (*B, coefficients, 3). All views show each of these lights.
-            background: Gray value, color, or images in [0, 1] that broadcast to (V, *B, 3, size, size).
-            light_per_view: Whether the lights have the shape (V, *B, coefficients, 3) instead: each view has its own.
+            lights: Coefficients, shape (*B, coefficients, 3). Every view is
+                rendered under every light.
+            background: Gray value, color, or images in [0, 1] that broadcast to
+                (V, *B, 3, size, size).
+            light_per_view: Whether each view has its own lights. Their shape is
+                then (V, *B, coefficients, 3).
 
         Returns:
             Images in [0, 1], shape (V, *B, 3, size, size).
 
         Raises:
-            InputError: If the lights hold NaN or are of another basis, their number is not that of the views, or the
-                background has another shape.
+            InputError: If the lights hold NaN, have another basis or are not one
+                per view, or if the background has another shape.
         """
         first = self._operators[0]
         lights = as_tensor("lights", lights)
         first.require_lights(lights)
         if light_per_view and (lights.ndim < 3 or len(lights) != len(self)):
-            shape, wanted = tuple(lights.shape), f"({len(self)}, ..., {first.basis.size}, 3)"
-            raise InputError(f"lights of shape {shape} are not one per view: give {wanted}")
+            raise InputError(
+                f"lights of shape {tuple(lights.shape)} are not one per view: "
+                f"give ({len(self)}, ..., {first.basis.size}, 3)"
+            )
         of_views = lights if light_per_view else lights.expand(len(self), *lights.shape)
         size = first.settings.size
-        shape = (*of_views.shape[:-2], 3, size, size)
-        behind = as_background(background, size, lights)
-        if behind.ndim > 3:
-            behind = _broadcast_background(behind, shape)
-        if min(len(self), self._per_stack) < FEWEST or behind.requires_grad:
-            backgrounds = behind if behind.ndim > 3 else behind.expand(len(self), 3, size, size)
-            views = zip(self, of_views, backgrounds, strict=True)
-            return torch.stack([operator.image(light, image) for operator, light, image in views])
-        return self._stacked_images(of_views, behind, shape)
+        image_shape = (*of_views.shape[:-2], COLORS, size, size)
+        background_images = as_background(background, size, lights)
+        if background_images.ndim > 3:
+            background_images = _broadcast_background(background_images, image_shape)
+        stack_size = min(len(self), self._per_stack)
+        if stack_size < FEWEST or background_images.requires_grad:
+            return self._image_by_image(of_views, background_images)
+        return self._stacked_images(of_views, background_images, image_shape)
 
     def image_and_gradient(
         self,
@@ -134,16 +154,19 @@ class TransferOperators(Sequence[TransferOperator]):
 
         Args:
             lights: Coefficients, as for `image`.
-            loss_gradient: Function of the images (V, *B, 3, size, size) that returns the gradient of the loss by them,
-                of the same shape. `torch.func.grad(loss)` makes one from a loss.
-            background: As for `image`.
-            light_per_view: As for `image`.
+            loss_gradient: Function of the images, shape (V, *B, 3, size, size).
+                It returns the gradient of the loss by the images, of the same
+                shape. `torch.func.grad(loss)` makes such a function from a loss.
+            background: Background, as for `image`.
+            light_per_view: Whether each view has its own lights, as for `image`.
 
         Returns:
-            The images, and the gradient of the loss by the lights, of the shape of the lights.
+            The images, and the gradient of the loss by the lights, with the
+            shape of the lights.
 
         Raises:
-            InputError: As `image`, or if the gradient of the loss has another shape.
+            InputError: As for `image`, or if the gradient of the loss has
+                another shape than the images.
         """
         lights = as_tensor("lights", lights)
         self._operators[0].require_lights(lights)
@@ -158,12 +181,12 @@ class TransferOperators(Sequence[TransferOperator]):
 
     @property
     def _per_stack(self) -> int:
-        """How many operators one stack holds."""
+        """Return how many operators one stack holds."""
         return max(1, STACKED // self._operators[0].settings.size ** 2)
 
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
-        """All operators in stacks, on their device."""
+        """Return all operators in stacks, on the device of the operators."""
         device = self._operators[0].transfer.device
         stacks = []
         for start in range(0, len(self), self._per_stack):
@@ -171,120 +194,227 @@ class TransferOperators(Sequence[TransferOperator]):
             stacks.append(OperatorStack(operators, torch.arange(len(operators)), device))
         return stacks
 
-    def _stacked_images(self, of_views: Tensor, behind: Tensor, shape: Sequence[int]) -> Tensor:
-        """Render lights (V, *B, coefficients, 3) before a background, (3, size, size) or of the images' shape."""
+    def _image_by_image(self, lights: Tensor, background: Tensor) -> Tensor:
+        """Render lights (V, *B, coefficients, 3), one operator after the other.
+
+        The background has the shape (3, size, size) or that of the images.
+        """
+        size = self._operators[0].settings.size
+        if background.ndim == 3:
+            background = background.expand(len(self), COLORS, size, size)
+        views = zip(self, lights, background, strict=True)
+        return torch.stack([operator.image(light, behind) for operator, light, behind in views])
+
+    def _stacked_images(
+        self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]
+    ) -> Tensor:
+        """Render lights (V, *B, coefficients, 3), one stack of operators after the other.
+
+        The background has the shape (3, size, size) or that of the images.
+        """
         encoding = self._operators[0].settings.encoding
         lights = of_views.flatten(0, -3).to(self._operators[0].transfer.dtype)
-        of_each_view = len(lights) // len(self)
-        everywhere = behind.reshape(-1, 3, shape[-1] ** 2)
-        first, targets, covered = 0, [], []
+        lights_per_view = len(lights) // len(self)
+        # One background, or one for each image: shape (1 or N, 3, size²).
+        backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
+        first_row = 0
+        targets = []
+        covered = []
         for stack in self._stacks:
-            images = torch.arange(len(stack.shown)).repeat_interleave(of_each_view)
-            rows = slice(first, first + len(images))
-            first = rows.stop
-            # From two axes, torch selects ten times as fast as from three.
-            some = everywhere if len(everywhere) == 1 else everywhere[rows]
-            at_pixels = some.flatten(0, 1).index_select(1, stack.pixels).unflatten(0, (-1, 3))
-            term = background_term(stack.coverage[images.to(behind.device)].to(behind), at_pixels, encoding)
-            radiance = stack.radiance(lights[rows], images).to(behind.dtype)
+            # This is the index in the stack of the operator that each image shows.
+            shown = torch.arange(len(stack.shown)).repeat_interleave(lights_per_view)
+            rows = slice(first_row, first_row + len(shown))
+            first_row = rows.stop
+            of_stack = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
+            # torch selects ten times as fast from two axes as from three.
+            at_pixels = of_stack.flatten(0, 1).index_select(1, stack.pixels)
+            coverage = stack.coverage[shown.to(background.device)].to(background)
+            term = background_term(coverage, at_pixels.unflatten(0, (-1, COLORS)), encoding)
+            radiance = stack.radiance(lights[rows], shown).to(background.dtype)
             targets.append((rows, stack.pixels))
             covered.append(encode(clamp(radiance + term), encoding))
-        canvas = everywhere.expand(len(lights), -1, -1).clone(memory_format=torch.contiguous_format)
-        return InPlace.apply(canvas, targets, *covered).view(shape)
+        canvas = backgrounds.expand(len(lights), -1, -1)
+        canvas = canvas.clone(memory_format=torch.contiguous_format)
+        return InPlace.apply(canvas, targets, *covered).view(image_shape)
 
 
-def _broadcast_background(behind: Tensor, shape: Sequence[int]) -> Tensor:
-    """Broadcast images to (V, *B, 3, size, size), or raise InputError."""
+def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
+    """Broadcast background images to (V, *B, 3, size, size), or raise `InputError`."""
     try:
-        return behind.expand(shape)
+        return images.expand(shape)
     except RuntimeError as error:
-        shapes = f"{tuple(behind.shape)} does not broadcast to {tuple(shape)}"
-        raise InputError(f"background of shape {shapes}: give one image, or one per view and light") from error
+        given = tuple(images.shape)
+        raise InputError(
+            f"background of shape {given} does not broadcast to {tuple(shape)}: "
+            "give one image, or one per view and light"
+        ) from error
 
 
 class InPlace(torch.autograd.Function):
-    """Canvases (N, 3, size²), overwritten where layers are by their values (B, 3, P); differentiable in these."""
+    """Write layers of pixel values into images, in place.
+
+    Its arguments are a canvas (N, 3, size²), and for each layer its target and
+    its values. A target is a pair of the rows of the canvas (B,) and the pixels
+    (P,). The values have the shape (B, 3, P). The result is the canvas, and is
+    differentiable in the values alone.
+    """
 
     @staticmethod
-    def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor
+    ) -> Tensor:
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, covered, strict=True):
-            # On a CPU, index_copy_ takes twice as long.
+            # index_copy_ takes twice as long as scatter_ on a CPU.
             images = canvas[rows].scatter_(2, pixels.expand(values.shape), values)
-            if isinstance(rows, Tensor):  # of which canvas[rows] is a copy
+            if isinstance(rows, Tensor):
+                # Indexing with a tensor copies the rows, so write them back.
                 canvas.index_copy_(0, rows, images)
         return canvas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        # Of two axes, torch selects ten times as fast as of three.
-        covered = (upstream[rows].flatten(0, 1).index_select(1, pixels) for rows, pixels in ctx.targets)
-        return None, None, *(values.unflatten(0, (-1, 3)) for values in covered)
+        gradients = []
+        for rows, pixels in ctx.targets:
+            # torch selects ten times as fast from two axes as from three.
+            values = upstream[rows].flatten(0, 1).index_select(1, pixels)
+            gradients.append(values.unflatten(0, (-1, COLORS)))
+        return None, None, *gradients
 
 
 class OperatorStack:
-    """O transfer operators over a common set of pixels, and N images that show one of them each, in their own light.
+    """O transfer operators over a common set of P pixels and K coefficients.
 
-    pixels: (P,) int64, covered by any of the operators. transfer: (O, 1 to 3, K, P), of the K coefficients that are
-    nonzero in any of them, with a row of zeros if K is odd: with 32 rows instead of 31 the gradient's product is twice
-    as fast. albedo: (O, 3, P). coverage: (O, 1, P). Which image shows which operator is known to the host.
+    N images show one of the operators each, under their own light.
+
+    Attributes:
+        shown: Index of the operator that each image shows, int64, shape (N,), on
+            the CPU.
+        pixels: Ascending indices of the pixels that any of the operators covers,
+            int64, shape (P,).
+        transfer: Dense transfer of the coefficients that are nonzero in any of
+            the operators, shape (O, 1 to 3, K, P). If their number is odd, a row
+            of zeros follows. With 32 rows instead of 31, the product of the
+            gradient takes half the time.
+        albedo: Albedo of each operator, shape (O, 3, P). It is 1 in pixels that
+            the operator does not cover.
+        coverage: Coverage of each operator, shape (O, 1, P).
     """
 
-    def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
-        """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
+    def __init__(
+        self,
+        operators: Sequence[TransferOperator],
+        shown: Tensor,
+        device: torch.device | str = "cpu",
+    ):
+        """Copy operators into common tensors.
+
+        Args:
+            operators: The O operators, on the CPU. All need the same dtype and
+                basis.
+            shown: Index of the operator of each image, int64, shape (N,).
+            device: Device of the stack.
+        """
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
-        coefficients = F.pad(nonzero, (0, len(nonzero) % 2))  # with any coefficient
-        channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
-        transfer = like.new_zeros(len(operators), channels, len(coefficients), len(pixels))
-        albedo = like.new_ones(len(operators), 3, len(pixels))
+        # The appended row of zeros multiplies an arbitrary coefficient.
+        coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
+        channel_count = max(len(operator.transfer) for operator in operators)
+        like = operators[0].transfer
+        shape = (len(operators), channel_count, len(coefficients), len(pixels))
+        transfer = like.new_zeros(shape)
+        albedo = like.new_ones(len(operators), COLORS, len(pixels))
         coverage = like.new_zeros(len(operators), 1, len(pixels))
-        first, parts = [0], list[SparseTransfer]()
+        sparse_parts: list[SparseTransfer] = []
+        entry_counts = []
         for index, operator in enumerate(operators):
-            rows, columns = torch.searchsorted(nonzero, operator.nonzero), torch.searchsorted(pixels, operator.pixels)
-            if channels < 3:
-                transfer[index][: len(operator.transfer), rows[:, None], columns] = operator.transfer
+            rows = torch.searchsorted(nonzero, operator.nonzero)
+            columns = torch.searchsorted(pixels, operator.pixels)
+            if channel_count < COLORS:
+                channels = transfer[index][: len(operator.transfer)]
+                channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:
                 transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             if operator.sparse is not None:
-                parts.append(operator.sparse._replace(pixel=columns[operator.sparse.pixel]))
-            first.append(sum(len(part.function) for part in parts))
-        sparse = joined(parts)
+                in_stack = columns[operator.sparse.pixel]
+                sparse_parts.append(operator.sparse._replace(pixel=in_stack))
+            entry_counts.append(0 if operator.sparse is None else len(operator.sparse.function))
+        sparse = joined(sparse_parts)
         self._sparse = sparse and sparse.to(device)
-        self.shown, self._first = shown, torch.tensor(first)
-        tensors = (tensor.to(device) for tensor in (pixels, transfer, albedo, coverage, coefficients))
-        self.pixels, self.transfer, self.albedo, self.coverage, self._coefficients = tensors
+        # The sparse entries of operator i are those from _first_entry[i] to
+        # _first_entry[i + 1].
+        self._first_entry = F.pad(torch.tensor(entry_counts).cumsum(0), (1, 0))
+        self.shown = shown
+        self.pixels = pixels.to(device)
+        self.transfer = transfer.to(device)
+        self.albedo = albedo.to(device)
+        self.coverage = coverage.to(device)
+        self._coefficients = coefficients.to(device)
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Linear radiance (A, 3, P), differentiable in the lights (A, size, 3), of images (A,), which are on the host.
+        """Compute the linear radiance of some images, differentiable in their lights.
 
-        Lights are laid out on a grid of operators × their images, with gaps where an operator has fewer than another.
-        Operators that none of the images shows are left out.
+        Args:
+            lights: Light of each image, shape (A, size, 3).
+            images: Indices of the images, int64, shape (A,), on the CPU.
+
+        Returns:
+            Radiance, shape (A, 3, P).
         """
-        used, row, counts = torch.unique(self.shown[images], return_inverse=True, return_counts=True)
-        slots, order = max(counts.tolist(), default=0), row.argsort(stable=True)
-        rank = torch.arange(len(row)) - (counts.cumsum(0) - counts)[row[order]]
-        cell = row * slots + torch.empty_like(row).index_copy_(0, order, rank)
-        no_gaps = len(cell) == len(used) * slots and bool((cell.diff() == 1).all())
-        used, cell = (indices.to(lights.device, non_blocking=True) for indices in (used, cell))
+        # The lights are laid out on a grid with a row for each operator and a
+        # slot for each of its images. Some slots stay empty if one operator is
+        # shown by fewer images than another.
+        shown = self.shown[images]
+        operators, row, counts = torch.unique(shown, return_inverse=True, return_counts=True)
+        slot_count = max(counts.tolist(), default=0)
+        cell = row * slot_count + _rank_in_row(row, counts)
+        has_gaps = len(cell) != len(operators) * slot_count
+        is_ordered = not has_gaps and bool((cell.diff() == 1).all())
+        operators = operators.to(lights.device, non_blocking=True)
+        cell = cell.to(lights.device, non_blocking=True)
         nonzero = lights.index_select(1, self._coefficients)
-        grid = nonzero.new_zeros(len(used) * slots, *nonzero.shape[1:]).index_copy(0, cell, nonzero)
-        everything = len(used) == len(self.transfer)
-        transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
-        radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)
-        radiance = radiance if no_gaps else radiance.index_select(0, cell)
+        grid = nonzero.new_zeros(len(operators) * slot_count, *nonzero.shape[1:])
+        grid = grid.index_copy(0, cell, nonzero).unflatten(0, (len(operators), slot_count))
+        is_complete = len(operators) == len(self.transfer)
+        transfer = self.transfer if is_complete else self.transfer[operators]
+        albedo = self.albedo if is_complete else self.albedo[operators]
+        radiance = apply_transfer(grid, transfer, albedo).flatten(0, 1)
+        if not is_ordered:
+            radiance = radiance.index_select(0, cell)
         if self._sparse is None:
             return radiance
-        entries, image = self._entries(self._sparse, self.shown[images])
+        entries, image = self._entries(self._sparse, shown)
         return radiance + entries.radiance(lights, image, len(self.pixels))
 
     def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
-        """(the sparse entries of operators (A,), one after the other; (N,) the row in A of each entry)."""
-        first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
+        """Return the sparse entries of operators (A,), one after the other.
+
+        The second result is the position in `shown` of each entry.
+        """
+        first = self._first_entry[shown]
+        count = self._first_entry[shown + 1] - first
         image = torch.arange(len(shown)).repeat_interleave(count)
-        entry = torch.arange(len(image)) + (first - count.cumsum(0) + count)[image]
-        entry, image = (indices.to(self.pixels.device, non_blocking=True) for indices in (entry, image))
+        # The entries of an image are consecutive in the result and in the stack.
+        # The offset leads from their positions in the result to those in the stack.
+        first_in_result = count.cumsum(0) - count
+        offset = first - first_in_result
+        entry = torch.arange(len(image)) + offset[image]
+        entry = entry.to(self.pixels.device, non_blocking=True)
+        image = image.to(self.pixels.device, non_blocking=True)
         return SparseTransfer(*(field[entry] for field in sparse)), image
+
+
+def _rank_in_row(row: Tensor, counts: Tensor) -> Tensor:
+    """Return for each item how many earlier items have the same row, shape (A,).
+
+    `row` (A,) is the row of each item, and `counts` the number of items of each
+    row. For example, the rows 1, 0, 1 give 0, 0, 1.
+    """
+    # The items of a row are neighbors in this order, earlier items first.
+    order = row.argsort(stable=True)
+    first_in_order = counts.cumsum(0) - counts
+    rank_in_order = torch.arange(len(row)) - first_in_order[row[order]]
+    return torch.empty_like(row).index_copy_(0, order, rank_in_order)

@@ -1,8 +1,14 @@
-"""A scene as a linear operator on its light: (mesh, camera) → T, rasterized once and multiplied for every light.
+"""A view of a mesh as a linear operator on its light.
 
-Before clamping, every pixel is linear in the lighting coefficients U (the paper's appendix B.2):
-radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do gloss
-(`renderer.surface.gloss`), shadows and bounces (package `renderer.transport`).
+Before clamping, the radiance of every pixel is linear in the coefficients U of
+the light (the paper's appendix B.2): radiance = Uᵀ T. The transfer matrix T is
+computed once for a mesh and a camera, and multiplied with every light. T
+contains the box filter, the texture and the albedo exactly. It also contains
+gloss (`renderer.surface.gloss`), and shadows and bounces (the package
+`renderer.transport`).
+
+Shapes use these letters: an operator has P covered pixels and K coefficients
+that reach a pixel, and *B are any dimensions of a batch of lights.
 """
 
 from __future__ import annotations
@@ -39,30 +45,52 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
-BLOCK = 2**12  # So many pixels are filtered at a time, whose sums stay in the processor's cache.
-GLOSSY = 2**20  # coefficients of samples with gloss at a time, of which more numbers are computed
+# Fields of a `TransferOperator` that are moved to another device.
+TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")
+# `_box_filter` sums as many pixels at a time, whose sums stay in the CPU cache.
+BLOCK = 2**12
+# `_glossy_box_filter` computes as many coefficients of samples at a time. They
+# need several times as many numbers.
+GLOSSY = 2**20
+COLORS = 3
 
 
 @dataclass(frozen=True)
 class TransferOperator:
-    """The transfer matrix of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
+    """The transfer matrix of a view of a mesh.
 
-    transfer: three channels of K nonzero coefficients and P covered pixels; or one, a third of the size and the time,
-    where no pixel mixes albedos (one sample per pixel, or a mesh of one color). With gloss, that one is followed by
-    white light, which is added to all channels.
-    albedo: multiplies the one channel; ones where there are three.
-    coverage: in (0, 1], the fraction of a pixel's samples that the mesh covers.
-    pixels: row-major indices of the covered pixels; row 0 is the top of the image.
-    nonzero: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
-    under an open sky (`Harmonics.nonzero`), and all in a view with shadows or gloss.
-    settings: of the image. basis: of the lights.
-    sparse: of three channels, added to the dense transfer: that of patterns, most of whose entries are zero; or None.
+    It maps the coefficients of a light to the linear radiance of the covered
+    pixels, weighted with coverage. All floating tensors have one dtype.
 
-    >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(1, 2.2), size=16)
-    >>> light = renderer.load_light("grace")
-    >>> torch.allclose(operator.radiance(2 * light), 2 * operator.radiance(light))  # linear, before clamping
-    True
+    Attributes:
+        transfer: Radiance per unit of each coefficient, shape (channels, K, P).
+            Usually, there are 3 channels. There is 1 channel, which takes a
+            third of the memory and the time, if no pixel mixes albedos (one
+            sample per pixel, or a mesh of one color). With gloss, the 1 channel
+            is followed by a second one of white light, which is added to all
+            colors.
+        albedo: Factor of the first channel if colors share it, shape (3, P).
+            Ones if there are 3 channels.
+        coverage: Fraction of the samples of each pixel that show the mesh, in
+            (0, 1], shape (P,).
+        pixels: Row-major indices of the covered pixels, shape (P,). Row 0 is the
+            top of the image.
+        nonzero: Ascending indices of the coefficients that reach a pixel, shape
+            (K,). At degree 6 these are 31 of the 49 under an open sky
+            (`Harmonics.nonzero`), and all 49 with shadows or gloss.
+        settings: Settings of the image.
+        basis: Basis of the lights.
+        sparse: Entries in three channels that are added to the dense transfer.
+            They are those of projected patterns, which are mostly zero. None
+            without such entries.
+
+    Example:
+        >>> cameras = renderer.orbit_cameras(1, 2.2)
+        >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
+        >>> light = renderer.load_light("grace")
+        >>> twice = operator.radiance(2 * light)  # Before clamping, this is linear.
+        >>> torch.allclose(twice, 2 * operator.radiance(light))
+        True
     """
 
     transfer: Float[Tensor, "channels K P"]
@@ -80,22 +108,27 @@ class TransferOperator:
         """Render images under B lights, differentiable in the lights and in the background.
 
         Args:
-            lights: Coefficients of the operator's basis, shape (*B, coefficients, 3).
-            background: Gray value, color or images in [0, 1]; see `renderer.image.as_background`.
+            lights: Coefficients of the operator's basis, shape
+                (*B, coefficients, 3).
+            background: Gray value, color or images in [0, 1]. See
+                `renderer.image.as_background`.
 
         Returns:
-            Images in [0, 1], shape (*B, 3, size, size), of the dtype of the lights.
+            Images in [0, 1], shape (*B, 3, size, size), in the dtype of the
+            lights.
 
         Raises:
-            InputError: If the lights hold NaN or are of another basis, or the background has another shape.
+            InputError: If the lights hold NaN or have another basis, or the
+                background has another shape.
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
-            behind = as_background(background, self.settings.size, lights)
+            images = as_background(background, self.settings.size, lights)
             coverage = self.coverage.to(lights)
-            return composite(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
-        return _Image.apply(lights, self, self._behind(background, lights))
+            radiance = self.radiance(lights)
+            return composite(radiance, coverage, self.pixels, images, self.settings.encoding)
+        return _Image.apply(lights, self, self._prepare_background(background, lights))
 
     def image_and_gradient(
         self,
@@ -103,43 +136,67 @@ class TransferOperator:
         loss_gradient: Callable[[Tensor], Tensor],
         background: float | Tensor = 0.5,
     ) -> tuple[Float[Tensor, "*lights 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
-        """Render images under B lights and compute the gradient of a loss by the lights, without autograd.
+        """Render images under B lights and compute the gradient of a loss, without autograd.
 
-        The results equal those of `image` and `torch.autograd.grad` to the bit. In small images, autograd takes most
-        of the time of a step.
+        The results equal those of `image` and `torch.autograd.grad` to the bit.
+        For small images, autograd would take most of the time of a step.
 
         Args:
-            lights: Coefficients of the operator's basis, shape (*B, coefficients, 3).
-            loss_gradient: Function of the images (*B, 3, size, size) that returns the gradient of the loss by them, of
-                the same shape. `torch.func.grad(loss)` makes one from a loss.
-            background: Gray value, color or images in [0, 1]; see `renderer.image.as_background`.
+            lights: Coefficients of the operator's basis, shape
+                (*B, coefficients, 3).
+            loss_gradient: Function of the images, shape (*B, 3, size, size). It
+                returns the gradient of the loss by the images, of the same
+                shape. `torch.func.grad(loss)` makes such a function from a loss.
+            background: Gray value, color or images in [0, 1]. See
+                `renderer.image.as_background`.
 
         Returns:
-            The images in [0, 1], shape (*B, 3, size, size), and the gradient of the loss by the lights.
+            The images in [0, 1], shape (*B, 3, size, size), and the gradient of
+            the loss by the lights, with the shape of the lights.
 
         Raises:
-            InputError: If lights, background or the gradient of the loss hold NaN or have another shape.
+            InputError: If the lights, the background or the gradient of the loss
+                hold NaN or have another shape.
 
-        >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(1, 2.2), size=16)
-        >>> light, target = renderer.load_light("grace"), torch.zeros(3, 16, 16)
-        >>> image, gradient = operator.image_and_gradient(light, lambda image: 2 * (image - target))
-        >>> image.shape, gradient.shape
-        (torch.Size([3, 16, 16]), torch.Size([49, 3]))
+        Example:
+            >>> cameras = renderer.orbit_cameras(1, 2.2)
+            >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
+            >>> light = renderer.load_light("grace")
+            >>> target = torch.zeros(3, 16, 16)
+            >>> image, gradient = operator.image_and_gradient(light, lambda x: 2 * (x - target))
+            >>> image.shape, gradient.shape
+            (torch.Size([3, 16, 16]), torch.Size([49, 3]))
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
         lights = lights.detach()
         if isinstance(background, Tensor):
             background = background.detach()
-        images, passing, clamped = self._images(lights, self._behind(background, lights))
+        prepared = self._prepare_background(background, lights)
+        images, is_passing, clamped = self._images(lights, prepared)
         image_gradient = loss_gradient(images)
         require_image_gradient(image_gradient, images)
-        return images, self._gradient_of_images(image_gradient.detach(), passing, clamped)
+        gradient = self._gradient_of_images(image_gradient.detach(), is_passing, clamped)
+        return images, gradient
 
-    def radiance(self, lights: Float[Tensor, "*lights coefficients 3"]) -> Float[Tensor, "*lights 3 P"]:
-        """Linear radiance; differentiable, by `light_gradient`.
+    def radiance(
+        self, lights: Float[Tensor, "*lights coefficients 3"]
+    ) -> Float[Tensor, "*lights 3 P"]:
+        """Compute the linear radiance of the covered pixels, differentiable in the lights.
 
-        Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another basis' size.
+        The product is computed in the dtype of the operator.
+
+        Args:
+            lights: Coefficients of the operator's basis, shape
+                (*B, coefficients, 3).
+
+        Returns:
+            Radiance, weighted with coverage, shape (*B, 3, P), in the dtype of
+            the lights.
+
+        Raises:
+            InputError: If the lights hold NaN or have another number of
+                coefficients.
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
@@ -148,68 +205,107 @@ class TransferOperator:
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
     ) -> Float[Tensor, "*lights coefficients 3"]:
-        """∂C/∂U = T ∂C/∂radiance, without a graph.
+        """Compute the gradient of a loss by the lights from that by the radiance, without a graph.
 
-        Exactly zero for the coefficients that reach no pixel. InputError: NaN.
+        This is the product with the transposed matrix:
+        ∂loss/∂U = T ∂loss/∂radiance.
+
+        Args:
+            radiance_gradient: Gradient by the radiance, shape (*B, 3, P).
+
+        Returns:
+            Gradient by the lights, shape (*B, coefficients, 3). It is exactly
+            zero for coefficients that reach no pixel.
+
+        Raises:
+            InputError: If the gradient holds NaN or has another shape.
         """
         radiance_gradient = as_tensor("radiance_gradient", radiance_gradient)
         require_bounded(radiance_gradient=radiance_gradient)
         if radiance_gradient.shape[-2:] != self.albedo.shape:
-            shape, expected = tuple(radiance_gradient.shape), tuple(self.albedo.shape)
-            raise InputError(f"radiance_gradient of shape {shape} is not of the operator's pixels: give {expected}")
+            given = tuple(radiance_gradient.shape)
+            expected = tuple(self.albedo.shape)
+            raise InputError(
+                f"radiance_gradient of shape {given} is not of the operator's pixels: "
+                f"give {expected}"
+            )
         return self._light_gradient(radiance_gradient)
 
-    def _images(self, lights: Tensor, behind: _Behind) -> tuple[Tensor, Tensor, Tensor]:
+    def _images(
+        self, lights: Tensor, background: _PreparedBackground
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Render without a graph.
 
-        Returns:
-            The images (*B, 3, size, size), where the clamp lets the gradient pass (*B, 3, P), as ones and zeros, and
-            the clamped linear values (*B, 3, P).
+        Returns the images (*B, 3, size, size), ones and zeros where the clamp
+        lets the gradient pass or not (*B, 3, P), and the clamped linear values
+        (*B, 3, P).
         """
-        unclamped = self._radiance(lights).add_(behind.at_pixels)
+        unclamped = self._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
-        # At the bounds themselves the gradient passes, as in `renderer.image.clamp`.
-        passing = unclamped.eq_(clamped)
-        rows, everywhere, shape = self._pixel_rows, behind.everywhere, self._image_shape
+        # The gradient passes at the bounds themselves, as in `renderer.image.clamp`.
+        is_passing = unclamped.eq_(clamped)
+        rows = self._pixel_rows
+        canvas = background.images
+        image_shape: tuple[int, ...] = self._image_shape
         if lights.ndim > 2:
-            lit = lights.shape[:-2]
-            rows, everywhere, shape = rows.expand(*lit, -1, -1), everywhere.expand(*lit, -1, -1), (*lit, *shape)
-        images = everywhere.clone(memory_format=torch.contiguous_format)
-        # On a CPU, index_copy_ takes twice as long as scatter_.
-        images.scatter_(-1, rows, clamped if self._is_linear else encode(clamped, self.settings.encoding))
-        return images.view(shape), passing, clamped
+            batch = lights.shape[:-2]
+            rows = rows.expand(*batch, -1, -1)
+            canvas = canvas.expand(*batch, -1, -1)
+            image_shape = (*batch, *image_shape)
+        images = canvas.clone(memory_format=torch.contiguous_format)
+        encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
+        # index_copy_ takes twice as long as scatter_ on a CPU.
+        images.scatter_(-1, rows, encoded)
+        return images.view(image_shape), is_passing, clamped
 
-    def _gradient_of_images(self, image_gradient: Tensor, passing: Tensor, clamped: Tensor) -> Tensor:
-        """Compute the gradient by the lights from that by the images (*B, 3, size, size) of `_images`."""
-        # From two axes, torch selects ten times as fast as from three.
+    def _gradient_of_images(
+        self, image_gradient: Tensor, is_passing: Tensor, clamped: Tensor
+    ) -> Tensor:
+        """Compute the gradient by the lights from that by the images of `_images`.
+
+        The gradient by the images has the shape (*B, 3, size, size).
+        """
+        # torch selects ten times as fast from two axes as from three.
         by_channel = image_gradient.reshape(-1, self._image_shape[1] * self._image_shape[2])
         covered = by_channel.index_select(1, self.pixels)
-        if passing.ndim > 2:
-            covered = covered.view(passing.shape)
+        if is_passing.ndim > 2:
+            covered = covered.view(is_passing.shape)
         if not self._is_linear:
             covered = encode_gradient(clamped, covered, self.settings.encoding)
-        gradient = self._light_gradient(covered.mul_(passing))
-        if not math.isfinite(gradient.sum().item()):  # a sum takes less time than the largest of all pixels
+        gradient = self._light_gradient(covered.mul_(is_passing))
+        # A sum takes less time than the largest magnitude of all pixels.
+        if not math.isfinite(gradient.sum().item()):
             require_bounded(image_gradient=covered)
         return gradient
 
     def require_lights(self, lights: Tensor) -> None:
-        """Raise InputError if the lights hold NaN or are of another basis."""
+        """Check that lights have the operator's basis and hold no NaN.
+
+        Args:
+            lights: Coefficients, shape (*B, coefficients, 3).
+
+        Raises:
+            InputError: If the lights hold NaN or have another shape.
+        """
         if not lights.is_floating_point():
             require_bounded(lights=lights)
         if lights.shape[-2:] != self._light_shape:
-            shape, size = tuple(lights.shape), self.basis.size
-            raise InputError(f"lights of shape {shape} are not of the operator's {self.basis}: give {size} rows")
-        # In small images this takes half the time of `require_bounded`, which finds and names the fault.
+            raise InputError(
+                f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
+                f"give {self.basis.size} rows"
+            )
+        # This takes half the time of `require_bounded` in small images.
+        # `require_bounded` finds and names the fault.
         values = lights.detach().reshape(-1)
         if not torch.dot(values, values).item() <= LARGEST**2:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
-        """Compute the radiance (*B, 3, P) without a graph, in a new tensor of the dtype of the lights."""
+        """Compute `radiance` without a graph, in a new tensor of the dtype of the lights."""
         dtype = self.transfer.dtype
         nonzero = lights.index_select(-2, self.nonzero)
-        if lights.dtype != dtype:  # in small images, a call that converts nothing counts, too
+        # Even a call that converts nothing takes notable time in small images.
+        if lights.dtype != dtype:
             nonzero = nonzero.to(dtype)
         if self._shared is not None:
             product = (nonzero.mT @ self._shared).mul_(self.albedo)
@@ -218,13 +314,15 @@ class TransferOperator:
         else:
             product = torch.einsum("...kc,ckp->...cp", nonzero, self.transfer)
         if self.sparse is not None:
-            arriving = lights.to(product.dtype).index_select(-2, self.sparse.function) * self.sparse.weight
+            selected = lights.to(product.dtype).index_select(-2, self.sparse.function)
+            arriving = selected * self.sparse.weight
             product = product.index_add(-1, self.sparse.pixel, arriving.mT)
         return product if lights.dtype == dtype else product.to(lights.dtype)
 
     def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
         """Compute `light_gradient` of values that may hold NaN."""
-        upstream, dtype = radiance_gradient, self.transfer.dtype
+        upstream = radiance_gradient
+        dtype = self.transfer.dtype
         if upstream.dtype != dtype:
             upstream = upstream.to(dtype)
         if self._shared is not None:
@@ -235,96 +333,134 @@ class TransferOperator:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._scatter @ product.mT
         if self.sparse is not None:
-            arriving = upstream.mT.index_select(-2, self.sparse.pixel) * self.sparse.weight
+            selected = upstream.mT.index_select(-2, self.sparse.pixel)
+            arriving = selected * self.sparse.weight
             gradient = gradient.index_add(-2, self.sparse.function, arriving)
-        return gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
+        return (
+            gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
+        )
 
-    def _behind(self, background: float | Tensor, lights: Tensor) -> _Behind:
-        """Prepare a background for lights; that of a gray value behind one light is kept for the next call."""
-        if not isinstance(background, float | int) or lights.ndim > 2:
-            return self._behind_surface(as_background(background, self.settings.size, lights), lights)
+    def _prepare_background(
+        self, background: float | Tensor, lights: Tensor
+    ) -> _PreparedBackground:
+        """Prepare a background for lights.
+
+        A gray value behind one light is kept for the next call.
+        """
+        is_gray = isinstance(background, float | int)
+        if not is_gray or lights.ndim > 2:
+            images = as_background(background, self.settings.size, lights)
+            return self._prepare_background_images(images, lights)
         key = (background, lights.dtype, lights.device)
-        if self._kept_behind.get("key") != key:
-            behind = self._behind_surface(as_background(background, self.settings.size, lights), lights)
-            self._kept_behind.update(key=key, behind=behind)
-        return self._kept_behind["behind"]
+        if self._kept_background.get("key") != key:
+            images = as_background(background, self.settings.size, lights)
+            prepared = self._prepare_background_images(images, lights)
+            self._kept_background.update(key=key, prepared=prepared)
+        return self._kept_background["prepared"]
 
-    def _behind_surface(self, images: Tensor, lights: Tensor) -> _Behind:
-        """Prepare images (*B, 3, size, size) that lie behind the surface under lights (*B, coefficients, 3)."""
-        everywhere = images.flatten(-2)
-        at_pixels = everywhere.index_select(-1, self.pixels)
+    def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
+        """Flatten background images, and compute what they add to the covered pixels.
+
+        The images have the shape (*B, 3, size, size), and the lights
+        (*B, coefficients, 3).
+        """
+        flat = images.flatten(-2)
+        at_pixels = flat.index_select(-1, self.pixels)
         if self.settings.encoding != "linear":
-            # The last bit of a power depends on the position in memory, so it is computed for each light.
+            # The last bit of a power depends on the position in memory, so it is
+            # computed for each light.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
-        return _Behind(everywhere, background_term(self.coverage.to(images)[None], at_pixels, self.settings.encoding))
+        coverage = self.coverage.to(images)[None]
+        term = background_term(coverage, at_pixels, self.settings.encoding)
+        return _PreparedBackground(flat, term)
 
     def to(self, device: torch.device | str) -> TransferOperator:
-        """The same on another device."""
+        """Return the same operator on another device.
+
+        Args:
+            device: The device, such as "cuda".
+
+        Raises:
+            InputError: If there is no such device.
+        """
         device = as_device(device)
         if device == self.transfer.device:
             return self
         sparse = self.sparse and self.sparse.to(device)
-        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS}, sparse=sparse)
+        tensors = {name: getattr(self, name).to(device) for name in TENSORS}
+        return replace(self, **tensors, sparse=sparse)
 
     @property
     def by_channel(self) -> Tensor:
-        """(3, K, P): the transfer of three channels, with their albedo."""
+        """Return the transfer of three channels, including the albedo, shape (3, K, P)."""
         if self._shared is None:
             return self.transfer
         colored = self._shared * self.albedo[:, None]
         return colored if self._white is None else colored + self._white
 
-    # Cached, since at 32² even an index or a comparison of dtypes counts.
+    # The following are cached. In images of 32² pixels, even an index or a
+    # comparison of dtypes takes notable time.
 
     @cached_property
     def _shared(self) -> Tensor | None:
-        """(K, P), where the channels share it."""
-        return self.transfer[0] if len(self.transfer) < 3 else None
+        """Return the transfer (K, P) that the colors share, or None if they do not."""
+        return self.transfer[0] if len(self.transfer) < COLORS else None
 
     @cached_property
     def _white(self) -> Tensor | None:
-        """(K, P), added to the product of albedo and what the channels share."""
+        """Return the white transfer (K, P) of gloss, or None without it."""
         return self.transfer[1] if len(self.transfer) == 2 else None
 
     @cached_property
-    def _kept_behind(self) -> dict[str, Any]:
-        """The background of the last call of `image` with a gray value, and the key that it is kept for."""
+    def _kept_background(self) -> dict[str, Any]:
+        """Return the prepared background of the last gray value, and the key that it is kept for."""
         return {}
 
     @cached_property
     def _is_linear(self) -> bool:
-        """Whether image values are not encoded."""
+        """Return whether image values are not encoded."""
         return self.settings.encoding == "linear"
 
     @cached_property
     def _image_shape(self) -> tuple[int, int, int]:
-        """(3, size, size): the shape of one image."""
-        return 3, self.settings.size, self.settings.size
+        """Return the shape of one image, (3, size, size)."""
+        return COLORS, self.settings.size, self.settings.size
 
     @cached_property
     def _light_shape(self) -> tuple[int, int]:
-        """(coefficients, 3): the shape of one light."""
-        return self.basis.size, 3
+        """Return the shape of one light, (coefficients, 3)."""
+        return self.basis.size, COLORS
 
     @cached_property
     def _pixel_rows(self) -> Tensor:
-        """(3, P): the covered pixels, for each channel."""
-        return self.pixels.expand(3, -1)
+        """Return the covered pixels for each color, shape (3, P)."""
+        return self.pixels.expand(COLORS, -1)
 
     @cached_property
     def _scatter(self) -> Tensor:
-        """(size, K): scatters the nonzero coefficients among all, with exact zeros elsewhere."""
+        """Return the matrix (size, K) that puts K coefficients in their place among all.
+
+        The other coefficients become exactly zero.
+        """
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
-class _Behind(NamedTuple):
-    """A background (*B, 3, size²), and what it adds to the radiance of the covered pixels (*B, 3, P)."""
+class _PreparedBackground(NamedTuple):
+    """A background of an operator.
 
-    everywhere: Tensor
-    at_pixels: Tensor
+    Attributes:
+        images: Background images, shape (*B, 3, size²).
+        term: Linear values that are added to the radiance of the covered pixels,
+            shape (*B, 3, P).
+    """
+
+    images: Tensor
+    term: Tensor
 
 
 class _Radiance(torch.autograd.Function):
+    """`TransferOperator._radiance` with its gradient by the lights."""
+
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
         ctx.operator = operator
@@ -337,37 +473,69 @@ class _Radiance(torch.autograd.Function):
 
 
 class _Image(torch.autograd.Function):
-    """Lights (*B, coefficients, 3) to images (*B, 3, size, size), in one node of autograd, since each costs time."""
+    """`TransferOperator._images` with its gradient by the lights.
+
+    It is a single node of autograd, since each node takes time.
+    """
 
     @staticmethod
-    def forward(ctx: Any, lights: Tensor, operator: TransferOperator, behind: _Behind) -> Tensor:
-        images, passing, clamped = operator._images(lights, behind)
-        ctx.operator, ctx.passing, ctx.clamped = operator, passing, clamped
+    def forward(
+        ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground
+    ) -> Tensor:
+        images, is_passing, clamped = operator._images(lights, background)
+        ctx.operator = operator
+        ctx.is_passing = is_passing
+        ctx.clamped = clamped
         return images
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        return ctx.operator._gradient_of_images(upstream, ctx.passing, ctx.clamped), None, None
+        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_passing, ctx.clamped)
+        return gradient, None, None
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
-    """Raise InputError unless the gradient of a loss by images has their shape."""
-    if not isinstance(image_gradient, Tensor) or image_gradient.shape != images.shape:
-        given = tuple(image_gradient.shape) if isinstance(image_gradient, Tensor) else type(image_gradient).__name__
-        raise InputError(f"loss_gradient returned {given}: return a tensor of the images' shape {tuple(images.shape)}")
+    """Check that the gradient of a loss by images has their shape.
+
+    Args:
+        image_gradient: What a function `loss_gradient` returned.
+        images: The images, of any shape.
+
+    Raises:
+        InputError: If it is no tensor or has another shape.
+    """
+    is_tensor = isinstance(image_gradient, Tensor)
+    if not is_tensor or image_gradient.shape != images.shape:
+        given = tuple(image_gradient.shape) if is_tensor else type(image_gradient).__name__
+        raise InputError(
+            f"loss_gradient returned {given}: "
+            f"return a tensor of the images' shape {tuple(images.shape)}"
+        )
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
-    """Radiance (..., B, 3, P) of B lights (..., B, K, 3) under transfer (..., C, K, P), C = 1 to 3, and albedo
-    (..., 3, P), as of a `TransferOperator`. The light comes first in the product: on a CPU that is several times
-    faster."""
-    if transfer.shape[-3] == 3:
+    """Compute the radiance of views under B lights.
+
+    The light comes first in the product, which is several times faster on a CPU.
+
+    Args:
+        lights: Nonzero coefficients, shape (..., B, K, 3).
+        transfer: Transfer of C = 1 to 3 channels, as in a `TransferOperator`,
+            shape (..., C, K, P).
+        albedo: Albedo, as in a `TransferOperator`, shape (..., 3, P).
+
+    Returns:
+        Radiance, shape (..., B, 3, P).
+    """
+    if transfer.shape[-3] == COLORS:
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     shared, *white = transfer.unbind(-3)
-    by_light = lights.mT.flatten(-3, -2)
-    product = (by_light @ shared).unflatten(-2, (-1, 3)) * albedo.unsqueeze(-3)
-    return product + (by_light @ white[0]).unflatten(-2, (-1, 3)) if white else product
+    by_color = lights.mT.flatten(-3, -2)
+    product = (by_color @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
+    if white:
+        product = product + (by_color @ white[0]).unflatten(-2, (-1, COLORS))
+    return product
 
 
 def build_operators(
@@ -380,29 +548,32 @@ def build_operators(
     dtype: torch.dtype = torch.float32,
     gloss: Gloss | None = None,
 ) -> list[TransferOperator]:
-    """Compute one operator per camera, for lights of one basis.
+    """Compute the transfer operators of a mesh for several cameras.
 
-    Surfaces shade on the side that the camera sees.
+    Surfaces are shaded on the side that the camera sees.
 
     Args:
         mesh: The mesh.
         cameras: The cameras.
         settings: Settings of the images.
-        rasterizer: What finds the visible faces.
-        albedo_scale: Factor of the albedo, for meshes whose texture is darker than
-            the thing.
+        rasterizer: Rasterizer that finds the visible faces.
+        albedo_scale: Factor of the albedo, for meshes whose texture is darker
+            than the real object.
         basis: Basis of the lights.
-        dtype: Of the operators, which are computed in float64.
-        gloss: Gloss instead of the mesh's.
+        dtype: Type of the operators. They are computed in float64.
+        gloss: Gloss instead of that of the mesh. None for that of the mesh.
 
     Returns:
-        The operators, in the order of the cameras.
+        One operator per camera, in the order of the cameras.
 
     Raises:
-        InputError: If local lights are to bounce, or the scale is not finite.
+        InputError: If the basis has local lights and light is to bounce, or the
+            scale is not finite.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
-    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
+    views = build_fragments(
+        mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed
+    )
     transport = build_transport(mesh, settings, albedo_scale, basis)
     builder = _OperatorBuilder(
         mesh=mesh,
@@ -418,16 +589,17 @@ def build_operators(
 
 
 class _Channels(NamedTuple):
-    """How the channels of a view's transfer are laid out, and where the albedo is.
+    """The layout of the channels of a view's transfer, and the place of the albedo.
 
     Attributes:
-        number: 3 if each color has a channel. 1 if the colors share a channel, and
-            2 if white light of the gloss follows it.
+        number: Number of channels. It is 3 if each color has a channel, 1 if the
+            colors share a channel, and 2 if the white light of gloss follows the
+            shared channel.
         is_shared: Whether the colors share a channel.
-        sample_albedo: Albedo that is folded into the transfer, shape (S, 3), or
-            ones (S, 1) if the colors share a channel.
-        pixel_albedo: Albedo that multiplies a shared channel, shape (P, 3), or
-            ones.
+        sample_albedo: Albedo that is multiplied into the transfer, shape (S, 3).
+            It is ones (S, 1) if the colors share a channel.
+        pixel_albedo: Albedo that multiplies a shared channel, shape (P, 3). It
+            is ones if each color has a channel.
     """
 
     number: int
@@ -437,7 +609,7 @@ class _Channels(NamedTuple):
 
 
 class _DenseRows(NamedTuple):
-    """Rows of a transfer matrix.
+    """The rows of a transfer matrix for some coefficients of the light.
 
     Attributes:
         transfer: Radiance per unit of K coefficients, shape (C, K, P).
@@ -450,16 +622,16 @@ class _DenseRows(NamedTuple):
 
 @dataclass(frozen=True)
 class _OperatorBuilder:
-    """Computes the operators of one mesh, view by view.
+    """Builder of the operators of one mesh, view by view.
 
     Attributes:
         mesh: The mesh.
         settings: Settings of the images.
         albedo_scale: Factor of the albedo.
         basis: Basis of the lights.
-        dtype: Of the operators.
-        gloss: Gloss instead of the mesh's, or None.
-        transport: Shadows and bounces of environment light, None without them.
+        dtype: Type of the operators.
+        gloss: Gloss instead of that of the mesh, or None.
+        transport: Shadows and bounces of environment light, or None without them.
         rays: Rays among the faces of the mesh.
     """
 
@@ -516,16 +688,26 @@ class _OperatorBuilder:
                 pixel_albedo = _pixel_albedo(fragments, sample_albedo, self.dtype)
         if pixel_albedo is None:
             assert sample_albedo is not None
-            return _Channels(3, False, sample_albedo, torch.ones(pixel_count, 3))
-        # The albedo multiplies whole pixels, so that the samples have 1.
+            return _Channels(
+                number=COLORS,
+                is_shared=False,
+                sample_albedo=sample_albedo,
+                pixel_albedo=torch.ones(pixel_count, COLORS),
+            )
         ones = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
-        return _Channels(2 if is_glossy else 1, True, ones, pixel_albedo)
+        return _Channels(
+            number=2 if is_glossy else 1,
+            is_shared=True,
+            sample_albedo=ones,
+            pixel_albedo=pixel_albedo,
+        )
 
     def _needs_three_channels(self, is_glossy: bool) -> bool:
-        """Return whether light takes on color in a way that no factor per pixel expresses.
+        """Return whether a factor per pixel cannot express the colors of the radiance.
 
-        Bounced light may have another color than the sky's. Shadows and local
-        lights compute gloss in the channels of the albedo.
+        This is so if bounced light has another color than the light of the sky.
+        It is also so if gloss meets shadows or local lights, because these add
+        the white light of gloss to the channels of the albedo.
         """
         if self.transport is not None and self.transport.colors:
             return True
@@ -535,7 +717,9 @@ class _OperatorBuilder:
         """Return the scaled albedo (S, 3) at the samples."""
         return surface_albedo(self.mesh, fragments, self.settings.encoding) * self.albedo_scale
 
-    def _environment_rows(self, part: EnvironmentPart, surface: Surface, channels: _Channels) -> _DenseRows:
+    def _environment_rows(
+        self, part: EnvironmentPart, surface: Surface, channels: _Channels
+    ) -> _DenseRows:
         """Compute the rows of environment light, with shadows and bounces."""
         harmonics_basis = part.basis
         everything = torch.arange(harmonics_basis.size)
@@ -545,7 +729,9 @@ class _OperatorBuilder:
             coefficients = harmonics_basis.nonzero
         else:
             albedo = channels.sample_albedo
-            transfer = _glossy_box_filter(surface, surface.gloss, albedo, harmonics_basis, self.dtype)
+            transfer = _glossy_box_filter(
+                surface, surface.gloss, albedo, harmonics_basis, self.dtype
+            )
             coefficients = everything
         change = None
         if self.transport is not None:
@@ -555,7 +741,9 @@ class _OperatorBuilder:
             coefficients = everything
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
-    def _local_entries(self, part: LocalPart, surface: Surface, channels: _Channels) -> SparseTransfer:
+    def _local_entries(
+        self, part: LocalPart, surface: Surface, channels: _Channels
+    ) -> SparseTransfer:
         """Compute the nonzero entries of a local light."""
         return local_transfer(self.rays, surface, channels.sample_albedo, part.basis)
 
@@ -564,14 +752,17 @@ class _OperatorBuilder:
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
-    def _sparse_rows(self, part: LocalPart, entries: SparseTransfer, channels: _Channels) -> SparseTransfer:
+    def _sparse_rows(
+        self, part: LocalPart, entries: SparseTransfer, channels: _Channels
+    ) -> SparseTransfer:
         """Return the entries of a local light in three channels, with their albedo."""
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
         return SparseTransfer(part.rows.start + entries.function, entries.pixel, weight)
 
     def _join(self, parts: list[_DenseRows], channel_count: int, pixel_count: int) -> _DenseRows:
         """Join rows in the order of their coefficients."""
-        if len(parts) == 1:  # There is nothing to join, so that nothing is copied.
+        if len(parts) == 1:
+            # Returning the part avoids a copy.
             return parts[0]
         empty = torch.empty(channel_count, 0, pixel_count, dtype=self.dtype)
         ordered = sorted(parts, key=_first_coefficient)
@@ -581,75 +772,90 @@ class _OperatorBuilder:
 
 
 def _first_coefficient(rows: _DenseRows) -> int:
-    """Return the index of the first coefficient, 0 for none."""
+    """Return the index of the first coefficient, or 0 without coefficients."""
     return int(rows.coefficients[0]) if len(rows.coefficients) else 0
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Return the albedo (P, 3) of each pixel if its samples' (S, 3) agree to the dtype's rounding, else None."""
-    by_channel = albedo.T  # Each row holds one channel and is contiguous.
-    by_pixel = by_channel.new_zeros(3, len(fragments.pixels)).index_copy(1, fragments.pixel, by_channel)
-    # In float64, index_select takes three times as long.
-    at_samples = by_pixel.gather(1, fragments.pixel.expand(3, -1))
-    spread = (by_channel - at_samples).abs_()
-    agrees = spread <= torch.finfo(dtype).eps * by_channel
-    return by_pixel.T if agrees.all() else None
+    """Return the albedo (P, 3) of each pixel, or None if the samples of a pixel disagree.
+
+    The albedo of the samples (S, 3) may differ by the rounding of the dtype.
+    """
+    # Each row holds one channel and is contiguous.
+    by_channel = albedo.T
+    zeros = by_channel.new_zeros(COLORS, len(fragments.pixels))
+    by_pixel = zeros.index_copy(1, fragments.pixel, by_channel)
+    # index_select takes three times as long in float64.
+    pixel_of_sample = fragments.pixel.expand(COLORS, -1)
+    difference = (by_channel - by_pixel.gather(1, pixel_of_sample)).abs_()
+    is_equal = difference <= torch.finfo(dtype).eps * by_channel
+    return by_pixel.T if is_equal.all() else None
 
 
-def _box_filter(surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype) -> Tensor:
+def _box_filter(
+    surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype
+) -> Tensor:
     """Sum albedo × A_l Y_lm(n) over each pixel's samples, in float64.
 
+    This is the transfer of a matte surface under an open sky, with the factors
+    A_l of `harmonics.lambertian_factors` and the normals n of the samples.
+
     Args:
-        surface: Normals at the S samples of a view, in P pixels.
-        albedo: Linear (S, C) at the samples. None stands for 1 in a single channel.
-        basis: The K nonzero functions A_l Y_lm.
-        dtype: Of the result.
+        surface: The S samples of a view, in P pixels.
+        albedo: Linear albedo at the samples, shape (S, C). None stands for 1 in
+            a single channel.
+        basis: Basis with K nonzero functions A_l Y_lm.
+        dtype: Type of the result.
 
     Returns:
-        (C, K, P).
+        Transfer, shape (C, K, P).
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
-    by_face = surface.settings.normals == "flat"
-    if by_face:
+    is_flat = surface.settings.normals == "flat"
+    if is_flat:
         face_harmonics = basis.irradiance(surface.face_planes)
         if albedo is None and _mostly_filled(fragments):
             return _copied_from_faces(fragments, face_harmonics, dtype)
         pixel, face, weights = _face_weights(fragments, albedo)
     else:
-        pixel, weights = fragments.pixel, _sample_weights(fragments, albedo)
+        pixel = fragments.pixel
+        weights = _sample_weights(fragments, albedo)
     filtered = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
     row_starts = _row_starts(torch.bincount(pixel, minlength=pixel_count))
     for first in range(0, pixel_count, BLOCK):
         rows = row_starts[first : first + BLOCK + 1]
         entries = slice(int(rows[0]), int(rows[-1]))
-        if by_face:
-            column, harmonics = face[entries], face_harmonics
+        if is_flat:
+            values = face_harmonics
+            value_of_entry = face[entries]
         else:
-            harmonics = basis.irradiance(surface.normals[entries])
-            column = torch.arange(len(harmonics))
+            values = basis.irradiance(surface.normals[entries])
+            value_of_entry = torch.arange(len(values))
         for channel, weight in zip(filtered, weights[entries].T, strict=True):
-            sums = _row_sums(weight, column, rows, harmonics)
+            sums = _row_sums(weight, value_of_entry, rows, values)
             channel[:, first : first + BLOCK] = sums.to(dtype).T
     return filtered
 
 
 def _mostly_filled(fragments: Fragments) -> bool:
-    """Return whether a single face fills most pixels."""
-    filled = fragments.runs.sample_count == fragments.samples**2
-    return 2 * int(filled.sum()) > len(fragments.pixels)
+    """Return whether most pixels show a single face."""
+    is_filled = fragments.runs.sample_count == fragments.samples**2
+    return 2 * int(is_filled.sum()) > len(fragments.pixels)
 
 
 def _copied_from_faces(fragments: Fragments, face_harmonics: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return `_box_filter` (1, K, P) of G faces of albedo 1 that have the values (G, K).
+    """Return `_box_filter`, shape (1, K, P), for flat normals and an albedo of 1.
 
-    A pixel that one face fills has the values of this face, which are copied. Only the
+    `face_harmonics` (G, K) are the functions A_l Y_lm of each seen face. A pixel
+    that one face fills has the values of this face, which are copied. Only the
     other pixels are summed.
     """
     pixel, face, sample_count = fragments.runs
     run_count = torch.bincount(pixel, minlength=len(fragments.pixels))
     first_run = _row_starts(run_count)[:-1]
-    positive_zero = face_harmonics + 0.0  # A sum is never −0.0, so a copy must not be, either.
+    # A sum is never −0.0. Adding 0.0 ensures that a copy is not −0.0 either.
+    positive_zero = face_harmonics + 0.0
     by_function = positive_zero.T.to(dtype).contiguous()
     filtered = by_function.index_select(1, face.index_select(0, first_run))
     is_partial = sample_count < fragments.samples**2
@@ -662,47 +868,57 @@ def _copied_from_faces(fragments: Fragments, face_harmonics: Tensor, dtype: torc
         rows = row_starts[first : first + BLOCK + 1]
         entries = slice(int(rows[0]), int(rows[-1]))
         sums = _row_sums(partial_weight[entries], partial_face[entries], rows, face_harmonics)
-        of_block = summed_pixels[first : first + BLOCK].expand(len(filtered), -1)
-        filtered.scatter_(1, of_block, sums.to(dtype).T.contiguous())
+        block = summed_pixels[first : first + BLOCK].expand(len(filtered), -1)
+        filtered.scatter_(1, block, sums.to(dtype).T.contiguous())
     return filtered[None]
 
 
 def _indices(is_chosen: Tensor) -> Tensor:
-    """Return where a mask (N,) is true: NumPy takes a quarter of the time of torch."""
+    """Return the indices at which a mask (N,) is true.
+
+    NumPy takes a quarter of the time of torch.
+    """
     return torch.from_numpy(np.flatnonzero(is_chosen.numpy()))
 
 
 def _row_starts(counts: Tensor) -> Tensor:
-    """Return where rows of these lengths (N,) begin, and where the last ends (N + 1,)."""
+    """Return the first entry of each of N rows and the end of the last one, shape (N + 1,).
+
+    `counts` (N,) is the number of entries of each row.
+    """
     starts = counts.new_zeros(len(counts) + 1)
     torch.cumsum(counts, 0, out=starts[1:])
     return starts
 
 
-def _row_sums(weight: Tensor, column: Tensor, row_starts: Tensor, values: Tensor) -> Tensor:
-    """Sum weighted rows of values.
+def _row_sums(weight: Tensor, value_of_entry: Tensor, row_starts: Tensor, values: Tensor) -> Tensor:
+    """Return N weighted sums of rows of values, shape (N, K).
 
     Args:
-        weight: Of each entry (E,).
-        column: The row of `values` that each entry weights (E,).
-        row_starts: Where the entries of N sums begin, and where the last ends (N + 1,).
-        values: (M, K).
-
-    Returns:
-        The sums (N, K).
+        weight: Weight of each entry, shape (E,).
+        value_of_entry: Row of `values` that each entry weights, shape (E,).
+        row_starts: First entry of each sum and the end of the last one, up to a
+            common offset, shape (N + 1,).
+        values: The values, shape (M, K).
     """
-    # The weights are a sparse matrix in compressed rows.
-    compressed = column.int().numpy(), (row_starts - row_starts[0]).int().numpy()
+    # The weights are a sparse matrix (N, M) in compressed rows.
+    columns = value_of_entry.int().numpy()
+    starts = (row_starts - row_starts[0]).int().numpy()
     shape = (len(row_starts) - 1, len(values))
-    return torch.from_numpy(csr_array((weight.numpy(), *compressed), shape=shape) @ values.numpy())
+    matrix = csr_array((weight.numpy(), columns, starts), shape=shape)
+    return torch.from_numpy(matrix @ values.numpy())
 
 
 def _face_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pixel (R,), the face (R,) and the summed weight (R, C) of each run of samples of one face."""
+    """Return the pixel, the seen face and the weight of each run of samples of one face.
+
+    The shapes for R runs are (R,), (R,) and (R, C).
+    """
     if albedo is not None:
         return fragments.merge(albedo)
     runs = fragments.runs
-    return runs.pixel, runs.face, (runs.sample_count.double() / fragments.samples**2)[:, None]
+    weights = runs.sample_count.double() / fragments.samples**2
+    return runs.pixel, runs.face, weights[:, None]
 
 
 def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
@@ -715,34 +931,71 @@ def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
 ) -> Tensor:
-    """`_box_filter` (C, K, P) with what gloss adds, for all K coefficients. One channel is followed by white."""
-    fragments, colors = surface.fragments, albedo.shape[1]
-    filtered = torch.zeros(colors + (colors == 1), basis.size, len(fragments.pixels), dtype=dtype)
-    weights, degree = albedo / fragments.samples**2, min(basis.degree, harmonics.DIFFUSE_DEGREE)
+    """Return the transfer (channels, K, P) of a glossy surface under an open sky.
+
+    `albedo` (S, C) is given at the samples. K counts all coefficients of the
+    basis. If C is 1, a second channel holds the white light of gloss. Otherwise
+    this white light is added to all channels.
+    """
+    fragments = surface.fragments
+    color_count = albedo.shape[1]
+    channel_count = 2 if color_count == 1 else color_count
+    filtered = torch.zeros(channel_count, basis.size, len(fragments.pixels), dtype=dtype)
+    # The white light of gloss is added to these channels.
+    white_channels = 1 if color_count == 1 else slice(None)
+    weights = albedo / fragments.samples**2
+    diffuse_degree = min(basis.degree, harmonics.DIFFUSE_DEGREE)
     pixels_at_once = max(1, GLOSSY // (basis.size * fragments.samples**2))
-    for some, at, block in _blocks(fragments.pixel, filtered, pixels_at_once):
-        seen, pixels = (surface.normals[some], at_samples(surface.toward, some)), block.shape[2]
-        part = gloss.at(some)
-        colored, white, frame = part.transfer(*seen, basis.degree)
-        rows = harmonics.basis(seen[0], degree) * part.entering_bands(degree).T * part.diffuse(*seen)[:, None]
-        for channel, weight in zip(block, weights[some].T, strict=False):
-            channel[: rows.shape[1]] = _over_pixels(rows * weight[:, None], at, pixels).to(dtype)
+    for block in _blocks(fragments.pixel, filtered, pixels_at_once):
+        normals = surface.normals[block.samples]
+        to_camera = at_samples(surface.toward, block.samples)
+        block_gloss = gloss.at(block.samples)
+        colored, white, frame = block_gloss.transfer(normals, to_camera, basis.degree)
+        diffuse = _diffuse_rows(block_gloss, normals, to_camera, diffuse_degree)
+        for channel, weight in zip(block.filtered, weights[block.samples].T, strict=False):
+            channel[: diffuse.shape[1]] = block.sum_by_pixel(diffuse * weight[:, None]).to(dtype)
             if colored is not None:
-                channel += frame.to_world(_over_pixels((colored * weight).T, at, pixels))
-        shine = frame.to_world(_over_pixels(white.T, at, pixels)) / fragments.samples**2
-        block[1 if colors == 1 else slice(None)] += shine
+                channel += frame.to_world(block.sum_by_pixel((colored * weight).T))
+        shine = frame.to_world(block.sum_by_pixel(white.T)) / fragments.samples**2
+        block.filtered[white_channels] += shine
     return filtered
 
 
-def _blocks(pixel: Tensor, filtered: Tensor, size: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """The samples of so many pixels at a time, their pixels counted from the first, and the part of (..., P) to
-    fill."""
-    starts = torch.arange(0, filtered.shape[-1], size)
-    ends = torch.searchsorted(pixel, starts + size).tolist()
-    for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
-        yield slice(begin, end), pixel[begin:end] - first, filtered[..., first : first + size]
+def _diffuse_rows(gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int) -> Tensor:
+    """Return the diffuse radiance of samples per unit of albedo and of each coefficient.
+
+    The shape is (S, K) for unit normals (S, 3) and K coefficients of environment
+    light. The light passes the coat of gloss twice.
+    """
+    entering = harmonics.basis(normals, degree) * gloss.entering_bands(degree).T
+    return entering * gloss.diffuse(normals, to_camera)[:, None]
 
 
-def _over_pixels(rows: Tensor, at: Tensor, pixels: int) -> Tensor:
-    """(K, pixels): rows (S, K) summed by pixel."""
-    return rows.new_zeros(pixels, rows.shape[1]).index_add_(0, at, rows).T
+class _Block(NamedTuple):
+    """Some neighboring pixels of a view with their samples.
+
+    Attributes:
+        samples: The samples of the pixels.
+        pixel: Pixel of each sample, counted from the first pixel of the block,
+            shape (S,).
+        filtered: Part of the transfer to fill, shape (channels, K, P).
+    """
+
+    samples: slice
+    pixel: Tensor
+    filtered: Tensor
+
+    def sum_by_pixel(self, rows: Tensor) -> Tensor:
+        """Return the sums (K, P) over the samples of each pixel, of rows (S, K)."""
+        zeros = rows.new_zeros(self.filtered.shape[2], rows.shape[1])
+        return zeros.index_add_(0, self.pixel, rows).T
+
+
+def _blocks(pixel: Tensor, filtered: Tensor, size: int) -> Iterator[_Block]:
+    """Yield blocks of pixels, given the pixel of each sample and the transfer (channels, K, P)."""
+    first_sample = 0
+    for first in range(0, filtered.shape[-1], size):
+        last_sample = int(torch.searchsorted(pixel, first + size))
+        samples = slice(first_sample, last_sample)
+        yield _Block(samples, pixel[samples] - first, filtered[..., first : first + size])
+        first_sample = last_sample
