@@ -1,4 +1,7 @@
-"""Images of objects in other light: stacked transfer operators, and nothing is rasterized again."""
+"""Render images of unchanged objects in changing light with stacked transfer operators.
+
+The objects are rasterized once. After that, a change of the light costs a matrix product.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,9 +23,13 @@ from renderer.transport.operators import TransferOperator
 
 
 class Layer(NamedTuple):
-    """Covered pixels (P,) of B images, which are `rows` of a batch: a part of it or, on its device, indices (B,).
+    """The radiance of B images of a batch at P pixels. Each object of them lies in these pixels.
 
-    composite: (B, 3, P) linear radiance and background.
+    Attributes:
+        rows: Which rows of the batch the images are: a slice, or indices (B,)
+            on the device of the radiance.
+        pixels: Indices of the pixels in an image, shape (P,).
+        composite: Linear radiance of object and background, shape (B, 3, P).
     """
 
     rows: Rows
@@ -30,13 +37,39 @@ class Layer(NamedTuple):
     composite: Tensor
 
 
+class _BuiltStack(NamedTuple):
+    """A stack of operators and the images that it renders.
+
+    Attributes:
+        operators: The operators.
+        rank: For each of all N images, its position among the A images of
+            this stack, shape (N,). Values of other images have no meaning.
+        background_terms: What the backgrounds add to the A images at the P
+            pixels of the stack, shape (A, C, P).
+    """
+
+    operators: OperatorStack
+    rank: Tensor
+    background_terms: Tensor
+
+
 @dataclass(eq=False, repr=False)
 class Relighting:
-    """N images, each of an object from a camera over one of the backgrounds (B, 3 or 1, size²).
+    """Render N images, each of one object from one camera in front of one background.
 
-    Equal views share an operator, and background terms are cached. Operators are built when they are first needed, a
-    stack at a time. views: (object's number, camera) of each image. behind: (N,) the background of each. build: the
-    operators of a mesh from cameras, for an albedo_scale. beside: bytes that an attack needs beside the operators.
+    Images of the same object from the same camera share an operator. The
+    operators are built when they are first needed, one stack at a time. The
+    radiance of the backgrounds is computed once.
+
+    Attributes:
+        objects: The objects.
+        views: Index of the object, and the camera, for each of the N images.
+        behind: Index of the background of each image, shape (N,).
+        backgrounds: Image values, shape (B, 3 or 1, size²).
+        settings: Settings of the images.
+        build: Builds one operator for each camera, from a mesh, cameras and
+            an albedo_scale.
+        beside: Bytes that an attack needs in addition to the operators.
     """
 
     objects: Sequence[SceneObject]
@@ -48,50 +81,93 @@ class Relighting:
     beside: int = 0
 
     def __post_init__(self) -> None:
-        self._distinct = sorted(dict.fromkeys(self.views), key=itemgetter(0))  # (object, camera) of each operator
-        number = {view: index for index, view in enumerate(self._distinct)}
-        self._operator = torch.tensor([number[view] for view in self.views])
-        self._per_stack = max(1, STACKED // self.settings.size**2)
-        self._count = -(-len(self._distinct) // self._per_stack)
-        self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
+        """Assign an operator to each image, and a stack to each operator."""
+        self._views_of_operators = sorted(dict.fromkeys(self.views), key=itemgetter(0))
+        operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
+        self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
+        self._operators_per_stack = max(1, STACKED // self.settings.size**2)
+        self._stack_of_image = self._operator_of_image // self._operators_per_stack
+        self._stack_count = -(-len(self._views_of_operators) // self._operators_per_stack)
+        self._built: dict[int, _BuiltStack] = {}
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """All stacks, built where they are missing."""
-        self._require(range(self._count))
-        return [self._stacks[index][0] for index in range(self._count)]
+        """All stacks of operators. Missing stacks are built."""
+        self._build_missing(range(self._stack_count))
+        return [self._built[index].operators for index in range(self._stack_count)]
 
     def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
-        """The layers of images (A,), each in its light (A, size, 3); differentiable in the light."""
-        images = images.cpu()  # once, since the host waits here for a GPU
-        number = self._operator[images] // self._per_stack
-        indices = number.unique().tolist()
-        self._require(indices)
-        for index in indices:
-            within, (stack, rank, behind) = torch.nonzero(number == index).squeeze(1), self._stacks[index]
-            ranks, first, end = rank[images[within]], int(within[0]), int(within[-1]) + 1
-            rows = slice(first, end) if end - first == len(within) else within.to(light.device, non_blocking=True)
-            on_device = ranks.to(light.device, non_blocking=True)
-            yield Layer(rows, stack.pixels, stack.radiance(light[rows], ranks) + behind[on_device])
+        """Compute the radiance of a batch of images, differentiable in the light.
 
-    def _require(self, indices: Iterable[int]) -> None:
-        missing = [index for index in indices if index not in self._stacks]
-        for index in progress(missing, "rendering views") if missing else ():
-            self._stacks[index] = stack, _, behind = self._build_stack(index)
-            if len(self._stacks) == 1:  # the others are as large
-                rest = (self._count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + behind.nbytes)
-                views = f"{len(self._distinct)} views of {self.settings.size} pixels per side (views)"
-                require_memory(views, rest + self.beside, self.backgrounds.device)
+        Args:
+            light: Coefficients of the light of each image of the batch, shape
+                (A, size, 3).
+            images: Indices of the images of the batch among all N, shape (A,).
 
-    def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
-        """(a stack; (N,) each image's rank among the A images of the stack; their background terms (A, C, P))."""
-        first = index * self._per_stack
-        views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
-        for number, group in groupby(views, key=itemgetter(0)):
-            item, cameras = self.objects[number], [camera for _, camera in group]
+        Yields:
+            The radiance of those images of the batch that share a stack.
+        """
+        # The host waits here for a GPU. It does so once for all stacks.
+        images = images.cpu()
+        stack_of_row = self._stack_of_image[images]
+        needed = stack_of_row.unique().tolist()
+        self._build_missing(needed)
+        for index in needed:
+            built = self._built[index]
+            row_indices = torch.nonzero(stack_of_row == index).squeeze(1)
+            rows = _as_rows(row_indices, light.device)
+            ranks = built.rank[images[row_indices]]
+            ranks_on_device = ranks.to(light.device, non_blocking=True)
+            radiance = built.operators.radiance(light[rows], ranks)
+            composite = radiance + built.background_terms[ranks_on_device]
+            yield Layer(rows, built.operators.pixels, composite)
+
+    def _build_missing(self, indices: Iterable[int]) -> None:
+        """Build those of the given stacks that do not exist."""
+        missing = [index for index in indices if index not in self._built]
+        if not missing:
+            return
+        for index in progress(missing, "rendering views"):
+            self._built[index] = self._build_stack(index)
+            if len(self._built) == 1:
+                self._require_memory_for_others(self._built[index])
+
+    def _require_memory_for_others(self, first: _BuiltStack) -> None:
+        """Check that there is memory for all other stacks, which are as large as the first."""
+        operators = first.operators
+        stack_bytes = (
+            operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
+        )
+        needed = (self._stack_count - 1) * stack_bytes + self.beside
+        view_count = len(self._views_of_operators)
+        name = f"{view_count} views of {self.settings.size} pixels per side (views)"
+        require_memory(name, needed, self.backgrounds.device)
+
+    def _build_stack(self, index: int) -> _BuiltStack:
+        """Build a stack of operators, and the background terms of its images."""
+        first = index * self._operators_per_stack
+        views = self._views_of_operators[first : first + self._operators_per_stack]
+        operators: list[TransferOperator] = []
+        for number, views_of_object in groupby(views, key=itemgetter(0)):
+            item = self.objects[number]
+            cameras = [camera for _, camera in views_of_object]
             operators += self.build(item.mesh, cameras, albedo_scale=item.albedo_scale)
-        here = self._operator // self._per_stack == index
-        stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self.backgrounds.device)
-        backgrounds = self.backgrounds.index_select(2, stack.pixels)
-        behind = background_term(stack.coverage[stack.shown], backgrounds[self.behind[here]], self.settings.encoding)
-        return stack, here.cumsum(0) - 1, behind
+        is_in_stack = self._stack_of_image == index
+        operator_of_image = (self._operator_of_image[is_in_stack] - first).cpu()
+        stack = OperatorStack(operators, operator_of_image, self.backgrounds.device)
+        pixels = self.backgrounds.index_select(2, stack.pixels)
+        background_terms = background_term(
+            stack.coverage[stack.shown],
+            pixels[self.behind[is_in_stack]],
+            self.settings.encoding,
+        )
+        return _BuiltStack(stack, is_in_stack.cumsum(0) - 1, background_terms)
+
+
+def _as_rows(indices: Tensor, device: torch.device) -> Rows:
+    """Return increasing indices as a slice if they are consecutive, or else on a device."""
+    first = int(indices[0])
+    end = int(indices[-1]) + 1
+    if end - first == len(indices):
+        return slice(first, end)
+    return indices.to(device, non_blocking=True)
