@@ -1,7 +1,9 @@
-"""Images of objects whose vertices, colors, gloss or lamps change, view by view; moved views are rasterized again.
+"""Render objects whose vertices, colors, gloss or lamps change, one view at a time.
 
-Shadows and bounces of environment light are frozen at a shape close by, with the mesh's gloss (`FrozenTransport`);
-shadows of local lights are those of the moved shape itself (`renderer.transport.lamp_paths`).
+Each view of moved vertices is rasterized again. The shadows and bounces of environment light are
+not computed again for each motion: `FrozenTransport` keeps those of a shape nearby, with the gloss
+of the mesh. The shadows of local lights are those of the moved shape itself
+(`renderer.transport.lamp_paths`).
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -32,56 +34,118 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from augment.scene.conditions import Conditions
 
-NEAR = 0.001  # world units: shadows and bounces are computed again once a coordinate has moved farther
+# Shadows and bounces are computed again if a coordinate of a vertex has moved farther than this
+# distance, in world units.
+NEAR = 0.001
+
+
+class FrozenView(NamedTuple):
+    """What shadows and bounces add to a view of a mesh with a known albedo.
+
+    Attributes:
+        change: Radiance that is added per unit of each of K coefficients of the
+            light, for each channel and pixel, shape (3, K, size²).
+        albedo_sums: Sum of the albedo of all samples of each pixel, shape
+            (3, size²).
+    """
+
+    change: Tensor
+    albedo_sums: Tensor
 
 
 class FrozenTransport:
-    """The radiance that shadows and bounces add to views of a mesh, per unit of each coefficient of environment light.
+    """The radiance that shadows and bounces of environment light add to views of a mesh.
 
-    It stays in place in the image, as the outline does for derivatives, and is scaled with the albedo of its pixel.
+    The added radiance of each pixel is scaled with the albedo of this pixel. It
+    does not move with the object in the image.
+
+    Attributes:
+        mesh: The mesh that casts the shadows.
+        views: What was added for each camera. None if nothing was added.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
-        self.mesh, self._settings = mesh, settings
+        """Precompute the transport of a mesh.
+
+        Args:
+            mesh: The mesh.
+            settings: Settings of the images.
+            albedo_scale: Factor of the albedo of the mesh.
+            basis: Basis of the light.
+        """
+        self.mesh = mesh
+        self.views: dict[Camera, FrozenView | None] = {}
+        self._settings = settings
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
-        self.views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
 
     def is_near(self, vertices: np.ndarray) -> bool:
-        """Whether vertices (V, 3) are near the mesh's."""
+        """Return whether no coordinate of vertices (V, 3) is farther than `NEAR` from the mesh's."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
-        """Add a view of the mesh, with its albedo at the samples (S, 3)."""
-        surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
-        change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
-        self.views[camera] = None
-        if change is not None:
-            canvas = change.new_zeros(*change.shape[:2], fragments.size**2)
-            canvas[..., surface.fragments.pixels] = change
-            self.views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
+        """Compute and keep what is added to a view of the mesh.
 
-    def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
-        """(3, P) at the fragments of an added view, with albedo (S, 3) in light (size, 3); differentiable in both."""
+        Args:
+            camera: The camera of the view.
+            fragments: The S samples of the mesh in the view.
+            albedo: Albedo of the mesh at the samples, shape (S, 3).
+        """
+        self.views[camera] = None
+        if not self._transport:
+            return
+        surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
+        change = self._transport.change(surface, albedo.cpu().double())
+        if change is None:
+            return
+        canvas = change.new_zeros(*change.shape[:2], fragments.size**2)
+        canvas[..., surface.fragments.pixels] = change
+        self.views[camera] = FrozenView(canvas.to(albedo), _sum_by_pixel(fragments, albedo))
+
+    def radiance(
+        self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
+    ) -> Tensor:
+        """Compute the added radiance of a view, differentiable in albedo and light.
+
+        Args:
+            camera: A camera whose view was added.
+            fragments: The S samples of the shape, in P pixels. The shape may
+                differ a little from the mesh.
+            albedo: Albedo at the samples, shape (S, 3).
+            light: Coefficients of the environment light, shape (K, 3).
+
+        Returns:
+            The added radiance, shape (3, P).
+        """
         view = self.views[camera]
         if view is None:
             return light.new_zeros(3, len(fragments.pixels))
-        change, before = (values[..., fragments.pixels] for values in view)
+        change = view.change[..., fragments.pixels]
+        old_sums = view.albedo_sums[..., fragments.pixels]
+        new_sums = _sum_by_pixel(fragments, albedo)[:, fragments.pixels]
         added = torch.einsum("ckp,kc->cp", change.to(light), light)
-        now = _by_pixel(fragments, albedo)[:, fragments.pixels]
-        return added * torch.where(before > 0, now / before.masked_fill(before == 0, 1), 1).to(light)
+        # Pixels without any albedo before are left as they are.
+        ratios = new_sums / old_sums.masked_fill(old_sums == 0, 1)
+        return added * torch.where(old_sums > 0, ratios, 1).to(light)
 
 
-def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
-    """(3, size²) the sum of the samples' albedo (S, 3) over each pixel."""
-    pixel = fragments.pixels[fragments.pixel]
-    return albedo.new_zeros(3, fragments.size**2).index_add(1, pixel, albedo.T)
+def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
+    """Sum the albedo (S, 3) of the samples in each pixel of the image, to shape (3, size²)."""
+    pixel_of_sample = fragments.pixels[fragments.pixel]
+    sums = albedo.new_zeros(3, fragments.size**2)
+    return sums.index_add(1, pixel_of_sample, albedo.T)
 
 
 @dataclass(eq=False, repr=False)
 class Reshading:
-    """Views of objects, which are given by their numbers.
+    """Renders views of objects without transfer operators of these views.
 
-    basis: of the lights. like: has the dtype and the device of the images. cached: keep the views of unmoved objects.
+    Attributes:
+        objects: The objects. Methods take the index of one of them.
+        settings: Settings of the images.
+        rasterizer: The rasterizer.
+        basis: Basis of the lights.
+        like: A tensor with the dtype and the device of the images.
+        cached: Whether the samples of unmoved objects are kept.
     """
 
     objects: Sequence[SceneObject]
@@ -92,33 +156,53 @@ class Reshading:
     cached: bool = True
 
     def __post_init__(self) -> None:
+        """Begin with nothing kept."""
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         self._rays: dict[int, Rays] = {}
-        self._unmoved_transport: dict[int, FrozenTransport] = {}  # of objects
-        self._moved_transport: dict[int, FrozenTransport] = {}  # of examples
+        self._transport_of_object: dict[int, FrozenTransport] = {}
+        self._transport_of_example: dict[int, FrozenTransport] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
-        """(V, 3) of each unmoved object."""
+        """The vertices of each unmoved object, shape (V, 3)."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
-        """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
-        key = number, camera
-        view = self._views.get(key) or self._rasterized(*key, self.objects[number].mesh.vertices)
+        """Rasterize an unmoved object.
+
+        Args:
+            number: Index of the object.
+            camera: The camera.
+
+        Returns:
+            The S samples of the object, and the albedo at the samples, shape
+            (S, 3).
+        """
+        key = (number, camera)
+        view = self._views.get(key)
+        if view is None:
+            view = self._rasterize(number, camera, self.objects[number].mesh.vertices)
         if self.cached:
             self._views[key] = view
         return view
 
     def local_view(self, number: int, camera: Camera) -> LocalLightView:
-        """An unmoved object in local light."""
-        key = number, camera
+        """Prepare a view of an unmoved object for local lights.
+
+        Args:
+            number: Index of the object.
+            camera: The camera.
+
+        Returns:
+            The view. It is computed once for each object and camera.
+        """
+        key = (number, camera)
         if key not in self._local_views:
-            fragments, _ = self.view(*key)
-            shape = self.objects[number].mesh
+            fragments, _ = self.view(number, camera)
+            mesh = self.objects[number].mesh
             rays = self._rays_among(number)
-            self._local_views[key] = LocalLightView(rays, shape, fragments, self.settings)
+            self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
         return self._local_views[key]
 
     def radiance(
@@ -136,11 +220,11 @@ class Reshading:
         the fields of the camera.
 
         Args:
-            example: Number of the example. The shapes of one example change
+            example: Index of the example. The shapes of one example change
                 little from call to call.
-            number: Number of the object.
+            number: Index of the object.
             camera: The camera.
-            light: Coefficients of the basis, shape (size, 3).
+            light: Coefficients of the basis, shape (K, 3).
             changed: A row of conditions, without their light and cameras.
             background: Image values behind the object, shape (3 or 1, size²).
 
@@ -157,9 +241,9 @@ class Reshading:
         else:
             vertices = changed.vertices
             positions = vertices.detach().cpu().double().numpy()
-            fragments, albedo = self._rasterized(number, fixed_camera, positions)
+            fragments, albedo = self._rasterize(number, fixed_camera, positions)
         if changed.albedo is not None:
-            painted = item.mesh, fragments, self.settings.encoding, item.albedo_scale
+            painted = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
             albedo = painted_albedo(*painted, changed.albedo, changed.hue)
         gloss = None
         if changed.gloss is not None:
@@ -168,14 +252,17 @@ class Reshading:
         rays = None
         lamp_view = None
         if split.local_lights:
-            rays = Rays(replace(item.mesh, vertices=positions)) if is_moved else self._rays_among(number)
+            moved_mesh = replace(item.mesh, vertices=positions)
+            rays = Rays(moved_mesh) if is_moved else self._rays_among(number)
             if not is_moved and gloss is None:
                 lamp_view = self.local_view(number, fixed_camera)
         indirect = None
         if self.settings.global_illumination:
+            # A camera that is being attacked changes in every call.
             is_kept = camera is fixed_camera
-            frozen = _FrozenView(self, example, number, fixed_camera, fragments, positions, is_kept)
-            indirect = frozen.radiance
+            indirect = _IndirectLight(
+                self, example, number, fixed_camera, fragments, positions, is_kept
+            ).radiance
         shares_normals = not is_moved and self.settings.normals == "smooth"
         shown = ShadedView(
             mesh=item.mesh,
@@ -195,48 +282,78 @@ class Reshading:
         return shown.pixel_radiance(camera, background)
 
     def _rays_among(self, number: int) -> Rays:
-        """Return rays among the faces of an unmoved object."""
-        return self._rays.setdefault(number, Rays(self.objects[number].mesh))
+        """Return the ray tracer of an unmoved object, which is built once."""
+        if number not in self._rays:
+            self._rays[number] = Rays(self.objects[number].mesh)
+        return self._rays[number]
 
     def _vertex_normals(self, number: int) -> Tensor:
         """Return the normals (V, 3) of an unmoved object, which all its views share."""
         return torch.from_numpy(self.objects[number].mesh.vertex_normals).to(self.like.device)
 
-    def transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
-        """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""
-        mesh, fixed = self.objects[number].mesh, (self.settings, self.objects[number].albedo_scale, self.basis)
-        if number not in self._unmoved_transport:
-            self._unmoved_transport[number] = FrozenTransport(mesh, *fixed)
-        frozen = self._unmoved_transport[number]
+    def transport_near(
+        self, example: int, number: int, camera: Camera, vertices: np.ndarray
+    ) -> FrozenTransport:
+        """Find shadows and bounces of a shape near the one of an example, or compute them.
+
+        Args:
+            example: Index of the example. One moved shape is kept for each.
+            number: Index of the object.
+            camera: The camera.
+            vertices: Vertices of the shape, shape (V, 3).
+
+        Returns:
+            The transport of a shape within `NEAR`, to which the view from the
+            camera has been added.
+        """
+        frozen = self._transport_of_object.get(number)
+        if frozen is None:
+            frozen = self._freeze(number, self.objects[number].mesh)
+            self._transport_of_object[number] = frozen
         if not frozen.is_near(vertices):
-            frozen = self._moved_transport.get(example, frozen)
+            frozen = self._transport_of_example.get(example, frozen)
             if not frozen.is_near(vertices):
-                frozen = FrozenTransport(replace(mesh, vertices=vertices), *fixed)
-            self._moved_transport[example] = frozen
+                moved = replace(self.objects[number].mesh, vertices=vertices)
+                frozen = self._freeze(number, moved)
+            self._transport_of_example[example] = frozen
         if camera not in frozen.views:
-            frozen.add(camera, *self._rasterized(number, camera, frozen.mesh.vertices))
+            frozen.add(camera, *self._rasterize(number, camera, frozen.mesh.vertices))
         return frozen
 
-    def _rasterized(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
-        """Fragments of an object with these vertices, and its albedo at the samples (S, 3)."""
-        item, settings = self.objects[number], self.settings
-        drawn = vertices, item.mesh.faces, [camera], settings, self.rasterizer
-        fragments = build_fragments(*drawn, closed=item.mesh.closed)[0].to(self.like.device)
-        return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self.like)
+    def _freeze(self, number: int, mesh: Mesh) -> FrozenTransport:
+        """Compute the shadows and bounces of an object's mesh, whose vertices may be moved."""
+        return FrozenTransport(mesh, self.settings, self.objects[number].albedo_scale, self.basis)
+
+    def _rasterize(
+        self, number: int, camera: Camera, vertices: np.ndarray
+    ) -> tuple[Fragments, Tensor]:
+        """Return the samples of an object with these vertices, and their albedo (S, 3)."""
+        item = self.objects[number]
+        [fragments] = build_fragments(
+            vertices,
+            item.mesh.faces,
+            [camera],
+            self.settings,
+            self.rasterizer,
+            closed=item.mesh.closed,
+        )
+        fragments = fragments.to(self.like.device)
+        albedo = surface_albedo(item.mesh, fragments, self.settings.encoding)
+        return fragments, (albedo * item.albedo_scale).to(self.like)
 
 
 @dataclass(frozen=True, eq=False)
-class _FrozenView:
-    """Shadows and bounces in one view of a shape, frozen at a shape close by.
+class _IndirectLight:
+    """Shadows and bounces in one view of a shape, taken from a shape nearby.
 
     Attributes:
-        reshading: What keeps the frozen shapes.
-        example: Number of the example.
-        number: Number of the object.
+        reshading: Keeps the transport of shapes.
+        example: Index of the example.
+        number: Index of the object.
         camera: The camera.
-        fragments: The samples of the view, in P pixels.
-        positions: Positions of the shape's vertices, shape (V, 3).
-        is_kept: Whether the camera will come back.
+        fragments: The S samples of the shape, in P pixels.
+        positions: Vertices of the shape, shape (V, 3).
+        is_kept: Whether the view is kept for further calls.
     """
 
     reshading: Reshading
@@ -248,8 +365,10 @@ class _FrozenView:
     is_kept: bool
 
     def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
-        """Return the radiance (3, P) that they add, with albedo (S, 3) in light (size, 3)."""
-        frozen = self.reshading.transport_near(self.example, self.number, self.camera, self.positions)
+        """Return the added radiance (3, P), with albedo (S, 3), in light (K, 3)."""
+        frozen = self.reshading.transport_near(
+            self.example, self.number, self.camera, self.positions
+        )
         added = frozen.radiance(self.camera, self.fragments, albedo, light)
         if not self.is_kept:
             del frozen.views[self.camera]
