@@ -1,6 +1,7 @@
-"""Effects of a camera on images, and patterns of a projector beneath them, drawn for each example."""
+"""Random effects of a camera on images, and random patterns of a projector on what it sees."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,7 +11,10 @@ from augment.settings import CameraEffectSettings
 from renderer.image import clamp, decode, encode
 from renderer.settings import ImageSettings
 
-BLUR_RADIUS = 3  # pixels to either side that a blur averages over
+# The blur of a pixel averages over this number of pixels to each side.
+BLUR_RADIUS = 3
+# The smallest standard deviation of the blur, in pixels. It leaves images as they are.
+MIN_BLUR = 1e-3
 
 
 def draw_camera_effects(
@@ -21,35 +25,90 @@ def draw_camera_effects(
     device: torch.device | str = "cpu",
     points: Tensor | None = None,
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """Random effects of `count` examples: a differentiable function of images (A, V, 3, size, size) and their examples
-    (A,). Projected patterns and white balance scale the linear light of object and background. points: (2, count, size,
-    size), where in a pattern, which spans [-1, 1], each pixel is; by default, as if projected by the camera."""
+    """Draw the effects of a camera and a projected pattern for each example.
+
+    Patterns and white balance scale the linear light of object and background.
+    The blur and then the noise follow.
+
+    Args:
+        settings: Ranges of the effects.
+        count: Number of examples.
+        image: Size and encoding of the images.
+        draws: Generator of the random numbers.
+        device: Device of the images.
+        points: Point of the pattern that each pixel shows, in [-1, 1], shape
+            (2, count, size, size). By default, the pattern fills the image, as
+            if the camera projected it.
+
+    Returns:
+        A differentiable function. It takes images (A, V, 3, size, size), with
+        V views of each of A examples, and the indices of these examples (A,).
+        It returns the changed images.
+
+    Example:
+        >>> draws = torch.Generator().manual_seed(0)
+        >>> effects = draw_camera_effects(CameraEffectSettings(), 5, ImageSettings(8), draws)
+        >>> effects(torch.rand(2, 1, 3, 8, 8), torch.tensor([0, 4])).shape
+        torch.Size([2, 1, 3, 8, 8])
+    """
     patterns = draw_patterns(count, image.size, draws, points)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
-    plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
-    light = torch.where(plain, 1.0, fill + (1 - fill) * patterns)
+    is_plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
+    projected = torch.where(is_plain, 1.0, fill + (1 - fill) * patterns)
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
-    sigma = settings.blur * torch.rand(count, generator=draws)
-    deviation = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noises = deviation * torch.randn(count, 3, image.size, image.size, generator=draws)
-    gains, blur, noise = (drawn.to(device) for drawn in (light * 2**stops, sigma, noises))
-
-    def effects(images: Tensor, examples: Tensor) -> Tensor:
-        gained = decode(images, image.encoding) * gains[examples, None]
-        blurred = encode(clamp(_blurred(gained, blur[examples])), image.encoding)
-        return clamp(blurred + noise[examples, None])
-
-    return effects
+    blurs = settings.blur * torch.rand(count, generator=draws)
+    deviations = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
+    noises = deviations * torch.randn(count, 3, image.size, image.size, generator=draws)
+    return _CameraEffects(
+        gains=(projected * 2**stops).to(device),
+        blurs=blurs.to(device),
+        noises=noises.to(device),
+        encoding=image.encoding,
+    )
 
 
-def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
-    """Each example (V, 3, size, size) convolved with its Gaussian, by rows and by columns; the border is repeated."""
-    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
-    weights = torch.exp(-0.5 * (offsets / sigma.clamp(min=1e-3)[:, None]) ** 2)  # (A, taps)
-    weights = (weights / weights.sum(1, keepdim=True)).to(images)
+@dataclass(frozen=True, eq=False)
+class _CameraEffects:
+    """Effects of a camera on the images of E examples.
+
+    Attributes:
+        gains: Factors of the linear light, shape (E, 3, size, size).
+        blurs: Standard deviations of the blur in pixels, shape (E,).
+        noises: Values that are added to the images, shape
+            (E, 3, size, size).
+        encoding: Encoding of the images.
+    """
+
+    gains: Tensor
+    blurs: Tensor
+    noises: Tensor
+    encoding: str
+
+    def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
+        """Change images (A, V, 3, size, size) of the examples with these indices (A,)."""
+        gained = decode(images, self.encoding) * self.gains[examples, None]
+        blurred = _blur(gained, self.blurs[examples])
+        encoded = encode(clamp(blurred), self.encoding)
+        return clamp(encoded + self.noises[examples, None])
+
+
+def _blur(images: Tensor, deviations: Tensor) -> Tensor:
+    """Convolve images (A, V, 3, size, size) with Gaussians of A standard deviations in pixels.
+
+    The pixels of the border are repeated beyond the border.
+    """
     size = images.shape[-1]
-    columns = (torch.arange(size, device=images.device)[:, None] + offsets).clamp(0, size - 1)  # (size, taps)
-    matrix = images.new_zeros(len(images), size, size)
-    matrix.scatter_add_(2, columns.expand(len(images), -1, -1), weights[:, None].expand(-1, size, -1))
-    return torch.einsum("aij,avcjk,alk->avcil", matrix, images, matrix)
+    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
+    weights = torch.exp(-0.5 * (offsets / deviations.clamp(min=MIN_BLUR)[:, None]) ** 2)
+    weights = (weights / weights.sum(1, keepdim=True)).to(images)
+    pixels = torch.arange(size, device=images.device)
+    neighbors = (pixels[:, None] + offsets).clamp(0, size - 1)
+    # The matrix (size, size) of an example blurs along one axis of its images.
+    matrices = images.new_zeros(len(images), size, size)
+    matrices.scatter_add_(
+        2,
+        neighbors.expand(len(images), -1, -1),
+        weights[:, None].expand(-1, size, -1),
+    )
+    return torch.einsum("aij,avcjk,alk->avcil", matrices, images, matrices)
