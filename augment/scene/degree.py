@@ -1,4 +1,8 @@
-"""The degree of a scene's light, which the smoothest surface that a run can reach decides."""
+"""Choose the degree of a scene's lighting: as high as its smoothest surface needs.
+
+The lighting is a sum of spherical harmonics up to a degree. The smoother a surface is, the sharper
+are its highlights, and the higher is the degree that shows them.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +30,25 @@ from renderer.surface.microfacets import degree_for, highlight_error
 if TYPE_CHECKING:
     from augment.settings import VarnishSettings
 
-NOTICED = 0.05  # irradiance error, of the rms irradiance, from which on it is told
-SHADED = 2  # degree: of lower ones, irradiance of a point source is off by 0.42 or more, of 2 by 0.09
-COMPARED = 8  # degree, beyond which irradiance of no light is off by NOTICED
+# A warning reports errors of the irradiance above this fraction of the rms irradiance.
+NOTICED = 0.05
+# The lowest degree that shades the sides of an object about right. The irradiance of a point
+# source is off by 0.09 for this degree, and by 0.42 or more for lower degrees.
+SHADED = 2
+# Beyond this degree, the irradiance of no lighting is off by more than `NOTICED`.
+COMPARED = 8
+# The roughness that stands for surfaces without gloss.
+MATTE = 1.0
 
 
 class Smoothest(NamedTuple):
-    """The least roughness that a run can reach, 1 where nothing has gloss; of which object; and what this does."""
+    """The smoothest surface that a run can reach.
+
+    Attributes:
+        roughness: Its roughness. It is 1 if no surface has gloss.
+        name: Name of the object that has this surface.
+        verb: "has", or "can reach" if an attack or a variation makes it.
+    """
 
     roughness: float
     name: str
@@ -40,76 +56,95 @@ class Smoothest(NamedTuple):
 
     @property
     def gloss(self) -> float | None:
-        """The roughness of the smoothest gloss; None where nothing has gloss."""
-        return self.roughness if self.roughness < 1 else None
+        """The roughness, or None if no surface has gloss."""
+        return self.roughness if self.roughness < MATTE else None
 
     @property
     def degree(self) -> int:
-        """The degree of light that shows its gloss; 0 without gloss."""
-        return degree_for(self.roughness) if self.roughness < 1 else 0
+        """The degree of lighting that shows the gloss, or 0 if no surface has gloss."""
+        return degree_for(self.roughness) if self.roughness < MATTE else 0
 
     def warn(self, choice: str, degree: int) -> None:
-        """Warn of the error that a choice of a lower degree makes in highlights."""
-        told = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
-        takes = f"which takes light of degree {self.degree}"
+        """Warn of the error of highlights in lighting of a degree that is too low.
+
+        Args:
+            choice: Beginning of a clause about the degree, such as "degree=6".
+            degree: The degree.
+        """
+        surface = f"{self.name} {self.verb} gloss of roughness {self.roughness:.2g}"
+        needed = f"which takes light of degree {self.degree}"
         error = highlight_error(degree, self.roughness)
-        least = highlight_error(self.degree, self.roughness)
-        shows = f"shows the highlight of a point of light off by {error:.0%} (rms) instead of {least:.0%}"
-        warnings.warn(f"{told}, {takes}: {choice} {shows}", stacklevel=4)
+        least_error = highlight_error(self.degree, self.roughness)
+        errors = f"off by {error:.0%} (rms) instead of {least_error:.0%}"
+        message = f"{surface}, {needed}: {choice} shows the highlight of a point of light {errors}"
+        warnings.warn(message, stacklevel=4)
 
 
 def reached_gloss(
-    objects: Iterable[SceneObject], material: MaterialSettings | None = None, varnish: VarnishSettings | None = None
+    objects: Iterable[SceneObject],
+    material: MaterialSettings | None = None,
+    varnish: VarnishSettings | None = None,
 ) -> Smoothest:
-    """Find the least roughness among the faces of objects, props included, and of what a run makes of them.
+    """Find the smoothest surface of all objects, also after an attack and a variation.
 
     Args:
-        objects: Those of a scene, hard negatives included.
-        material: Of an attack on the material, which lowers the roughness as far as its norm-ball allows.
-        varnish: From which the gloss of the objects is drawn anew.
+        objects: The objects of a scene, which include hard negatives. Their
+            props count, too.
+        material: Settings of an attack on the material. It lowers the roughness
+            as far as its norm ball allows.
+        varnish: Settings from which the gloss of the objects is drawn.
 
     Returns:
-        The least roughness and the object that has or reaches it.
+        The lowest roughness and the object that has or reaches it.
     """
-    least = Smoothest(1.0, "")
+    least = Smoothest(MATTE, "")
     for item in objects:
-        now = smoothest(item.mesh)
-        least = min(least, Smoothest(now, item.name))
+        initial = smoothest(item.mesh)
+        least = min(least, Smoothest(initial, item.name))
         reached = _reached_roughness(item, material, varnish)
-        if reached < now:
+        if reached < initial:
             least = min(least, Smoothest(reached, item.name, "can reach"))
     return least
 
 
-def _reached_roughness(item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None) -> float:
-    """The least roughness of an object's own faces, whatever a variation draws and an attack does."""
+def _reached_roughness(
+    item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None
+) -> float:
+    """Return the lowest roughness that a variation and an attack give to an object's own faces."""
+    is_varnished = varnish is not None and any(varnish.strength)
+    is_attacked = material is not None and any(
+        (material.roughness, material.metallic, material.strength)
+    )
+    if not is_varnished and not is_attacked:
+        return MATTE
     surface = initial_surface(item)
     roughness = surface.face_gloss[surface.object_mask, ROUGHNESS]
-    varnished = varnish is not None and any(varnish.strength)
-    attacked = material is not None and any((material.roughness, material.metallic, material.strength))
-    if varnish is not None and varnished:
+    if varnish is not None and is_varnished:
         roughness = torch.full_like(roughness, varnish.roughness[0])
-    if material is not None and attacked and material.roughness:
+    if material is not None and is_attacked and material.roughness:
         mean = float(roughness.mean())
-        reach = math.inf if material.radius is None else material.radius * material.roughness
-        change = max(mean - reach, MIN_ROUGHNESS) - mean
+        radius = math.inf
+        if material.radius is not None:
+            radius = material.radius * material.roughness
+        change = max(mean - radius, MIN_ROUGHNESS) - mean
         roughness = (roughness + min(change, 0.0)).clamp(min=0)
-    if not varnished and not attacked:
-        return 1.0
-    mesh = select_faces(item.mesh, slice(item.own))
-    gloss = Gloss(roughness, textured=not varnished)  # of strength 1, since it may become so
-    return smoothest(gloss.on(mesh))
+    # The strength of this gloss is 1, because attacks and variations can raise it to 1.
+    gloss = Gloss(roughness, textured=not is_varnished)
+    own_mesh = select_faces(item.mesh, slice(item.own))
+    return smoothest(gloss.on(own_mesh))
 
 
 def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
-    """The degree of a scene's light: the given one, or the least that shows all gloss, at least 6.
+    """Choose the degree of a scene's lighting.
 
-    A warning tells where gloss takes more than 6, than what is given or than there is memory for.
+    Without a given degree, it is the lowest that shows all gloss, and at least
+    6. Warnings report a degree above 6, a given degree that is too low, and a
+    degree that memory limits.
 
     Args:
         reached: The smoothest surface of the run.
-        given: The degree that was asked for.
-        pixels: How many pixels the views of all objects have.
+        given: The degree that the user asked for, or None.
+        pixels: Number of pixels of the views of all objects.
 
     Returns:
         The degree, from 0 to 40.
@@ -124,15 +159,19 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
     if reached.degree > given:
         reached.warn(f"degree={given}", given)
     if given < SHADED:
-        sides = "shades all sides of an object alike" if given == 0 else "shades no side of an object right"
-        cut = "so do attacks and variations of the light, which keep to it"
-        advice = f"give {SHADED} or more, or leave degree out"
-        warnings.warn(f"degree={given} {sides} in light that is not even, and {cut}: {advice}", stacklevel=3)
+        fault = "shades no side of an object right"
+        if given == 0:
+            fault = "shades all sides of an object alike"
+        message = (
+            f"degree={given} {fault} in light that is not even, and so do attacks and variations "
+            f"of the light, which keep to this degree: give {SHADED} or more, or leave degree out"
+        )
+        warnings.warn(message, stacklevel=3)
     return given
 
 
 def _affordable_degree(reached: Smoothest, pixels: int) -> int:
-    """The degree that shows all gloss, or the highest from 6 on for whose operators there is memory."""
+    """Return the degree that shows all gloss, or the highest from 6 on that fits in memory."""
     degree = max(DEGREE, reached.degree)
     cpu = torch.device("cpu")
     while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):
@@ -141,48 +180,61 @@ def _affordable_degree(reached: Smoothest, pixels: int) -> int:
 
 
 def warn_of_cut_light(name: str, light: Tensor) -> None:
-    """Warn where cutting a named light off after a low degree changes its irradiance by more than 5 %.
+    """Warn if a low degree changes the irradiance of a named lighting by more than 5 %.
 
-    Measured is the rms over normals and channels of the error of irradiance, relative to the rms irradiance of the
-    light to degree 8, by `irradiance_error`.
+    The error is the rms difference to the irradiance of the same lighting of
+    degree 8, over normals and channels, relative to the rms irradiance of the
+    latter (`irradiance_error`).
 
     Args:
-        name: As for `load_light`, which has no more harmonics than this degree where it is not a map's file.
-        light: What was loaded, of shape ((degree + 1)², 3).
+        name: Name of the lighting, as for `load_light`. A lighting that is not
+            the file of a map has no harmonics above its own degree.
+        light: The coefficients that were loaded, shape ((degree + 1)², 3).
     """
     degree = math.isqrt(len(light)) - 1
-    if degree < COMPARED // 2:
-        error = float(irradiance_error(light, load_light(name, COMPARED)))
-        if error > NOTICED:
-            told = f"light {name} of degree={degree} has an irradiance that is off by {error:.0%} (rms over normals)"
-            warnings.warn(f"{told}: give a higher degree", stacklevel=3)
+    if degree >= COMPARED // 2:
+        return
+    error = float(irradiance_error(light, load_light(name, COMPARED)))
+    if error > NOTICED:
+        fault = f"has an irradiance that is off by {error:.0%} (rms over normals)"
+        message = f"light {name} of degree={degree} {fault}: give a higher degree"
+        warnings.warn(message, stacklevel=3)
 
 
 def with_needed_degree(
-    scene: Scene, material: MaterialSettings | None = None, varnish: VarnishSettings | None = None
+    scene: Scene,
+    material: MaterialSettings | None = None,
+    varnish: VarnishSettings | None = None,
 ) -> Scene:
-    """The scene in light of the degree that a run needs, where its own is lower and `build_scene` chose it.
+    """Raise the degree of a scene's lighting to what an attack and a variation need.
+
+    Only a degree that `build_scene` chose is raised. If the user gave the
+    degree or the coefficients, a warning reports that the degree is too low.
 
     Args:
-        scene: With `lights_of_degree`, unless it was not built by name, or with a given degree. Otherwise, a warning
-            tells of a light that the scene's degree cuts off.
-        material: Of an attack.
-        varnish: Of a variation.
+        scene: The scene.
+        material: Settings of an attack on the material.
+        varnish: Settings from which the gloss of the objects is drawn.
 
     Returns:
-        The scene itself, where its degree is enough or nothing else is known.
+        A scene with more coefficients of the same lighting, or the given scene.
     """
-    reached, degree = reached_gloss(scene.objects, material, varnish), harmonics_of(scene.basis).degree
-    pixels = sum(map(len, scene.cameras)) * scene.settings.size**2
-    needed = _affordable_degree(reached, pixels)
+    reached = reached_gloss(scene.objects, material, varnish)
+    degree = harmonics_of(scene.basis).degree
+    view_count = sum(len(cameras) for cameras in scene.cameras)
+    needed = _affordable_degree(reached, view_count * scene.settings.size**2)
     if needed <= degree:
         return scene
     if scene.lights_of_degree is not None:
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss)
-        if scene.lights.shape[1:] == built.shape and (scene.lights == built.to(scene.lights)).all():
+        has_same_shape = scene.lights.shape[1:] == built.shape
+        # Lights that were changed after `build_scene` are known to this degree only.
+        if has_same_shape and (scene.lights == built.to(scene.lights)).all():
             reached.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, reached.gloss)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    if scene.lights[:, degree**2 : (degree + 1) ** 2].any():  # it may go on
+    # Lighting without coefficients of the highest degree is complete.
+    highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
+    if highest_band.any():
         reached.warn(f"degree={degree}", degree)
     return scene
