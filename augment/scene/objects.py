@@ -1,4 +1,4 @@
-"""Objects of a scene: meshes from files or solids, each with the name of its class, props and a table."""
+"""Load the objects of a scene: a mesh with the name of its class, props beside it and a table."""
 
 from __future__ import annotations
 
@@ -15,15 +15,25 @@ from renderer.geometry.mesh import Mesh, concatenate, normalize, select_faces, s
 from renderer.geometry.shapes import solid
 from renderer.surface.gloss import Gloss
 
-TABLE, RIM = 1.2, 0.2  # half the width of a table, at least; and how far it reaches beyond everything
+# The smallest distance from the middle of a table to its sides, in world units.
+MIN_TABLE_REACH = 1.2
+# The distance that a table reaches beyond object and props, in world units.
+TABLE_MARGIN = 0.2
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A mesh that spans [-1, 1], the name of its class, a factor of its albedo, and its own name in messages.
+    """An object of a scene, with its props and its table.
 
-    The mesh has the faces of props and table, whose albedo is multiplied, too, after the object's own. own: the number
-    of the object's faces, None where all are. props: their meshes, on z = 0. ground: the table's color, or None.
+    Attributes:
+        label: Name of its class.
+        mesh: A mesh whose first faces are those of the object, which spans
+            [-1, 1]. The faces of props and table follow.
+        albedo_scale: Factor of the albedo of all faces.
+        name: Name of the object in messages.
+        own: Number of the object's own faces. None if all faces are its own.
+        props: Meshes of the props, which stand on z = 0.
+        ground: Color of the table, or None without a table.
     """
 
     label: str
@@ -36,131 +46,241 @@ class SceneObject:
 
     @property
     def own_faces(self) -> np.ndarray:
-        """(F,) bool: the object's, not those of props and table."""
-        return np.arange(len(self.mesh.faces)) < (len(self.mesh.faces) if self.own is None else self.own)
+        """Whether each face is the object's own, not a prop's or the table's. Shape (F,)."""
+        face_count = len(self.mesh.faces)
+        own_count = face_count if self.own is None else self.own
+        return np.arange(face_count) < own_count
 
     @property
     def own_vertices(self) -> np.ndarray:
-        """(V,) bool: all but those of props and table."""
-        others = self.mesh.faces[~self.own_faces]
-        return ~np.isin(np.arange(len(self.mesh.vertices)), others)
+        """Whether each vertex is in no face of props and table. Shape (V,)."""
+        other_vertices = self.mesh.faces[~self.own_faces]
+        return ~np.isin(np.arange(len(self.mesh.vertices)), other_vertices)
 
     @cached_property
     def radius(self) -> float:
-        """Of a ball around the origin that holds the whole mesh, props and table included."""
-        return float(np.linalg.norm(self.mesh.vertices, axis=1)[self.mesh.faces].max())
+        """The largest distance of a vertex from the origin, with props and table."""
+        distances = np.linalg.norm(self.mesh.vertices, axis=1)
+        return float(distances[self.mesh.faces].max())
 
     @property
     def lowest(self) -> float:
-        """The height of the ground that it stands on."""
-        return float(self.mesh.vertices[:, 2][self.mesh.faces].min())
+        """The height z of the lowest vertex, where a table is."""
+        heights = self.mesh.vertices[:, 2]
+        return float(heights[self.mesh.faces].min())
 
     def joined(self, others: Sequence[Mesh]) -> SceneObject:
-        """The object with other meshes in its own."""
+        """Append other meshes to the mesh of the object.
+
+        Args:
+            others: The other meshes. They are not the object's own.
+
+        Returns:
+            The object with one mesh of all faces.
+        """
         if not others:
             return self
-        return replace(self, mesh=concatenate([self.mesh, *others]), own=int(self.own_faces.sum()))
+        mesh = concatenate([self.mesh, *others])
+        return replace(self, mesh=mesh, own=int(self.own_faces.sum()))
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """The mesh, subdivided until it has more than `vertices`, and normalized; with its props.
+    """Load an object and its props.
 
-    InputError: as `load_mesh` and `solid`.
+    Args:
+        item: Settings of the object.
+        vertices: The object's mesh is subdivided until it has more vertices
+            than this number.
+
+    Returns:
+        The object, scaled and moved to span [-1, 1].
+
+    Raises:
+        InputError: If a mesh cannot be loaded, has colors besides those of the
+            settings, or is a metal without a color.
+
+    Example:
+        >>> load_object(ObjectSettings("solid:orange", "orange")).label
+        'orange'
     """
     mesh = normalize(subdivide(_load(item), vertices))
-    return with_props(SceneObject(item.label, mesh, item.albedo_scale, item.mesh), [_prop(prop) for prop in item.props])
+    loaded = SceneObject(item.label, mesh, item.albedo_scale, item.mesh)
+    return with_props(loaded, [_load_prop(prop) for prop in item.props])
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """The object among meshes that stand on z = 0, moved to its ground."""
-    height = np.array([0, 0, item.lowest])
-    raised = [(prop.vertices + height).astype(np.float32) for prop in props]  # rounded as the object is
-    meshes = [replace(prop, vertices=vertices.astype(np.float64)) for prop, vertices in zip(props, raised, strict=True)]
-    return replace(item.joined(meshes), props=props)
+    """Put props beside an object.
+
+    Args:
+        item: The object.
+        props: Meshes that stand on z = 0. They are moved to the height of the
+            object's lowest vertex.
+
+    Returns:
+        The object with its props.
+    """
+    offset = np.array([0, 0, item.lowest])
+    raised = []
+    for prop in props:
+        # The vertices are rounded as `normalize` rounds those of the object.
+        vertices = (prop.vertices + offset).astype(np.float32)
+        raised.append(replace(prop, vertices=vertices.astype(np.float64)))
+    return replace(item.joined(raised), props=props)
 
 
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """The object on a table under everything, as one mesh; color: RGB, sRGB-encoded in [0, 1], or None for no table.
+    """Put a table under an object and its props.
 
-    The table's albedo is scaled, too. InputError: not a color.
+    Args:
+        item: The object. Its `albedo_scale` applies to the table, too.
+        color: Red, green and blue of the table, sRGB-encoded in [0, 1]. None
+            for no table.
+
+    Returns:
+        The object with its table.
+
+    Raises:
+        InputError: If the color is none.
     """
     if color is None:
         return item
     require_color("ground", color)
-    across = item.mesh.vertices[np.unique(item.mesh.faces), :2]
-    (left, near), (right, far) = np.minimum(across.min(0) - RIM, -TABLE), np.maximum(across.max(0) + RIM, TABLE)
-    corners = [[x, y, item.lowest] for x, y in ((left, near), (right, near), (right, far), (left, far))]
+    used_vertices = np.unique(item.mesh.faces)
+    horizontal = item.mesh.vertices[used_vertices, :2]
+    left, near = np.minimum(horizontal.min(0) - TABLE_MARGIN, -MIN_TABLE_REACH)
+    right, far = np.maximum(horizontal.max(0) + TABLE_MARGIN, MIN_TABLE_REACH)
+    corners = [
+        [left, near, item.lowest],
+        [right, near, item.lowest],
+        [right, far, item.lowest],
+        [left, far, item.lowest],
+    ]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
     return replace(item.joined([table]), ground=color)
 
 
 def another_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Another instance of a solid named without a seed, with the same props and table; of others, the object itself."""
-    kind, *rest = item.name.split(":")
-    if kind != "solid" or len(rest) != 1:
+    """Replace a solid by another instance of its class.
+
+    Args:
+        item: The object. Only a solid whose name has no seed is replaced.
+        seed: Seed of the instance.
+
+    Returns:
+        The new object with the same gloss, props and table, or the given
+        object.
+    """
+    kind, *name_and_seed = item.name.split(":")
+    if kind != "solid" or len(name_and_seed) != 1:
         return item
-    mesh, gloss = normalize(solid(rest[0], seed)), item.mesh.gloss
-    gloss = None if gloss is None else gloss[:1].repeat(len(mesh.faces), axis=0)  # of a solid, all faces have the same
+    mesh = normalize(solid(name_and_seed[0], seed))
+    gloss = item.mesh.gloss
+    if gloss is not None:
+        # All faces of a solid have the same gloss.
+        gloss = gloss[:1].repeat(len(mesh.faces), axis=0)
     return _with_mesh(item, replace(mesh, gloss=gloss))
 
 
 def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
-    """The object after a rotation (3, 3) about the origin, with the same props and table at its new lowest point."""
+    """Rotate an object about the origin.
+
+    Args:
+        item: The object.
+        rotation: Rotation matrix, shape (3, 3).
+
+    Returns:
+        The rotated object. The same props and table are at the height of its
+        new lowest vertex.
+    """
     mesh = select_faces(item.mesh, slice(item.own))
-    vertices = (mesh.vertices @ rotation.T).astype(np.float32)  # rounded as by `normalize`
+    # The vertices are rounded as `normalize` rounds them.
+    vertices = (mesh.vertices @ rotation.T).astype(np.float32)
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 
 
 def varnished(item: SceneObject, gloss: Gloss) -> SceneObject:
-    """The object with this gloss in place of its own, and with the same props and table."""
-    return _with_mesh(item, gloss.on(select_faces(item.mesh, slice(item.own))))
+    """Replace the gloss of an object.
+
+    Args:
+        item: The object.
+        gloss: Its new gloss. Props and table keep theirs.
+
+    Returns:
+        The object with the new gloss.
+    """
+    own_mesh = select_faces(item.mesh, slice(item.own))
+    return _with_mesh(item, gloss.on(own_mesh))
 
 
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
-    """The same props and table with another object's mesh."""
-    return on_ground(with_props(replace(item, mesh=mesh, own=None), item.props), item.ground)
+    """Replace the object's own mesh, and keep its props and its table."""
+    alone = replace(item, mesh=mesh, own=None)
+    return on_ground(with_props(alone, item.props), item.ground)
 
 
-def _prop(item: PropSettings) -> Mesh:
-    """Turned, scaled and moved to its position on z = 0."""
-    mesh, angle = normalize(_load(item)), math.radians(item.azimuth)
-    turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+def _load_prop(item: PropSettings) -> Mesh:
+    """Load the mesh of a prop, turn, scale and move it, and put it on z = 0."""
+    mesh = normalize(_load(item))
+    angle = math.radians(item.azimuth)
+    cosine = math.cos(angle)
+    sine = math.sin(angle)
+    # This matrix is transposed, because it multiplies rows from the right.
+    turn = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     turned = item.scale * mesh.vertices @ turn
-    lowest = turned[np.unique(mesh.faces), 2].min()
+    used_vertices = np.unique(mesh.faces)
+    lowest = turned[used_vertices, 2].min()
     return replace(mesh, vertices=turned + np.array([*item.at, -lowest]), skin=None)
 
 
 def _load(item: MeshSettings) -> Mesh:
-    mesh = _colored(item)
+    """Load a mesh with the color and the gloss of its settings."""
+    mesh = _load_with_color(item)
     if item.gloss is None:
         return mesh
-    mesh = mesh if item.gloss == "file" else _gloss(item.gloss).on(mesh)
-    metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
-    if metal and item.color is None and not mesh.textures and (mesh.corner_colors == 1).all():
-        raise InputError(f"{item.mesh} is a metal without a color: give color=[red,green,blue], or a metallic of 0")
+    if item.gloss != "file":
+        mesh = _as_gloss(item.gloss).on(mesh)
+    is_metal = mesh.gloss is not None and mesh.gloss[:, 1].any()
+    if is_metal and item.color is None and not _has_colors(mesh):
+        remedy = "give color=[red,green,blue], or a metallic of 0"
+        raise InputError(f"{item.mesh} is a metal without a color: {remedy}")
     return mesh
 
 
-def _gloss(values: Sequence[float]) -> Gloss:
-    """Of [roughness, metallic, strength], or the first of them."""
-    roughness, *others = map(float, values)
-    return Gloss(roughness, *others)
-
-
-def _colored(item: MeshSettings) -> Mesh:
+def _load_with_color(item: MeshSettings) -> Mesh:
+    """Load a mesh file or build a solid, and color it as its settings say."""
     kind, _, name = item.mesh.partition(":")
     if kind == "solid":
-        name, _, seed = name.partition(":")
-        try:
-            mesh = solid(name, int(seed or 0))
-        except ValueError as error:  # of the name or the seed
-            raise InputError(f"{item.mesh}: {error}") from error
+        mesh = _build_solid(item.mesh, name)
     else:
-        from renderer.io.meshes import load_mesh  # trimesh takes half a second
+        # The import of trimesh takes half a second.
+        from renderer.io.meshes import load_mesh
 
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     if item.color is None:
         return mesh
-    if mesh.textures or (mesh.corner_colors != 1).any():
-        raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
-    return replace(Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color)), gloss=mesh.gloss, skin=mesh.skin)
+    if _has_colors(mesh):
+        remedy = "leave color out; albedo_scale brightens or dims them"
+        raise InputError(f"{item.mesh} brings colors of its own: {remedy}")
+    colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
+    return replace(colored, gloss=mesh.gloss, skin=mesh.skin)
+
+
+def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
+    """Build a solid, such as orange:3, whose seed is 0 by default."""
+    name, _, seed = name_and_seed.partition(":")
+    try:
+        return solid(name, int(seed or 0))
+    # The name is unknown, or the seed is no number.
+    except ValueError as error:
+        raise InputError(f"{mesh_name}: {error}") from error
+
+
+def _has_colors(mesh: Mesh) -> bool:
+    """Return whether a mesh has textures, or vertex colors other than white."""
+    return bool(mesh.textures) or bool((mesh.corner_colors != 1).any())
+
+
+def _as_gloss(values: Sequence[float]) -> Gloss:
+    """Convert [roughness, metallic, strength], or the first of them, to a gloss."""
+    roughness, *others = [float(value) for value in values]
+    return Gloss(roughness, *others)
