@@ -1,9 +1,9 @@
-"""A scene from meshes in one call, its backgrounds, and the settings of scene, renderer and local lights."""
+"""Build a scene from meshes, names of lightings and files of backgrounds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
@@ -17,13 +17,8 @@ from augment.scene.degree import degree_of_scene, reached_gloss, warn_of_cut_lig
 from augment.scene.objects import SceneObject, load_object, on_ground
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
-from renderer.camera import orbit_cameras
-from renderer.errors import (
-    InputError,
-    as_device,
-    describe,
-    require_bounded,
-)
+from renderer.camera import Camera, orbit_cameras
+from renderer.errors import InputError, as_device, describe, require_bounded
 from renderer.geometry.mesh import Mesh, normalize, require_mesh, subdivide
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Basis, LocalBasis, with_local_lights
@@ -38,9 +33,11 @@ if TYPE_CHECKING:
     from augment.attacks.settings import AttackSettings
     from augment.settings import VariationSettings
 
-
+# What a mesh is given as: a file, solid:NAME or a mesh.
 Shown = str | Path | Mesh
-SCENE = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
+# The settings of a scene that are options of `build_scene`.
+SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
+RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 
 def build_scene(
@@ -56,62 +53,100 @@ def build_scene(
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> Scene:
-    """Every mesh from a circle of views over every background, at `size` pixels per side.
+    """Build a scene of every mesh, from a circle of cameras, in front of every background.
 
-    meshes: pairs of a file, solid:NAME or `Mesh`, and the name of its class; or `ObjectSettings`. shared: the views of
-    an example share one light, shape or color; otherwise each view is an example. scene, renderer: all further choices
-    (their own `meshes` and `views` are ignored). attack, vary: what the scene will go through, by whose least roughness
-    the degree of the light is chosen. options: fields of scene or renderer, which take precedence.
-    InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
+    Args:
+        meshes: Pairs of a mesh and the name of its class, or `ObjectSettings`.
+            A mesh is a file, solid:NAME or a `Mesh`.
+        size: Pixels per side of the images.
+        views: Number of cameras on the circle.
+        shared: Whether the views of an object in front of a background are one
+            example, whose lighting, shape and colors an attack changes for all
+            views. By default, each view is an example.
+        scene: Further settings of the scene. Its `meshes` and `views` are
+            ignored.
+        renderer: Settings of the renderer.
+        attack: Settings of the attack that will follow. The degree of the
+            lighting suits the smoothest surface that this attack can reach.
+        vary: Settings of the variation that will follow, for the same reason.
+        device: Device of the images.
+        options: Fields of `SceneSettings` or `RendererSettings`, which replace
+            those of `scene` and `renderer`.
 
-    >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
-    >>> scene = build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], polar=70.0, samples=1)
-    >>> len(scene), scene.labels[0]
-    (12, 'orange')
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: If an argument has the wrong type, is unknown or out of
+            bounds, if a file is missing, or if the renders do not fit in
+            memory.
+
+    Example:
+        >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
+        >>> scene = build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], samples=1)
+        >>> len(scene), scene.labels[0]
+        (12, 'orange')
     """
     require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
     require_kind("renderer", renderer, RendererSettings | None, "RendererSettings(...) or None")
     require_flag("shared", shared)
     require_whole("views", views)
     ImageSettings(size)
-    known = SCENE | {item.name for item in fields(RendererSettings)}
-    if unknown := sorted(options.keys() - known):
-        raise InputError(f"{unknown[0]} is no option of build_scene: choose from {', '.join(sorted(known))}")
-    meshes = _as_meshes(meshes)
-    of_scene = {name: options.pop(name) for name in SCENE & options.keys()}
-    shown = replace(scene or SceneSettings(), views=views, **of_scene)
-    drawn = replace(renderer or RendererSettings(), **options)
-    read = (_object(member, shown.vertices) for member in progress(meshes, "reading meshes"))
-    objects = [on_ground(item, shown.ground) for item in read]
-    environment: Any = shown.light
-    named = isinstance(environment, str | Path)
+    _require_known(options)
+    members = _as_meshes(meshes)
+    scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
+    renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
+    scene_settings = replace(scene or SceneSettings(), views=views, **scene_options)
+    renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
+    objects = []
+    for member in progress(members, "reading meshes"):
+        item = _load_member(member, scene_settings.vertices)
+        objects.append(on_ground(item, scene_settings.ground))
+    environment: Any = scene_settings.light
+    is_named = isinstance(environment, str | Path)
     degree = None
-    if named:
-        reached = reached_gloss(objects, attack.material if attack else None, vary.gloss if vary else None)
-        degree = degree_of_scene(reached, shown.degree, views * len(objects) * size**2)
+    if is_named:
+        material = attack.material if attack else None
+        reached = reached_gloss(objects, material, vary.gloss if vary else None)
+        pixels = views * len(objects) * size**2
+        degree = degree_of_scene(reached, scene_settings.degree, pixels)
         environment = load_light(environment, degree, reached.gloss)
-        warn_of_cut_light(str(shown.light), environment)
+        warn_of_cut_light(str(scene_settings.light), environment)
     else:
         environment = as_tensor("light", environment)
+        # This call checks the shape.
         degree_of(environment)
         require_bounded(light=environment)
-    basis, lights = _lights(shown, environment, degree)
-    fov = None if shown.fov is None else math.radians(shown.fov)
+    basis, lights = _build_lights(scene_settings, environment, degree)
+    # A named lighting can be loaded again with a higher degree, unless the user chose the degree.
+    lights_of_degree = None
+    if is_named and scene_settings.degree is None:
+        lights_of_degree = partial(_build_lights, scene_settings, scene_settings.light)
+    rasterizer = renderer_settings.rasterizer
     return Scene.grid(
         objects,
-        orbit_cameras(views, shown.width, math.radians(shown.polar), math.radians(shown.azimuth), fov),
-        load_backgrounds(shown.backgrounds, size),
+        _place_cameras(scene_settings),
+        load_backgrounds(scene_settings.backgrounds, size),
         lights.to(as_device(device)),
-        drawn.image(size),
-        choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
+        renderer_settings.image(size),
+        choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
         shared=shared,
         basis=basis,
-        lights_of_degree=partial(_lights, shown, shown.light) if named and shown.degree is None else None,
+        lights_of_degree=lights_of_degree,
     )
 
 
+def _require_known(options: Mapping[str, Any]) -> None:
+    """Check that all options are fields of the settings of a scene or of the renderer."""
+    known = SCENE_OPTIONS | RENDERER_OPTIONS
+    unknown = sorted(options.keys() - known)
+    if unknown:
+        choices = ", ".join(sorted(known))
+        raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
+
+
 def _as_meshes(meshes: object) -> list[Any]:
-    """Convert to a list of objects, or of pairs of what is shown and the name of its class; InputError otherwise."""
+    """Check that the argument is a list of `ObjectSettings`, or of pairs of a mesh and a label."""
     expected = "a list of pairs such as ('solid:orange', 'orange'), or of augment.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
@@ -122,31 +157,55 @@ def _as_meshes(meshes: object) -> list[Any]:
             continue
         if len(member) != 2:
             raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
-        if not isinstance(member[0], str | Path):
-            require_mesh(f"meshes[{index}]", member[0])
-        require_kind(f"meshes[{index}]: its label", member[1], str, "the name of a class")
+        mesh, label = member
+        if not isinstance(mesh, str | Path):
+            require_mesh(f"meshes[{index}]", mesh)
+        require_kind(f"meshes[{index}]: its label", label, str, "the name of a class")
     return members
 
 
-def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObject:
-    if isinstance(item, ObjectSettings):
-        return load_object(item, vertices)
-    mesh, label = item
+def _load_member(member: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObject:
+    """Load a member of `meshes`, subdivided until it has more than a number of vertices."""
+    if isinstance(member, ObjectSettings):
+        return load_object(member, vertices)
+    mesh, label = member
     if isinstance(mesh, Mesh):
         return SceneObject(label, normalize(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
-def _lights(
-    shown: SceneSettings, environment: Tensor | str | Path, degree: int | None, roughness: float | None = None
+def _place_cameras(settings: SceneSettings) -> list[Camera]:
+    """Place the cameras of a scene on a circle around its object."""
+    polar = math.radians(settings.polar)
+    azimuth = math.radians(settings.azimuth)
+    fov = None if settings.fov is None else math.radians(settings.fov)
+    return orbit_cameras(settings.views, settings.width, polar, azimuth, fov)
+
+
+def _build_lights(
+    settings: SceneSettings,
+    environment: Tensor | str | Path,
+    degree: int | None,
+    roughness: float | None = None,
 ) -> tuple[Basis, Tensor]:
-    """The basis and the lights (size, 3) of the settings, of coefficients or of a named light of a degree, for surfaces
-    of a roughness."""
+    """Join the environment lighting with the local lights of the settings.
+
+    Args:
+        settings: Settings of the scene.
+        environment: Name of the environment lighting, or its coefficients,
+            shape (K, 3).
+        degree: Degree of a named lighting.
+        roughness: Roughness of the smoothest surface that is in a named
+            lighting. None for surfaces without gloss.
+
+    Returns:
+        The basis of all lights and their coefficients, shape (size, 3).
+    """
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
-    settings = [getattr(shown, kind.name) for kind in LOCAL_LIGHTS]
-    local = [build_local_light(light) for light in settings if light is not None]
-    return with_local_lights(environment * shown.exposure, local)
+    local_settings = [getattr(settings, kind.name) for kind in LOCAL_LIGHTS]
+    local = [build_local_light(light) for light in local_settings if light is not None]
+    return with_local_lights(environment * settings.exposure, local)
 
 
 def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
@@ -159,17 +218,36 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
         The light, and the coefficients (size, 3) with which attacks start.
 
     Raises:
-        InputError: If a file cannot be read, or a value does not fit the others.
+        InputError: If a file cannot be read, or if a value does not fit the
+            others.
     """
     [kind] = [kind for kind in LOCAL_LIGHTS if type(settings) is LOCAL_LIGHT_SETTINGS[kind.name]]
     return kind.from_settings(settings)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
-    """(B, 3, size, size) of gray values or image files, or (B, 1, size, size) where all are gray; in [0, 1]."""
-    choices = as_list("backgrounds", choices, object, "a list of gray values in [0, 1] or image files")
+    """Load backgrounds.
+
+    Args:
+        choices: Gray values in [0, 1], or image files.
+        size: Pixels per side.
+
+    Returns:
+        Image values in [0, 1], shape (B, 3, size, size), or
+        (B, 1, size, size) if all backgrounds are gray.
+
+    Raises:
+        InputError: If there is no background, if a gray value is out of
+            bounds, or if an image cannot be read.
+
+    Example:
+        >>> load_backgrounds([0.2, 0.8], 16).shape
+        torch.Size([2, 1, 16, 16])
+    """
+    expected = "gray values in [0, 1] or image files"
+    choices = as_list("backgrounds", choices, object, f"a list of {expected}")
     if not choices:
-        raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
+        raise InputError(f"backgrounds is empty: give {expected}")
     images = [gray_or_image("backgrounds", choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
