@@ -1,10 +1,10 @@
-"""Projected patterns: shapes of light in two colors.
+"""Patterns that a projector adds to an image: shapes of light in two colors.
 
-Points have their two coordinates in the projected image on the first axis,
-right and down, shape (2, ...). The image spans [-1, 1]. A shape gives each
-point a weight (...) between two colors, here 0 or 1. The training draws these
-patterns (`draw_patterns`), and the laboratory draws them in its own sizes,
-beside others (train/evaluation/laboratory/lab_patterns.py).
+A point has two coordinates in the projected image: x to the right and y down, both in [-1, 1].
+Tensors of points have these coordinates on their first axis, shape (2, ...). A shape gives each
+point a weight (...): 1 in the first color, 0 in the second. `draw_patterns` draws the patterns of
+the training. The laboratory uses the same shapes in other sizes
+(train/evaluation/laboratory/lab_patterns.py).
 """
 
 import math
@@ -15,7 +15,11 @@ from torch import Tensor
 
 from renderer.image import decode
 
-DISC_RADIUS = 0.4  # Of spots in the unit cells of a grid, which then cover half of the area.
+# The radius of a disc in a cell of width 1. The discs cover half of the area.
+DISC_RADIUS = 0.4
+# The smallest and the largest period of a pattern.
+MIN_PERIOD = 0.25
+MAX_PERIOD = 1.0
 
 
 def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tensor:
@@ -23,7 +27,8 @@ def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tenso
 
     Args:
         points: Points, shape (2, ...).
-        shift: Shift of the stripes along x; of a tensor (2, ...), the first.
+        shift: Shift of the stripes. Of a tensor (2, ...), only the first row,
+            along x, is used.
         bright: Fraction of a period that is bright.
 
     Returns:
@@ -33,25 +38,57 @@ def stripes(points: Tensor, shift: Tensor | float, bright: float = 0.5) -> Tenso
 
 
 def checkers(points: Tensor, shift: Tensor) -> Tensor:
-    """Return which squares of a chessboard of period 1 are bright, shifted by (2, ...)."""
-    return ((points + shift) % 1 < 0.5).sum(0) == 1
+    """Return which squares of a chessboard of period 1 are bright.
+
+    Args:
+        points: Points, shape (2, ...).
+        shift: Shift of the chessboard along x and y, shape (2, ...).
+
+    Returns:
+        A mask of the points, shape (...).
+    """
+    is_in_first_half = (points + shift) % 1 < 0.5
+    return is_in_first_half.sum(0) == 1
 
 
 def spots(points: Tensor, shift: Tensor) -> Tensor:
-    """Return where the discs of a grid of period 1 are, shifted by (2, ...)."""
-    return ((points + shift) % 1 - 0.5).square().sum(0) < DISC_RADIUS**2
+    """Return which points are in the discs of a grid of period 1.
+
+    Args:
+        points: Points, shape (2, ...).
+        shift: Shift of the grid along x and y, shape (2, ...).
+
+    Returns:
+        A mask of the points, shape (...).
+    """
+    from_center = (points + shift) % 1 - 0.5
+    return from_center.square().sum(0) < DISC_RADIUS**2
 
 
 def half(points: Tensor, shift: Tensor | float) -> Tensor:
     """Return which points are to the right of a line at x = shift - 0.5.
 
-    Of a shift (2, ...), the first counts.
+    Args:
+        points: Points, shape (2, ...).
+        shift: Shift of the line. Of a tensor (2, ...), only the first row,
+            along x, is used.
+
+    Returns:
+        A mask of the points, shape (...).
     """
     return (points > shift - 0.5)[0]
 
 
 def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
-    """Return ones for all points: a single color."""
+    """Return ones for all points, which makes a pattern of a single color.
+
+    Args:
+        points: Points, shape (2, ...).
+        shift: Not used. All shapes are called with a shift.
+
+    Returns:
+        Ones, shape (...).
+    """
     return torch.ones_like(points[0])
 
 
@@ -59,17 +96,17 @@ FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, s
 
 
 def pixel_middles(size: int) -> Tensor:
-    """Return the middles of the pixels of an image, shape (2, 1, size, size)."""
-    middles = (torch.arange(size) + 0.5) / size * 2 - 1
-    return torch.stack(torch.meshgrid(middles, middles, indexing="xy"))[:, None]
+    """Return the centers of the pixels of an image as points, shape (2, 1, size, size)."""
+    centers = (torch.arange(size) + 0.5) / size * 2 - 1
+    return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
 
 
 def turned(points: Tensor, cosine: Tensor | float, sine: Tensor | float) -> Tensor:
-    """Rotate points (2, ...) about the middle of the image by an angle.
+    """Rotate points about the center of the image.
 
     Args:
         points: Points, shape (2, ...).
-        cosine: Cosine of the angle, which goes from right to down.
+        cosine: Cosine of the angle. A positive angle turns right to down.
         sine: Sine of the angle.
 
     Returns:
@@ -80,7 +117,16 @@ def turned(points: Tensor, cosine: Tensor | float, sine: Tensor | float) -> Tens
 
 
 def two_colors(weight: Tensor, first: Tensor, second: Tensor) -> Tensor:
-    """Blend two colors of light: the first where the weight is 1, the second where it is 0."""
+    """Blend two colors of light.
+
+    Args:
+        weight: Weight of the first color in [0, 1], shape (N, 1, H, W).
+        first: Linear RGB, shape (N, 3, 1, 1).
+        second: Linear RGB, shape (N, 3, 1, 1).
+
+    Returns:
+        Linear RGB, shape (N, 3, H, W).
+    """
     return second + weight * (first - second)
 
 
@@ -91,29 +137,31 @@ def random_colors(draws: Tensor) -> Tensor:
         draws: Hue and saturation in [0, 1] of each color, shape (N, 2).
 
     Returns:
-        Linear RGB from white to pure, shape (N, 3, 1, 1). Steps of saturation are
-        even in sRGB values.
+        Linear RGB, shape (N, 3, 1, 1): white at saturation 0, a pure hue at 1.
+        The sRGB values are linear in the saturation.
 
     Example:
         >>> random_colors(torch.tensor([[0.0, 0.0], [0.0, 1.0]])).flatten(1).tolist()
         [[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]]
     """
     hue, saturation = draws.split(1, dim=1)
-    # The ramps of the hexcone (Smith 1978).
+    # Each channel of a pure hue is a piecewise linear function of the hue (HSV, Smith 1978).
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6
     pure = ((ramps - 3).abs() - 1).clamp(0, 1)
     return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]
 
 
-def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor | None = None) -> Tensor:
+def draw_patterns(
+    count: int, size: int, draws: torch.Generator, points: Tensor | None = None
+) -> Tensor:
     """Draw patterns of random colors, at random angles, scales and positions.
 
     Args:
         count: Number of patterns.
         size: Pixels per side.
         draws: Source of random numbers.
-        points: Where in the pattern each pixel is, shape (2, count, size, size).
-            By default, the pattern fills the image.
+        points: Point of the pattern that each pixel shows, shape
+            (2, count, size, size). By default, the pattern fills the image.
 
     Returns:
         Linear light in [0, 1], shape (count, 3, size, size).
@@ -122,22 +170,29 @@ def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor 
         >>> draw_patterns(2, 8, torch.Generator().manual_seed(0)).shape
         torch.Size([2, 3, 8, 8])
     """
-    points = pixel_middles(size) if points is None else points
-    places, families, color_draws = [], [], []
+    if points is None:
+        points = pixel_middles(size)
+    position_draws = []
+    family_draws = []
+    color_draws = []
     for _ in range(count):
-        places.append(torch.rand(4, generator=draws))
-        families.append(torch.randint(len(FAMILIES), (), generator=draws))
+        position_draws.append(torch.rand(4, generator=draws))
+        family_draws.append(torch.randint(len(FAMILIES), (), generator=draws))
         color_draws.append(torch.rand(5, generator=draws))
-    turn, period, *shift = torch.stack(places).T[:, :, None, None]
+    # Each of the four position draws has shape (count, 1, 1).
+    turn, relative_period, *shift = torch.stack(position_draws).T[:, :, None, None]
+    period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
     angle = 2 * math.pi * turn
-    rotated = turned(points / (0.25 + 0.75 * period), angle.cos(), angle.sin())
+    rotated = turned(points / period, angle.cos(), angle.sin())
     shifts = torch.stack(shift)
-    family_of_pattern = torch.stack(families)
+    family_of_pattern = torch.stack(family_draws)
     weight = torch.empty(count, 1, *points.shape[2:])
-    for index, mask in enumerate(FAMILIES):
-        here = torch.nonzero(family_of_pattern == index).squeeze(1)
-        weight[here, 0] = mask(rotated[:, here], shifts[:, here]).float()
+    for index, shape in enumerate(FAMILIES):
+        patterns = torch.nonzero(family_of_pattern == index).squeeze(1)
+        weight[patterns, 0] = shape(rotated[:, patterns], shifts[:, patterns]).float()
     colors = torch.stack(color_draws)
     first = random_colors(colors[:, :2])
-    second = random_colors(colors[:, 2:4]) * colors[:, 4:, None, None]  # Down to black.
+    # The brightness of the second color is between 0 and 1.
+    brightness = colors[:, 4:, None, None]
+    second = random_colors(colors[:, 2:4]) * brightness
     return two_colors(weight, first, second)
