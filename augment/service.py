@@ -1,4 +1,8 @@
-"""Fresh labeled renders for a training loop, attacked with the weights that the network has at the moment."""
+"""Regenerate labeled renders for a training loop.
+
+In each regeneration, the renders are attacked with the current weights of the network, or their
+lighting is drawn at random.
+"""
 
 from __future__ import annotations
 
@@ -42,15 +46,26 @@ from renderer.validation import (
     require_whole,
 )
 
-SHOWN_EXAMPLES = 4  # of an attack, to look at
-CLASSIFIED = 250  # of random renders, for diagnostics: a success rate within .06
+# The number of attacked examples that are kept for figures.
+SHOWN_EXAMPLES = 4
+# The number of random renders that are classified for diagnostics. The standard error of a success
+# rate is then at most 0.032.
+CLASSIFIED = 250
 
 
 @dataclass(frozen=True)
 class AttackExamples:
-    """S successful examples of a regeneration, before the attack and after it.
+    """S successful examples of a regeneration, before and after the attack.
 
-    images: (2, S, 3, H, W) in [0, 1]. lights: (2, S, basis.size, 3). predictions: (2, S, C) probabilities.
+    On the first axis of images, lights and predictions, index 0 is before the attack
+    and index 1 is after it.
+
+    Attributes:
+        images: Images in [0, 1], shape (2, S, 3, H, W).
+        lights: Coefficients of the lights, shape (2, S, basis.size, 3).
+        predictions: Probabilities of the C classes, shape (2, S, C).
+        labels: Labels, shape (S,), int64.
+        basis: Basis of the lights.
     """
 
     images: Tensor
@@ -60,23 +75,25 @@ class AttackExamples:
     basis: Basis = HARMONICS
 
     def __len__(self) -> int:
+        """Return the number of examples."""
         return len(self.labels)
 
 
 @dataclass(frozen=True)
 class Renders(Dataset[tuple[Tensor, int]]):
-    """Labeled examples. As a data set, it holds pairs of an image on the CPU and a label.
+    """The labeled images of a regeneration, which are also a data set of PyTorch.
 
-    With data of the same kind, `data + renders` is both. A data set with labels
-    as tensors, such as a `TensorDataset`, needs them as numbers for that, since
-    PyTorch's `DataLoader` makes a batch of one kind of labels.
+    The data set holds pairs of an image on the CPU and a label as an int. It
+    can be concatenated with other data whose labels are ints. Labels that are
+    tensors, as in a `TensorDataset`, must be converted to ints before, because
+    PyTorch's `DataLoader` cannot mix both types in a batch.
 
     Attributes:
         images: Images in [0, 1], shape (E, 3, H, W).
         labels: Labels, shape (E,), int64.
         diagnostics: Plain numbers about the regeneration.
-        attack_examples: A few successful examples with what they were before
-            the attack. None if nothing is rendered.
+        attack_examples: A few successful examples before and after the
+            attack. None if nothing is rendered.
 
     Example:
         >>> tensors = torch.utils.data.TensorDataset(torch.rand(2, 3, 8, 8), torch.tensor([0, 1]))
@@ -104,13 +121,26 @@ class Renders(Dataset[tuple[Tensor, int]]):
 
 @dataclass(eq=False, repr=False)
 class AugmentationService:
-    """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
+    """Renders the examples of a scene anew for each regeneration.
 
-    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`.
-    studied: the classes that hard negatives, the examples of all other labels, are attacked towards, in turn.
-    Without any, every attack leads away from the example's own class. rank, world_size: of this process among those
-    that train together; each attacks its shard of the examples, and all get all renders. images: (E, 3, H, W)
-    uint8, of arm="folder".
+    With `settings.warm_start`, each attack begins with the result of the
+    previous one.
+
+    Attributes:
+        settings: Settings of the augmentation.
+        scene: Scene with one view for each of E examples. None if nothing is
+            rendered.
+        labels: Labels, shape (E,), int64, as in `augment.losses`.
+        seed: Seed of all random numbers.
+        phases: Timer of the attacks.
+        studied: The positive classes. Examples of all other labels, which are
+            hard negatives, are attacked towards one of these classes in turn.
+            Without positive classes, every attack leads away from the class of
+            its example.
+        rank: Index of this process among those that train together. Each
+            process attacks its share of the examples and gets all renders.
+        world_size: Number of these processes.
+        images: Images of `arm="folder"`, shape (E, 3, H, W), uint8.
     """
 
     settings: AugmentationSettings
@@ -125,31 +155,42 @@ class AugmentationService:
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        require_kind("settings", self.settings, AugmentationSettings, "augment.AugmentationSettings(...)")
+        """Check the arguments, and raise the degree of the lighting to what the settings need.
+
+        Raises:
+            InputError: If an argument has the wrong type or shape, or if the
+                settings need a scene or images that are not given.
+        """
+        expected = "augment.AugmentationSettings(...)"
+        require_kind("settings", self.settings, AugmentationSettings, expected)
         require_seed("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
         require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
         self.studied = [int(label) for label in as_integers("studied", self.studied)]
         if self.scene is not None and self.labels.shape != (len(self.scene),):
-            raise InputError(
-                f"labels has shape {tuple(self.labels.shape)}: give one of each of {len(self.scene)} examples"
-            )
+            fault = f"labels has shape {tuple(self.labels.shape)}"
+            raise InputError(f"{fault}: give one of each of {len(self.scene)} examples")
         if self.images is not None:
-            if not isinstance(self.images, Tensor):
-                self.images = torch.from_numpy(as_array("images", self.images))
-            if self.images.dtype != torch.uint8 or self.images.shape[:2] != (len(self.labels), 3):
-                raise InputError(f"images is {describe(self.images)}: give bytes (E, 3, H, W), one for each label")
+            self.images = self._checked_images(self.images)
         source = "images" if self.settings.arm == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
-            raise InputError(
-                f"{source} is None, and arm={self.settings.arm} needs examples: give a scene, or images for a folder"
-            )
+            fault = f"{source} is None, and arm={self.settings.arm} needs examples"
+            raise InputError(f"{fault}: give a scene, or images for a folder")
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
             self.scene = with_needed_degree(self.scene, attack.material, self.settings.vary.gloss)
             if not attack.allow_negative:
                 warn_of_changed_light(self.scene, build_problem(attack, self.scene).scene)
+
+    def _checked_images(self, images: Tensor) -> Tensor:
+        """Return images as a tensor, and check that there is one of bytes for each label."""
+        if not isinstance(images, Tensor):
+            images = torch.from_numpy(as_array("images", images))
+        if images.dtype != torch.uint8 or images.shape[:2] != (len(self.labels), 3):
+            expected = "bytes (E, 3, H, W), one for each label"
+            raise InputError(f"images is {describe(images)}: give {expected}")
+        return images
 
     @classmethod
     def from_meshes(
@@ -161,44 +202,84 @@ class AugmentationService:
         seed: int = 0,
         **of_scene: Any,
     ) -> AugmentationService:
-        """A service for any training loop: meshes × views × backgrounds renders, as in the paper by default.
+        """Build a service for any training loop, by default with the renders of the paper.
 
-        meshes: pairs of a file, solid:NAME or `Mesh`, and the index of its class. size: pixels per side. of_scene:
-        further arguments of `build_scene`, by default the paper's: 10 views, 5 grays, 8 × 8 samples and flat shading.
+        There is an example for each mesh, camera and background.
 
-        >>> service = AugmentationService.from_meshes([("solid:orange", 0), ("solid:apple", 1)], 8, views=1, samples=1)
-        >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
-        >>> service.regenerate(model, number=0).images.shape
-        torch.Size([10, 3, 8, 8])
+        Args:
+            meshes: Pairs of a mesh and the index of its class. A mesh is a
+                file, solid:NAME or a `Mesh`.
+            size: Pixels per side.
+            settings: Settings of the augmentation.
+            seed: Seed of all random numbers.
+            of_scene: Further arguments of `build_scene`. By default, there are
+                10 views, 5 gray backgrounds, 8 × 8 samples per pixel and flat
+                shading.
+
+        Returns:
+            The service.
+
+        Raises:
+            InputError: If an argument has the wrong type, or as by
+                `build_scene`.
+
+        Example:
+            >>> meshes = [("solid:orange", 0), ("solid:apple", 1)]
+            >>> service = AugmentationService.from_meshes(meshes, 8, views=1, samples=1)
+            >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
+            >>> service.regenerate(model, number=0).images.shape
+            torch.Size([10, 3, 8, 8])
         """
-        require_kind("settings", settings, AugmentationSettings | None, "augment.AugmentationSettings(...) or None")
+        expected = "augment.AugmentationSettings(...) or None"
+        require_kind("settings", settings, AugmentationSettings | None, expected)
         require_seed("seed", seed)
-        expected = "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
+        expected = (
+            "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
+        )
         members = as_list("meshes", meshes, tuple | list, expected)
         for index, member in enumerate(members):
             if len(member) != 2:
                 raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
             require_whole(f"meshes[{index}]: its label", member[1])
         named = [(mesh, str(label)) for mesh, label in members]
-        paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
-        paper["backgrounds"] = [0.0, 0.25, 0.5, 0.75, 1.0]
+        paper: dict[str, Any] = {
+            "views": 10,
+            "samples": 8,
+            "normals": "flat",
+            "backgrounds": [0.0, 0.25, 0.5, 0.75, 1.0],
+        }
         settings = settings or AugmentationSettings()
-        scene = build_scene(named, size, attack=settings.attack, vary=settings.vary, **paper | of_scene)
+        options = paper | of_scene
+        scene = build_scene(named, size, attack=settings.attack, vary=settings.vary, **options)
         labels = torch.tensor([int(label) for label in scene.labels], device=scene.lights.device)
         settings = replace(settings, examples=len(scene))
         return cls(settings, scene, labels, seed, Phases(labels.device))
 
     def __len__(self) -> int:
-        """Examples per regeneration."""
+        """Return the number of examples of a regeneration."""
         if self.images is None:
             return len(self.labels) if self.settings.renders else 0
-        return len(self.labels) if self.settings.examples is None else self.settings.examples
+        if self.settings.examples is None:
+            return len(self.labels)
+        return self.settings.examples
 
     def regenerate(self, model: nn.Module, number: int) -> Renders:
-        """Fresh examples for the model's current weights; the model keeps its mode, gradients and random state.
+        """Generate examples for the current weights of a model.
 
-        model: images (N, 3, size, size) in [0, 1] → logits. number: counts a run's regenerations from 0. The draw
-        depends on it and on the seed alone, so a resumed run repeats it. InputError: a label that has no logit.
+        The mode, the gradients and the random state of the model are restored
+        afterwards.
+
+        Args:
+            model: A network from images (N, 3, size, size) in [0, 1] to logits.
+            number: Index of the regeneration, counted from 0 in a run. The
+                random numbers depend on this index and on the seed alone, so
+                that a resumed run repeats them.
+
+        Returns:
+            The examples.
+
+        Raises:
+            InputError: If the model fails, or has no logit for a label.
         """
         require_kind("model", model, nn.Module, "a torch.nn.Module from images to logits")
         require_seed("number", number)
@@ -207,160 +288,237 @@ class AugmentationService:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
-        once = self.settings.arm == "random"
-        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), once)
-        make = self._random if once else self._adversarial
+        is_random = self.settings.arm == "random"
+        draws = generator(self.seed, number, "rows")
+        scene = vary(self.scene, self.settings.vary, draws, once=is_random)
+        problem = build_problem(self.settings.attack, scene)
         shard = distributed.shard(len(scene), self.rank, self.world_size).to(scene.lights.device)
-        return make(model, build_problem(self.settings.attack, scene), number, shard)
+        if is_random:
+            return self._random(model, problem, number, shard)
+        return self._adversarial(model, problem, number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a resumed run needs.
 
         Returns:
-            "scene": a hash of what is shown, which `load_state_dict` compares. "values", with `warm_start` once there
-            was an attack: the values (E, D) that the next attack begins with.
+            A hash of the scene under "scene", which `load_state_dict` compares.
+            With `warm_start`, after an attack, also its D resulting values of
+            each example under "values", shape (E, D). The next attack begins
+            with them.
         """
         state = {"scene": self._scene_hash}
-        return state if self._last_values is None else {**state, "values": self._last_values.cpu()}
+        if self._last_values is not None:
+            state["values"] = self._last_values.cpu()
+        return state
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore the result of `state_dict`.
 
+        Args:
+            state: A result of `state_dict`.
+
         Raises:
-            InputError: If the state is of a service with another scene, or is none.
+            InputError: If it is the result of a service with another scene, or
+                no result of `state_dict`.
         """
         expected = "the result of state_dict of a service with the same scene"
         require_kind("state", state, Mapping, expected)
         if "scene" not in state or state.keys() - {"scene", "values"}:
-            raise InputError(f"state holds {', '.join(map(str, state)) or 'nothing'}: give {expected}")
+            found = ", ".join(str(key) for key in state) or "nothing"
+            raise InputError(f"state holds {found}: give {expected}")
         values = state.get("values")
         if values is not None:
             values = as_tensor("state", values)
             if values.ndim != 2 or len(values) != len(self.labels):
                 counts = f"{len(values)} examples and the scene has {len(self.labels)}"
-                raise InputError(f"state: it continues {counts}; resume with the settings of the run")
+                raise InputError(
+                    f"state: it continues {counts}; resume with the settings of the run"
+                )
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
-            raise InputError("state is of another scene: resume with the same meshes, labels, views and light")
+            remedy = "resume with the same meshes, labels, views and light"
+            raise InputError(f"state is of another scene: {remedy}")
         self._last_values = None if values is None else values.to(self.labels.device)
 
     @cached_property
     def _scene_hash(self) -> Tensor:
-        """Hash what is shown, to some digits, so that the same settings agree on all machines."""
+        """The SHA-256 hash of labels, scene and image sizes, as 32 bytes.
+
+        Numbers are rounded before, so that the same settings have the same hash
+        on all machines.
+        """
         shown: list[object] = [self.labels.tolist(), list(self.studied)]
         if self.images is not None:
             shown.append(tuple(self.images.shape))
         if self.scene is not None:
             shown.append(_describe_scene(self.scene))
-        return torch.tensor(list(hashlib.sha256(repr(shown).encode()).digest()), dtype=torch.uint8)
+        digest = hashlib.sha256(repr(shown).encode()).digest()
+        return torch.tensor(list(digest), dtype=torch.uint8)
 
     def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
-        """The images that are next in passes over the whole folder, each in an order of its own."""
-        total, first = len(images), number * len(self)
-        passes = range(first // total, (first + len(self) - 1) // total + 1)
-        order = torch.cat([torch.randperm(total, generator=generator(self.seed, part, "folder")) for part in passes])
-        rows = order[first - passes.start * total :][: len(self)].to(images.device)
-        shown, labels = to_unit(images[rows]), self.labels[rows]
-        return Renders(shown, labels, self._errors(model, shown, labels)[1])
+        """Return the next images in passes over the folder, each pass in its own random order."""
+        total = len(images)
+        first = number * len(self)
+        last = first + len(self) - 1
+        first_pass = first // total
+        orders = []
+        for index in range(first_pass, last // total + 1):
+            draws = generator(self.seed, index, "folder")
+            orders.append(torch.randperm(total, generator=draws))
+        offset = first - first_pass * total
+        rows = torch.cat(orders)[offset : offset + len(self)].to(images.device)
+        selected = to_unit(images[rows])
+        labels = self.labels[rows]
+        _, diagnostics = self._classify(model, selected, labels)
+        return Renders(selected, labels, diagnostics)
 
-    def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
+    def _random(
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+    ) -> Renders:
+        """Render random conditions. This process renders the examples with the indices in shard."""
         values = self._random_values(problem, number)
-        images = problem.images(values, shard)[:, 0]
-        images = distributed.merged(images, shard, len(self.labels), self.world_size)
-        success, diagnostics = self._errors(model, images, self.labels)
-        examples = choose_attack_examples(model, problem, values, success, self.labels)
-        return Renders(images, self.labels, diagnostics | _changes(problem, values), examples)
+        images = self._gather(problem.images(values, shard)[:, 0], shard)
+        is_error, diagnostics = self._classify(model, images, self.labels)
+        examples = choose_attack_examples(model, problem, values, is_error, self.labels)
+        diagnostics |= _changes(problem, values)
+        return Renders(images, self.labels, diagnostics, examples)
 
-    def _errors(self, model: nn.Module, images: Tensor, labels: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """On which of `CLASSIFIED` examples the model errs, (E,) bool, of all images (E, 3, H, W) with labels (E,); and
-        how often, with the mean loss."""
-        rows = torch.linspace(0, len(labels) - 1, min(CLASSIFIED, len(labels))).round().long().to(labels.device)
+    def _classify(
+        self, model: nn.Module, images: Tensor, labels: Tensor
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Classify up to `CLASSIFIED` evenly spaced images.
+
+        Args:
+            model: The network.
+            images: Images in [0, 1], shape (E, 3, H, W).
+            labels: Their labels, shape (E,).
+
+        Returns:
+            Whether each image is classified and misclassified, shape (E,), and
+            diagnostics: the fraction of misclassified images and the mean loss.
+        """
+        count = min(CLASSIFIED, len(labels))
+        rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
         with as_found(model), self.phases("attack_classifier"):
             attacked_model = preprocessed_model(self.settings.attack, model)
-            logits = logits_of(attacked_model, images[rows, None], self.settings.attack.batch_size)[:, 0]
+            batch_size = self.settings.attack.batch_size
+            logits = logits_of(attacked_model, images[rows, None], batch_size)[:, 0]
         require_known(labels, logits)
-        success = ~is_right(logits.argmax(1), labels[rows], self.studied[1:])
+        is_misclassified = ~is_right(logits.argmax(1), labels[rows], self.studied[1:])
         loss = label_loss(logits, labels[rows], absent=self.studied[1:])
-        errors = torch.zeros_like(labels, dtype=torch.bool).index_copy(0, rows, success)
-        return errors, {"attack_success": _mean(success), "loss": _mean(loss)}
+        is_error = torch.zeros_like(labels, dtype=torch.bool)
+        is_error = is_error.index_copy(0, rows, is_misclassified)
+        return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
-        attack, goal = self.settings.attack, Goal(self.labels[:, None])
-        if self.studied:
-            studied = torch.tensor(self.studied, device=self.labels.device)
-            source = torch.where(self.labels < 0, NO_CLASS, self.labels)
-            in_turn = studied[torch.arange(len(self.labels), device=self.labels.device) % len(studied)]
-            target = torch.where(torch.isin(self.labels, studied), NO_CLASS, in_turn)
-            goal = Goal(source[:, None], target[:, None])
-        start = self._last_values
-        if start is None:
-            start = self._random_values(problem, number) if self.settings.init == "random" else problem.start
+    def _adversarial(
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+    ) -> Renders:
+        """Attack the examples. This process attacks the examples with the indices in shard."""
+        attack = self.settings.attack
+        goal = self._attack_goal().of(shard)
+        attacked_model = preprocessed_model(attack, model)
+        start = self._attack_start(problem, number)
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
+        seed = stream_seed(self.seed, number)
         result = descend(
-            preprocessed_model(attack, model),
+            attacked_model,
             problem,
-            goal.of(shard),
+            goal,
             attack,
             self.phases,
             examples=shard,
             start=start[shard],
             restarts=restarts,
-            seed=stream_seed(self.seed, number),
+            seed=seed,
         )
         with as_found(model), self.phases("attack_classifier"):
-            fooled = fooled_in_views(
-                preprocessed_model(attack, model),
+            is_fooled = fooled_in_views(
+                attacked_model,
                 result.images,
                 result.predicted,
                 shard,
-                goal.of(shard),
+                goal,
                 attack,
-                stream_seed(self.seed, number),
+                seed,
             )
-        success = fooled.all(1) | result.success_before  # as no attack was needed there
-        success = distributed.merged(success, shard, len(self.labels), self.world_size)
-        shards = [getattr(result, item.name) for item in fields(result)]
-        result = DescentResult(*(distributed.merged(rows, shard, len(self.labels), self.world_size) for rows in shards))
+        # Examples that were misclassified before the attack needed none.
+        success = self._gather(is_fooled.all(1) | result.success_before, shard)
+        parts = [getattr(result, item.name) for item in fields(result)]
+        result = DescentResult(*[self._gather(part, shard) for part in parts])
         if self.settings.warm_start:
             self._last_values = result.values
+        max_steps = attack.max_steps * (1 + attack.restarts)
         diagnostics = {
             "attack_success_before": _mean(result.success_before),
             "attack_success": _mean(success),
             "steps": _mean(result.steps),
-            "used_all_steps": _mean(result.steps == attack.max_steps * (1 + attack.restarts)),
+            "used_all_steps": _mean(result.steps == max_steps),
             "loss_before": -_mean(result.cost_before),
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
         if attack.sensor_noise:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
-        new_success = success & ~result.success_before
-        examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
-        return Renders(result.images[:, 0], self.labels, diagnostics | _changes(problem, result.values), examples)
+        diagnostics |= _changes(problem, result.values)
+        is_new_success = success & ~result.success_before
+        examples = choose_attack_examples(
+            model, problem, result.values, is_new_success, self.labels
+        )
+        return Renders(result.images[:, 0], self.labels, diagnostics, examples)
+
+    def _gather(self, part: Tensor, shard: Tensor) -> Tensor:
+        """Join the rows of all processes, where this process has those of the shard."""
+        return distributed.merged(part, shard, len(self.labels), self.world_size)
+
+    def _attack_goal(self) -> Goal:
+        """Return the source and the target class of each example."""
+        if not self.studied:
+            return Goal(self.labels[:, None])
+        studied = torch.tensor(self.studied, device=self.labels.device)
+        # Negative labels are complementary labels, which name no class of the example.
+        source = torch.where(self.labels < 0, NO_CLASS, self.labels)
+        indices = torch.arange(len(self.labels), device=self.labels.device)
+        target_in_turn = studied[indices % len(studied)]
+        is_positive = torch.isin(self.labels, studied)
+        target = torch.where(is_positive, NO_CLASS, target_in_turn)
+        return Goal(source[:, None], target[:, None])
+
+    def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
+        """Return the values (E, D) with which the attack of a regeneration begins."""
+        if self._last_values is not None:
+            return self._last_values
+        if self.settings.init == "random":
+            return self._random_values(problem, number)
+        return problem.start
 
     def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        random, parts = self.settings.random_light, []
+        """Draw the values (E, D) of all attacked parameters of a regeneration."""
+        settings = self.settings.random_light
+        parts = []
         for parameter, start in problem.by_parameter(problem.start):
             if parameter.name == "lighting":
                 zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
-                offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
+                offsets = perturb(zero, len(start), settings.amplitude, settings.radius, draws)
                 parts.append(start + offsets.flatten(1).to(start))
             else:
-                parts.append(parameter.sample(generator(self.seed, number, parameter.name)).to(start))
+                draws = generator(self.seed, number, parameter.name)
+                parts.append(parameter.sample(draws).to(start))
         return problem.project(torch.cat(parts, dim=1), problem.everything)
 
 
 def _describe_scene(scene: Scene) -> list[object]:
-    """Describe a scene's objects, cameras, backgrounds and lights by plain values of a few digits."""
+    """Describe objects, cameras, backgrounds and lights by plain values and rounded numbers."""
     described: list[object] = [scene.settings.size, scene.settings.encoding, str(scene.basis)]
     for item in scene.objects:
         extent = item.mesh.vertices.std(axis=0)
-        counts = len(item.mesh.vertices), len(item.mesh.faces)
-        described.append((item.label, item.name, counts, _rounded(extent), f"{item.albedo_scale:.3g}"))
+        counts = (len(item.mesh.vertices), len(item.mesh.faces))
+        scale = f"{item.albedo_scale:.3g}"
+        described.append((item.label, item.name, counts, _rounded(extent), scale))
     for example in scene.examples:
-        cameras = [_rounded(list(vars(camera.fixed()).values())) for camera in example.cameras]
-        described.append((example.object, example.background, f"{example.exposure:.3g}", cameras))
+        cameras = [_rounded(vars(camera.fixed()).values()) for camera in example.cameras]
+        exposure = f"{example.exposure:.3g}"
+        described.append((example.object, example.background, exposure, cameras))
     backgrounds = scene.backgrounds.mean((2, 3)).flatten()
     lights = scene.lights.flatten(1).unique(dim=0).double()
     described.append(_rounded(backgrounds.tolist()))
@@ -369,49 +527,95 @@ def _describe_scene(scene: Scene) -> list[object]:
 
 
 def _rounded(values: Iterable[float]) -> list[str]:
-    """Write numbers with three digits, so that the rounding of a computation is not seen."""
+    """Write numbers with three digits, which do not show rounding errors."""
     return [f"{float(value):.3g}" for value in values]
 
 
 class CheckedNetwork(nn.Module):
-    """A network of the training loop, whose outputs are refused if they cannot be logits."""
+    """A network of the training loop. Its outputs are checked.
+
+    Attributes:
+        model: The network.
+    """
 
     def __init__(self, model: nn.Module):
+        """Wrap a network.
+
+        Args:
+            model: The network, from images to logits.
+        """
         super().__init__()
         self.model = model
         self._call_network = NetworkCall("model")
 
     def forward(self, images: Tensor) -> Tensor:
+        """Return the logits of images.
+
+        Raises:
+            InputError: If the network fails or its outputs cannot be logits.
+        """
         return self._call_network(self.model, images)
 
 
 def choose_attack_examples(
-    model: nn.Module, problem: AttackProblem, values: Tensor, success: Tensor, labels: Tensor
+    model: nn.Module,
+    problem: AttackProblem,
+    values: Tensor,
+    success: Tensor,
+    labels: Tensor,
 ) -> AttackExamples:
-    """Up to `SHOWN_EXAMPLES` of the examples with success (E,), evenly spaced, under values (E, D).
+    """Select up to `SHOWN_EXAMPLES` successful examples, and render and classify them.
 
-    The problem's examples have one view each. The model keeps its state.
+    Args:
+        model: The network. Its state is restored afterwards.
+        problem: The attack on E examples of one view each.
+        values: The D values of each example after the attack, shape (E, D).
+        success: Whether the attack succeeded, shape (E,), bool.
+        labels: Labels, shape (E,).
+
+    Returns:
+        The selected examples, which are evenly spaced among the successful
+        ones.
     """
-    rows = torch.nonzero(success).squeeze(1)
-    chosen = torch.linspace(0, max(len(rows) - 1, 0), min(SHOWN_EXAMPLES, len(rows))).round().long()
-    rows = rows[chosen.to(rows.device)]
-    sides = [problem.conditions(end[rows], rows) for end in (problem.start, values)]
+    successful = torch.nonzero(success).squeeze(1)
+    count = min(SHOWN_EXAMPLES, len(successful))
+    last = max(len(successful) - 1, 0)
+    chosen = torch.linspace(0, last, count).round().long()
+    rows = successful[chosen.to(successful.device)]
+    before = problem.conditions(problem.start[rows], rows)
+    after = problem.conditions(values[rows], rows)
+    images = []
+    predictions = []
     with as_found(model), torch.no_grad():
-        images = [problem.scene.render(side, rows)[:, 0] for side in sides]
-        predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    lights = torch.stack([side.light for side in sides])
-    return AttackExamples(torch.stack(images), lights, torch.stack(predictions), labels[rows], problem.scene.basis)
+        for conditions in (before, after):
+            rendered = problem.scene.render(conditions, rows)[:, 0]
+            images.append(rendered)
+            if len(rows):
+                predictions.append(model(rendered).float().softmax(1))
+            else:
+                predictions.append(rendered.new_zeros(0, 0))
+    return AttackExamples(
+        images=torch.stack(images),
+        lights=torch.stack([before.light, after.light]),
+        predictions=torch.stack(predictions),
+        labels=labels[rows],
+        basis=problem.scene.basis,
+    )
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """The mean L2 norm of each condition's change."""
-    before, after = (problem.conditions(end, problem.everything) for end in (problem.start, values))
-    return {
-        f"{part.name}_change": _mean((value - getattr(before, part.name)).flatten(1).norm(dim=1))
-        for part in fields(Conditions)
-        if (value := getattr(after, part.name)) is not None
-    }
+    """Return the mean L2 norm of the change of each condition, as diagnostics."""
+    before = problem.conditions(problem.start, problem.everything)
+    after = problem.conditions(values, problem.everything)
+    changes = {}
+    for condition in fields(Conditions):
+        new = getattr(after, condition.name)
+        if new is not None:
+            difference = new - getattr(before, condition.name)
+            changes[f"{condition.name}_change"] = _mean(difference.flatten(1).norm(dim=1))
+    return changes
 
 
 def _mean(values: Tensor) -> float:
+    """Return the mean of all values, computed in double precision."""
     return float(values.double().mean())
