@@ -125,7 +125,7 @@ def build_scene(
     rasterizer = renderer_settings.rasterizer
     return Scene.grid(
         objects,
-        _place_cameras(scene_settings),
+        _place_cameras(scene_settings, views),
         load_backgrounds(scene_settings.backgrounds, size),
         lights.to(as_device(device)),
         renderer_settings.image(size),
@@ -174,12 +174,12 @@ def _load_member(member: ObjectSettings | tuple[Shown, str], vertices: int) -> S
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
-def _place_cameras(settings: SceneSettings) -> list[Camera]:
-    """Place the cameras of a scene on a circle around its object."""
+def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:
+    """Place a number of cameras on a circle around the object of a scene."""
     polar = math.radians(settings.polar)
     azimuth = math.radians(settings.azimuth)
     fov = None if settings.fov is None else math.radians(settings.fov)
-    return orbit_cameras(settings.views, settings.width, polar, azimuth, fov)
+    return orbit_cameras(count, settings.width, polar, azimuth, fov)
 
 
 def _build_lights(
