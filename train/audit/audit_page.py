@@ -17,7 +17,7 @@ from train.evaluation.tables import Estimate, fraction
 from train.report import plots, summary
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
-from train.runs.run_folder import CONFIG, read_config, read_json
+from train.runs.run_config import CONFIG, read_config, read_json
 
 CLASSIFIER, HARDENED = "classifier", "hardened"  # the folders of the networks' parts
 LABORATORY, PHOTOGRAPHS = "laboratory", "photographs"

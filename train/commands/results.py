@@ -14,7 +14,8 @@ from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
 from train.report.report_page import PAGE
 from train.report.summary import is_finished
 from train.runs import checkpoint
-from train.runs.run_folder import CONFIG, METRICS, read_config
+from train.runs.run_config import CONFIG, read_config
+from train.runs.run_log import METRICS
 from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
 # By command, the files that show its results in a folder: patterns of `Path.glob`, the most telling first.

@@ -33,7 +33,7 @@ from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, FOREIGN, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
-from train.runs.run_folder import LOCK, sole_writer
+from train.runs.run_lock import LOCK, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
 
