@@ -8,7 +8,7 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 
-from train.runs.run_folder import read_metrics
+from train.runs.run_log import read_metrics
 
 MEASURES = {"light_change": "L2 norm of the light's change", "steps": "steps", "attack_success": "success"}
 

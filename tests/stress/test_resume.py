@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from train.runs import checkpoint
-from train.runs.run_folder import METRICS, read_metrics
+from train.runs.run_log import METRICS, read_metrics
 from train.system.hashing import content_hash
 
 from .conftest import PATIENCE, TRAINING, Process, end, run_here, start_command

@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.runs.run_folder import write_config
+from train.runs.run_config import write_config
 from train.settings import ExperimentSettings
 
 CLASSES = ["apple", "orange", "pear"]

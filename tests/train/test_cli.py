@@ -20,7 +20,7 @@ from train.command import USER_ERROR, Command
 from train.command_settings import LightSettings
 from train.help import HelpText
 from train.runs.checkpoint import LAST
-from train.runs.run_folder import locked
+from train.runs.run_lock import locked
 from train.system import user_errors as errors
 from train.system.hashing import content_hash
 from train.system.user_errors import one_sentence, writable_folder

@@ -1,14 +1,23 @@
-"""The parts of an audit: each is measured once, written whole, and read by the page."""
+"""Run the audit of pnb-audit.
+
+An audit has many parts, such as the attacks on one network with one kind of
+lighting. Each part is measured once, and its file is written completely or not
+at all. An audit that was stopped therefore continues with the first missing
+part. `train.audit.audit_page` reads the files and writes the report.
+"""
 
 import json
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from augment.classifiers import Classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -25,99 +34,200 @@ from train.data.photographs import FOREIGN, find_photographs
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
-from train.runs.run_folder import CONFIG, read_config, require_same, sole_writer, write_config
+from train.runs.run_config import CONFIG, read_config, require_same, write_config
+from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import published, read_objects, solid_name
 from train.system.device import choose_device
 from train.system.user_errors import writable_folder
 
-VIEWS, LIGHTS, ATTACKED, SETUPS = 24, 8, 12, 6  # views, random lights, attacked views, and setups of each pattern
-PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")  # that training does not throw
-SPP = 48  # paths per pixel
-ADDED = ("hardened", "photos")  # keys that an audit may be given when it goes on
+# Views that are rendered in environment lighting.
+VIEWS = 24
+# Random lights in addition to the environments.
+LIGHTS = 8
+# Views that are attacked with each kind of lighting.
+ATTACKED = 12
+# Setups of the laboratory for each pattern and each environment.
+SETUPS = 6
+# Projected patterns that no training of this project uses.
+PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
+# Paths per pixel of the renders of the laboratory.
+SPP = 48
+# Keys of settings that may be set when a stopped audit continues.
+ADDED = ("hardened", "photos")
 
 
 def audit(settings: AuditSettings) -> None:
-    """Make the audit of pnb-audit, and print the path of its page."""
+    """Run the audit of pnb-audit, and print the path of its report."""
     print(f"report: {run_audit(settings)}")
 
 
 def run_audit(settings: AuditSettings) -> Path:
-    """Measure what is not yet measured in the folder `settings.out`, and write the page; returns its path."""
-    device = choose_device(settings.device)
-    networks = {page.CLASSIFIER: load_network(settings.classifier, settings.weights).to(device)}
-    if settings.hardened:
-        networks[page.HARDENED] = load_network(settings.hardened).to(device)
-    meshes, others = read_meshes(settings)
-    given = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
-    folders = {part: published(Path(folder)) for part, folder in given.items() if folder}
-    for network in networks.values():
-        for label in {item.label for item in (*meshes, *others) if not item.label.startswith(FOREIGN)}:
-            network.label(label)  # or InputError that names the network
-        for folder in folders.values():
-            find_photographs(folder, network.classes, settings.label)
-    objects = [load_object(item) for item in (*meshes, *others)][: len(meshes)]  # all can be read
-    for name in settings.environments:
-        load_light(name)  # or InputError
-    lights = [UNIFORM, *settings.environments], settings.scale(LIGHTS)
-    views, attacked = (Views(objects, settings.scale(n), settings.seed, device) for n in (VIEWS, ATTACKED))
+    """Measure the parts that are missing in the folder `settings.out`, and write the report.
+
+    Args:
+        settings: Settings of the audit.
+
+    Returns:
+        Path of the report.
+
+    Raises:
+        InputError: If an input cannot be read, if a network lacks a class, or
+            if the folder holds other results.
+    """
+    plan = _Plan(settings)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite, own=_own_results(out))
-    caveats, renders = list[str](), out / "renders"  # an object of the label and another in every light
-    sizes = [str(network.size) for network in networks.values()]
-    if len({*sizes}) > 1:
-        caveats.append(f"The networks take images of {' and '.join(sizes)} pixels, and differ by that, too.")
-    lab = laboratory_settings(settings, renders, max(network.size for network in networks.values()))
-    if page.LABORATORY not in folders:
+    renders = out / "renders"
+    caveats = _compare_sizes(plan.networks.values())
+    has_renders = renders.exists() and not settings.overwrite
+    if page.LABORATORY not in plan.folders:
         try:
-            with nullcontext() if renders.exists() and not settings.overwrite else mitsuba():
-                folders = {page.LABORATORY: renders} | folders
+            # Without Mitsuba, new renders are impossible.
+            with nullcontext() if has_renders else mitsuba():
+                plan.folders = {page.LABORATORY: renders} | plan.folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and look_alikes with it ({error}).")
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
-        if settings.overwrite:
-            for name in (page.CLASSIFIER, page.HARDENED, renders.name):
-                shutil.rmtree(out / name, ignore_errors=True)
-        elif (out / CONFIG).exists():
-            require_same(out, settings, "out=", lambda key, old, new: old is None and key in ADDED)
-        write_config(out, settings, command=command_line("audit"))
-        if folders.get(page.LABORATORY) == renders:
-            _whole(renders, lambda path: write_laboratory(replace(lab, out=str(path))))
-        for key, network in networks.items():
-            own, (*rest,) = out / key, (other for other in networks.values() if other is not network)
-            own.mkdir(exist_ok=True)
-            _part(own / page.RECOGNIZED, recognized, network, views, *lights)
-            for kind in KINDS:
-                _part(own / f"{kind}.json", success_by_light, network, attacked, kind, own)
-            for name, folder in folders.items():
-                predictor = Predictor(network, network.classes, network.size, device)
-                _whole(own / name, partial(_evaluate, predictor, folder, settings.label))
-            if rest:
-                _part(own / page.TRANSFER, transfers, network, *rest, attacked, own)
-        names = {key: network.name for key, network in networks.items()}
-        return page.write_audit_page(settings.label, names, folders, out, caveats)
+        _begin(settings, out, renders)
+        if plan.folders.get(page.LABORATORY) == renders:
+            size = max(network.size for network in plan.networks.values())
+            laboratory = laboratory_settings(settings, renders, size)
+            _write_folder(
+                renders, lambda folder: write_laboratory(replace(laboratory, out=str(folder)))
+            )
+        for key in plan.networks:
+            plan.measure(key, out / key)
+        names = {key: network.name for key, network in plan.networks.items()}
+        return page.write_audit_page(settings.label, names, plan.folders, out, caveats)
+
+
+class _Plan:
+    """Networks and images of an audit, which are checked before anything is written.
+
+    Attributes:
+        label: Class whose objects are tested.
+        device: Device of the networks and the renders.
+        networks: Networks by the name of the folder of their parts.
+        folders: Folders of labeled images by the name of the part.
+        environments: Names or files of environments.
+        random_light_count: Number of random lights.
+        views: Views that are rendered in environment lighting.
+        attacked_views: Views that are attacked.
+    """
+
+    def __init__(self, settings: AuditSettings):
+        self.label = settings.label
+        self.device = choose_device(settings.device)
+        self.networks = _load_networks(settings, self.device)
+        meshes, look_alikes = read_meshes(settings)
+        folders = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
+        self.folders = {part: published(Path(folder)) for part, folder in folders.items() if folder}
+        items = [*meshes, *look_alikes]
+        _require_classes(self.networks.values(), items, self.folders.values(), self.label)
+        # The hard negatives are loaded, too, so that an unreadable file is
+        # reported at once.
+        objects = [load_object(item) for item in items]
+        for name in settings.environments:
+            load_light(name)
+        self.environments = [UNIFORM, *settings.environments]
+        self.random_light_count = settings.scale(LIGHTS)
+        seed = settings.seed
+        subjects = objects[: len(meshes)]
+        self.views = Views(subjects, settings.scale(VIEWS), seed, self.device)
+        self.attacked_views = Views(subjects, settings.scale(ATTACKED), seed, self.device)
+
+    def measure(self, key: str, own: Path) -> None:
+        """Measure the missing parts of one network.
+
+        Args:
+            key: Key of the network in `networks`.
+            own: Folder of its parts.
+        """
+        network = self.networks[key]
+        own.mkdir(exist_ok=True)
+        lights = (self.environments, self.random_light_count)
+        _write_part(own / page.RECOGNIZED, recognized, network, self.views, *lights)
+        for kind in KINDS:
+            path = own / f"{kind}.json"
+            _write_part(path, success_by_light, network, self.attacked_views, kind, own)
+        for name, folder in self.folders.items():
+            predictor = Predictor(network, network.classes, network.size, self.device)
+            _write_folder(own / name, partial(_evaluate, predictor, folder, self.label))
+        others = [other for other in self.networks.values() if other is not network]
+        if others:
+            path = own / page.TRANSFER
+            _write_part(path, transfers, network, *others, self.attacked_views, own)
+
+
+def _load_networks(settings: AuditSettings, device: torch.device) -> dict[str, Classifier]:
+    """Load the classifier and, if there is one, the hardened network."""
+    classifier = load_network(settings.classifier, settings.weights)
+    networks = {page.CLASSIFIER: classifier.to(device)}
+    if settings.hardened:
+        networks[page.HARDENED] = load_network(settings.hardened).to(device)
+    return networks
+
+
+def _require_classes(
+    networks: Collection[Classifier],
+    items: Sequence[ObjectSettings],
+    folders: Collection[Path],
+    label: str,
+) -> None:
+    """Raise InputError if a network lacks the class of a mesh or of a photograph."""
+    labels = {item.label for item in items if not item.label.startswith(FOREIGN)}
+    for network in networks:
+        for name in labels:
+            network.label(name)
+        for folder in folders:
+            find_photographs(folder, network.classes, label)
+
+
+def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
+    """Write a caveat if the networks take images of several sizes."""
+    sizes = [str(network.size) for network in networks]
+    if len(set(sizes)) == 1:
+        return []
+    listed = " and ".join(sizes)
+    return [f"The networks take images of {listed} pixels, and differ by that, too."]
+
+
+def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
+    """Remove earlier results or check that they have the same settings, and write the settings."""
+    if settings.overwrite:
+        for name in (page.CLASSIFIER, page.HARDENED, renders.name):
+            shutil.rmtree(out / name, ignore_errors=True)
+    elif (out / CONFIG).exists():
+        require_same(out, settings, "out=", _may_be_added)
+    write_config(out, settings, command=command_line("audit"))
+
+
+def _may_be_added(key: str, old: Any, new: Any) -> bool:
+    """Return whether a setting without a value may be set when an audit continues."""
+    return old is None and key in ADDED
 
 
 def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSettings:
-    """Choose the renders of the laboratory: of all patterns and all environments.
+    """Choose the settings of the renders: setups of all patterns and all environments.
 
     Args:
         settings: Settings of the audit.
         out: Folder of the renders.
-        size: Pixels per side.
+        size: Pixels per side of the renders.
 
     Returns:
-        Settings of the laboratory.
+        Settings of pnb-lab.
     """
-    objects = [asdict(item) for items in read_meshes(settings) for item in items]
-    setups = settings.scale(SETUPS) * (len(PATTERNS) + len(settings.environments))
+    meshes, look_alikes = read_meshes(settings)
+    kind_count = len(PATTERNS) + len(settings.environments)
     return LabSettings(
         out=str(out),
         label=settings.label,
-        meshes=objects,
-        setups=setups,
+        meshes=[asdict(item) for item in (*meshes, *look_alikes)],
+        setups=settings.scale(SETUPS) * kind_count,
         patterns=[*PATTERNS],
         environments=settings.environments,
         size=size,
@@ -127,53 +237,66 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
 
 
 def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
-    """Read the meshes and the look-alikes.
+    """Read the settings of the meshes and of the hard negatives.
 
-    A look-alike that names no class is of a class that networks may lack.
+    A hard negative without a label gets a label that starts with FOREIGN. The
+    networks need not have a class for this label.
 
     Args:
         settings: Settings of the audit.
 
     Returns:
-        The meshes of the label, and the look-alikes.
+        Settings of the meshes of the label, and of the hard negatives.
 
     Raises:
-        InputError: If one is of the wrong class.
+        InputError: If a mesh has another label than `settings.label`, or if a
+            hard negative has this label.
     """
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
     look_alikes = [*read_objects(settings.look_alikes, "", "look_alikes").values()]
     for item in look_alikes:
         item.label = item.label or FOREIGN + (solid_name(item.mesh) or Path(item.mesh).stem)
-    for key, items, own in (("meshes", meshes, True), ("look_alikes", look_alikes, False)):
-        for item in items:
-            if (item.label == settings.label) != own:
-                fault = f"{item.mesh} is of the class {item.label}, and label={settings.label}"
-                raise InputError(f"{key}: {fault}", key)
+    for item in meshes:
+        if item.label != settings.label:
+            raise _wrong_class("meshes", item, settings.label)
+    for item in look_alikes:
+        if item.label == settings.label:
+            raise _wrong_class("look_alikes", item, settings.label)
     return meshes, look_alikes
 
 
+def _wrong_class(key: str, item: ObjectSettings, label: str) -> InputError:
+    """Return the error for a mesh that is listed under the wrong key."""
+    return InputError(f"{key}: {item.mesh} is of the class {item.label}, and label={label}", key)
+
+
 def _own_results(out: Path) -> Collection[str]:
-    """The results in a folder that an audit goes on with: all, if it is that of an audit."""
+    """Return RESULTS if the folder is the folder of an audit, which may continue, else nothing."""
     with suppress(InputError):
-        return RESULTS if "look_alikes" in read_config(out / CONFIG) else ()
+        if "look_alikes" in read_config(out / CONFIG):
+            return RESULTS
     return ()
 
 
-def _part(path: Path, measure: Callable[..., dict[str, Any]], *arguments: Any) -> None:
-    """Write what is measured as JSON, unless the file is there."""
+def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
+    """Call a function and write its result as JSON, unless the file exists."""
     if not path.exists():
         write_whole(path, json.dumps(measure(*arguments)) + "\n", durable=True)
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
-    """Score a network on photographs, but for those that cannot be read."""
+    """Score a network on all photographs that can be read."""
     evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
-def _whole(folder: Path, make: Callable[[Path], object]) -> None:
-    """Make a folder under another name, which it keeps until it is whole, unless it is there."""
+def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
+    """Write a folder, unless it exists.
+
+    The folder gets its name when it is complete. Until then, ".part" follows
+    the name.
+    """
     if not folder.exists():
         unfinished = folder.with_name(f"{folder.name}.part")
         shutil.rmtree(unfinished, ignore_errors=True)
-        make(unfinished)
+        write(unfinished)
         unfinished.rename(folder)

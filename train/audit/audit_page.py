@@ -1,6 +1,6 @@
-"""The page of an audit, from the files of its parts."""
+"""Write the report of an audit from the files of its parts."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,18 +13,29 @@ from train.audit.lights import FURTHER, KINDS, RANDOM, SIDE, STEPS
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
-from train.evaluation.tables import Estimate, fraction
+from train.evaluation.tables import Estimate, Proportion, fraction
 from train.report import plots, summary
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
-from train.runs.run_folder import CONFIG, read_config, read_json
+from train.runs.run_config import CONFIG, read_config, read_json
 
-CLASSIFIER, HARDENED = "classifier", "hardened"  # the folders of the networks' parts
-LABORATORY, PHOTOGRAPHS = "laboratory", "photographs"
-RECOGNIZED, TRANSFER = "recognized.json", "transfer.json"
-WORST = 10  # images of a network
-SAFE = 0.9  # least fraction of the label that is recognized, and of other things that are not taken for it
-Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]  # by name of a network, and part
+# Folders of the parts of the networks.
+CLASSIFIER = "classifier"
+HARDENED = "hardened"
+# Parts of a network that are scored on a folder of images.
+LABORATORY = "laboratory"
+PHOTOGRAPHS = "photographs"
+# File of `train.audit.lights.recognized` in the folder of a network.
+RECOGNIZED = "recognized.json"
+# File of `train.audit.lights.transfers` in the folder of a network.
+TRANSFER = "transfer.json"
+# Number of images in a gallery of the worst images.
+WORST = 10
+# Minimum fraction of correctly classified images of a network that is called
+# safe, both of the label and of other things.
+SAFE = 0.9
+# Predictions by the name of a network and by part, in the order of the images.
+Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
 
 
 def write_audit_page(
@@ -34,69 +45,99 @@ def write_audit_page(
     out: Path,
     caveats: Sequence[str],
 ) -> Path:
-    """Write report.html of the parts in `out`. names: of the networks, by their folders. folders: of the images that
-    were scored, by part. caveats: sentences that come first."""
-    at = {name: out / key for key, name in names.items()}
+    """Write report.html from the parts of an audit.
+
+    Args:
+        label: Class whose objects were tested.
+        names: Names of the networks by the folders of their parts in `out`.
+        folders: Folders of the scored images by part.
+        out: Folder of the audit.
+        caveats: Sentences at the beginning of the report.
+
+    Returns:
+        Path of the report.
+    """
+    paths = {name: out / key for key, name in names.items()}
+    scored = {
+        name: {part: read_predictions(path / part / PREDICTIONS, label) for part in folders}
+        for name, path in paths.items()
+    }
+    correct = {name: read_json(path / RECOGNIZED) for name, path in paths.items()}
     counts = {
         name: {kind: read_json(path / f"{kind}.json") for kind in KINDS}
-        for name, path in at.items()
+        for name, path in paths.items()
     }
-    correct = {name: read_json(path / RECOGNIZED) for name, path in at.items()}
-    scored, runs, pictures = {}, {}, {kind: list[Picture]() for kind in KINDS}
-    for name, path in at.items():
-        scored[name] = {
-            part: read_predictions(path / part / PREDICTIONS, label) for part in folders
-        }
-        runs[name] = [
-            summary.RunSummary(path, name, {"network": name}, summary.read_summaries(path), None)
-        ]
+    transfers = {}
+    if len(paths) > 1:
+        transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
+    return write_page(
+        out,
+        "audit.html.jinja",
+        title=f"Audit: {label} in strange light",
+        about=" and ".join(paths),
+        label=label,
+        kinds=KINDS,
+        steps=(STEPS, FURTHER),
+        counts=counts,
+        correct=correct,
+        pictures=_attack_pictures(paths, counts),
+        transfers=transfers,
+        answers=[_answer(label, name, path, folders) for name, path in paths.items()],
+        photographs=_score_sections(paths),
+        rates={name: _rates(lights) for name, lights in correct.items()},
+        worst=_worst(label, folders, scored),
+        caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
+        agreement=_agreement(scored),
+        config=read_config(out / CONFIG),
+    )
+
+
+def _attack_pictures(
+    paths: Mapping[str, Path], counts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, list[Picture]]:
+    """Read the pictures of one adversary of each network, by kind of lighting."""
+    pictures: dict[str, list[Picture]] = {kind: [] for kind in KINDS}
+    for name, path in paths.items():
         for kind, part in counts[name].items():
-            caption = f"{name}: {' and '.join(part.get('predicted', ()))}"
+            predicted = " and ".join(part.get("predicted", ()))
+            caption = f"{name}: {predicted}"
             pictures[kind] += plots.from_file(path / f"{kind}.png", caption, 2 * SIDE, caption)
-    pairs = zip(*(by_part.get(PHOTOGRAPHS, ()) for by_part in scored.values()), strict=True)
-    same = [len({item.predicted for item in pair}) == 1 for pair in pairs]
-    content: dict[str, Any] = {
-        "transfers": {name: read_json(path / TRANSFER) for name, path in at.items() if len(at) > 1},
-        "answers": [_answer(label, name, path, folders) for name, path in at.items()],
-        "photographs": [
-            scores_section(title, group) for title, group in summary.by_images(runs).items()
-        ],
-        "rates": {name: _rates(lights) for name, lights in correct.items()},
-        "worst": _worst(label, folders, scored),
-    }
-    content |= {
-        "title": f"Audit: {label} in strange light",
-        "about": " and ".join(at),
-        "label": label,
-    }
-    content |= {
-        "kinds": KINDS,
-        "steps": (STEPS, FURTHER),
-        "counts": counts,
-        "correct": correct,
-        "pictures": pictures,
-    }
-    for key in folders:
-        if files := read_json(path / key / SUMMARY)["unreadable"]:  # by all networks
-            caveats = [
-                *caveats,
-                f"{len(files)} of the {key} cannot be read, the first being {files[0]}.",
-            ]
-    content |= {
-        "caveats": caveats,
-        "agreement": fraction(sum(same), len(same)),
-        "config": read_config(out / CONFIG),
-    }
-    return write_page(out, "audit.html.jinja", **content)
+    return pictures
+
+
+def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
+    """Collect the scores of all networks, by folder of images."""
+    runs = {}
+    for name, path in paths.items():
+        scores = summary.read_summaries(path)
+        runs[name] = [summary.RunSummary(path, name, {"network": name}, scores, None)]
+    return [scores_section(title, group) for title, group in summary.by_images(runs).items()]
+
+
+def _unreadable_caveats(parts: Collection[str], path: Path) -> Iterator[str]:
+    """Say which images cannot be read, by the scores of one network in `path`."""
+    for part in parts:
+        files = read_json(path / part / SUMMARY)["unreadable"]
+        if files:
+            yield f"{len(files)} of the {part} cannot be read, the first being {files[0]}."
+
+
+def _agreement(scored: Predictions) -> Proportion:
+    """Compute the fraction of photographs to which all networks give the same class."""
+    by_network = [parts.get(PHOTOGRAPHS, ()) for parts in scored.values()]
+    is_same = []
+    for predictions in zip(*by_network, strict=True):
+        is_same.append(len({item.predicted for item in predictions}) == 1)
+    return fraction(sum(is_same), len(is_same))
 
 
 class Finding(NamedTuple):
-    """How often a network is right, in words and as a number.
+    """How often a network is right, as text and as numbers.
 
     Attributes:
         text: Sentence without a period.
         right: Fraction of images on which the network is right.
-        least: Low end of the interval of this fraction.
+        least: Low end of the 95% interval of this fraction.
     """
 
     text: str
@@ -105,7 +146,7 @@ class Finding(NamedTuple):
 
 
 def _answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
-    """Say whether a network is safe in strange light, and why not."""
+    """Say whether a network is safe in unusual lighting, and why it is not."""
     findings = _find_rates(label, folder, parts)
     faults = [finding.text for finding in findings if finding.right < SAFE]
     faults += _attack_faults(folder)
@@ -119,39 +160,42 @@ def _answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
 
 
 def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Finding]:
-    """Find how often a network is right on renders and on photographs, where that is known."""
+    """Find how often a network is right on renders and on the images of each part."""
     rates = _rates(read_json(folder / RECOGNIZED))
-    findings = [_recognized(what, rate) for what, rate in rates.items()]
+    findings = [_recognized(subject, rate) for subject, rate in rates.items()]
     for part in parts:
         scores = read_json(folder / part / SUMMARY)
         recall = read_metric(scores, "recall")
         findings.append(_recognized(f"{label} in the {part}", recall))
-        mistaken = read_metric(scores, "false_positive_rate")
-        findings.append(_not_mistaken(f"other things for {label} in the {part}", mistaken))
+        false_positive_rate = read_metric(scores, "false_positive_rate")
+        subject = f"other things for {label} in the {part}"
+        findings.append(_not_mistaken(subject, false_positive_rate))
     return [finding for finding in findings if finding is not None]
 
 
-def _recognized(what: str, rate: Estimate | None) -> Finding | None:
-    """Say how much of something a network recognizes; None if that is unknown."""
-    if rate is None or rate.value is None or rate.low is None:
+def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
+    """Say how many images of a subject a network recognizes. None if the recall is unknown."""
+    if recall is None or recall.value is None or recall.low is None:
         return None
-    return Finding(f"it recognizes {rate.value:.0%} of {what}", rate.value, rate.low)
+    text = f"it recognizes {recall.value:.0%} of {subject}"
+    return Finding(text, right=recall.value, least=recall.low)
 
 
-def _not_mistaken(what: str, rate: Estimate | None) -> Finding | None:
-    """Say how much a network takes for something else; None if that is unknown."""
-    if rate is None or rate.value is None or rate.high is None:
+def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
+    """Say how many images of a subject a network mistakes. None if the error rate is unknown."""
+    if error_rate is None or error_rate.value is None or error_rate.high is None:
         return None
-    return Finding(f"it takes {rate.value:.0%} of {what}", 1 - rate.value, 1 - rate.high)
+    text = f"it takes {error_rate.value:.0%} of {subject}"
+    return Finding(text, right=1 - error_rate.value, least=1 - error_rate.high)
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Say from which radius on an attack with each kind of light loses half of the views."""
+    """Name the smallest radius at which an attack on each kind of lighting fools half of the views."""
     faults = []
     for kind, light in KINDS.items():
         counts = read_json(folder / f"{kind}.json")
-        for radius, lost in zip(light.radii, counts["adversarial"], strict=True):
-            if 0 < counts["correct"] <= 2 * lost:
+        for radius, fooled_count in zip(light.radii, counts["adversarial"], strict=True):
+            if 0 < counts["correct"] <= 2 * fooled_count:
                 attack = f"an attack with {light.title} of radius {radius:g}"
                 faults.append(f"{attack} loses half of the views")
                 break
@@ -159,9 +203,9 @@ def _attack_faults(folder: Path) -> list[str]:
 
 
 def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
-    """Compute the fraction of renders that is recognized in each kind of light.
+    """Compute the fraction of recognized renders in environments and in random lights.
 
-    The intervals draw views, and lights of each.
+    The bootstrap of the interval draws views, and then lights of each view.
     """
     random = {name for name in correct if name.startswith(RANDOM)}
     lights = {
@@ -170,7 +214,7 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     }
     rates = {}
     for title, names in lights.items():
-        # A row for each view, and a column for each light.
+        # The array has a row for each view and a column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
         views = np.arange(len(hits)).repeat(hits.shape[1])
         replicates = bootstrap(partial(weighted_mean, hits.ravel()), views)
@@ -178,35 +222,45 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     return rates
 
 
+class _ScoredImage(NamedTuple):
+    """Prediction of one network, with the part and the index of the image."""
+
+    part: str
+    index: int
+    prediction: Prediction
+
+
 def _worst(
     label: str, folders: Mapping[str, Path], scored: Predictions
 ) -> dict[str, list[Picture]]:
-    """Galleries of the label's images of the lowest log-odds, and of other things of the highest, by title."""
-    pictures: dict[str, list[Picture]] = {}
+    """Make two galleries for each network, by title.
+
+    The first one has the images of the label with the lowest log-odds. The
+    second one has the images of other things with the highest log-odds.
+    """
+    galleries: dict[str, list[Picture]] = {}
     for name, by_part in scored.items():
         rows = [
-            (part, index, item)
-            for part, items in by_part.items()
-            for index, item in enumerate(items)
+            _ScoredImage(part, index, prediction)
+            for part, predictions in by_part.items()
+            for index, prediction in enumerate(predictions)
         ]
-        rows.sort(key=lambda row: row[2].log_odds)
-        own = [row for row in rows if row[2].photograph.label == label][:WORST]
-        others = [row for row in reversed(rows) if row[2].photograph.label != label][:WORST]
-        galleries = {
-            f"{label} that {name} doubts most": own,
-            f"what {name} most takes for {label}": others,
-        }
-        for title, chosen in galleries.items():
-            pictures[title] = []
-            for part, index, item in chosen:
-                about = {
-                    network: predictions[part][index] for network, predictions in scored.items()
-                }
-                texts = [
-                    f"{network}: {each.probability:.0%} {each.predicted}"
-                    for network, each in about.items()
-                ]
-                caption = f"{item.photograph.label}, {item.photograph.source}: {'; '.join(texts)}"
-                image = Image.fromarray(read_square(folders[part] / item.photograph.path, SIDE))
-                pictures[title].append(plots.encoded(image, caption, caption))
-    return pictures
+        rows.sort(key=lambda row: row.prediction.log_odds)
+        positives = [row for row in rows if row.prediction.photograph.label == label]
+        negatives = [row for row in reversed(rows) if row.prediction.photograph.label != label]
+        draw = partial(_draw_image, folders, scored)
+        galleries[f"{label} that {name} doubts most"] = list(map(draw, positives[:WORST]))
+        galleries[f"what {name} most takes for {label}"] = list(map(draw, negatives[:WORST]))
+    return galleries
+
+
+def _draw_image(folders: Mapping[str, Path], scored: Predictions, row: _ScoredImage) -> Picture:
+    """Draw an image with the predictions of all networks as its caption."""
+    photograph = row.prediction.photograph
+    texts = []
+    for network, by_part in scored.items():
+        prediction = by_part[row.part][row.index]
+        texts.append(f"{network}: {prediction.probability:.0%} {prediction.predicted}")
+    caption = f"{photograph.label}, {photograph.source}: {'; '.join(texts)}"
+    image = Image.fromarray(read_square(folders[row.part] / photograph.path, SIDE))
+    return plots.encoded(image, caption, caption)

@@ -1,6 +1,8 @@
-"""How surely a classifier recognizes renders, and how far each kind of light must change until it errs.
+"""Measure how a classifier recognizes renders in many kinds of lighting, and attack the lighting.
 
-Every classifier gets the same objects from the same sides, at its own size. Light is nowhere negative.
+All classifiers of an audit get the same objects from the same cameras. The
+images of each classifier have the size that it takes. No lighting has a
+negative radiance in any direction.
 """
 
 import io
@@ -20,7 +22,7 @@ from augment.attacks.checks import success_by_radius
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.parameter_settings import SkylightSettings, StepSettings
-from augment.attacks.problem import build_problem
+from augment.attacks.problem import AttackProblem, build_problem
 from augment.attacks.settings import NOISE_MARGIN, AttackSettings
 from augment.classifiers import Classifier
 from augment.progress import progress
@@ -41,37 +43,89 @@ from renderer.light.presets import load_light, perturb
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import choose
 
-BATCH = 16  # images per pass
-LIGHT = "grace"  # in which all attacks but that of the sky begin
-AMPLITUDE = 0.5  # of random light, in each coefficient: that of the paper's random arm
-RANDOM = "random "  # begins the name of a random light
-CAMERA = orbit_cameras(1, 2.6, *map(math.radians, (60, 45, 40)))
+# Images in one pass of the classifier.
+BATCH = 16
+# Environment lighting of the views, before an attack changes it.
+LIGHT = "grace"
+# Standard deviation of the noise in each spherical-harmonic coefficient of a
+# random light. The paper's training with random lighting has the same value.
+AMPLITUDE = 0.5
+# Start of the name of every random light.
+RANDOM = "random "
+# Distance of the camera from the origin, in world units, and its azimuth,
+# elevation and field of view, in degrees.
+CAMERA_DISTANCE = 2.6
+CAMERA_ANGLES = (60, 45, 40)
+CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *map(math.radians, CAMERA_ANGLES))
+# Range of the random cameras, poses and sizes, around CAMERA and the objects.
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
-STEPS = 10  # of a descent at each radius, and random draws
-FURTHER = 20  # steps of an attack that goes on after its success
-SIDE = 200  # pixels of a picture
+# Steps of the attack at each radius, and random draws at each radius.
+STEPS = 10
+# Steps of an attack that continues after its success.
+FURTHER = 20
+# Steps of an attack that are as long together as the radius.
+STEPS_PER_RADIUS = 4
+# Pixels per side of a picture on the page.
+SIDE = 200
+# Gray value of the background, in sRGB.
+BACKGROUND = 0.5
 
 
 class LightKind(NamedTuple):
-    """Light that an attack changes, within L∞ balls of radii. local: lights beside those from all around."""
+    """Kind of lighting that an attack changes, within L∞ balls of several radii.
+
+    Attributes:
+        title: Name of the lighting in the report.
+        unit: Unit of the radii in the report.
+        radii: Radii of the L∞ balls, in ascending order.
+        local: Light sources in the scene in addition to the environment lighting.
+    """
 
     title: str
-    unit: str  # of the radii
+    unit: str
     radii: tuple[float, ...]
     local: tuple[ProjectorSettings | LampsSettings, ...] = ()
 
 
 KINDS = {
-    "lighting": LightKind("light from all around", "in each coefficient", (0.02, 0.05, 0.1, 0.3)),
-    "skylight": LightKind("a daylight sky", "radians of the sun, a quarter of turbidity", (0.1, 0.3, 1.0, 3.0)),
-    "projector": LightKind("a projector", "of its power, in each pixel", (0.03, 0.1, 0.3, 1.0), (ProjectorSettings(),)),
-    "lamps": LightKind("four lamps", "of power, in each channel", (0.3, 1.0, 3.0, 10.0), (LampsSettings(),)),
+    "lighting": LightKind(
+        title="light from all around",
+        unit="in each coefficient",
+        radii=(0.02, 0.05, 0.1, 0.3),
+    ),
+    "skylight": LightKind(
+        title="a daylight sky",
+        unit="radians of the sun, a quarter of turbidity",
+        radii=(0.1, 0.3, 1.0, 3.0),
+    ),
+    "projector": LightKind(
+        title="a projector",
+        unit="of its power, in each pixel",
+        radii=(0.03, 0.1, 0.3, 1.0),
+        local=(ProjectorSettings(),),
+    ),
+    "lamps": LightKind(
+        title="four lamps",
+        unit="of power, in each channel",
+        radii=(0.3, 1.0, 3.0, 10.0),
+        local=(LampsSettings(),),
+    ),
 }
 
 
 @dataclass(frozen=True)
 class Views:
-    """The objects in turn, each turned and seen from the projector's side at random; the seed alone decides how."""
+    """Views of objects, in random poses and from random cameras.
+
+    The pose and the camera of a view depend only on the seed and on the number
+    of views.
+
+    Attributes:
+        objects: Objects, which the views show in turn.
+        count: Number of views.
+        seed: Seed of the poses and the cameras.
+        device: Device of the renders.
+    """
 
     objects: Sequence[SceneObject]
     count: int
@@ -79,93 +133,248 @@ class Views:
     device: torch.device
 
     def scene(self, size: int, kind: str = "lighting") -> Scene:
-        """An example of each view, in the lights of a kind of attack."""
-        shown = [self.objects[index % len(self.objects)] for index in range(self.count)]
-        basis, lights = with_local_lights(load_light(LIGHT), [build_local_light(light) for light in KINDS[kind].local])
-        image = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")
-        given = CAMERA, torch.full((1, 1, size, size), 0.5), lights.to(self.device), image, choose("auto")
-        scene = Scene.grid(shown, *given, shared=False, basis=basis)
+        """Build a scene with one example for each view.
+
+        Args:
+            size: Pixels per side of the renders.
+            kind: Key of KINDS. It decides which light sources the scene has.
+
+        Returns:
+            Scene of `count` examples.
+        """
+        objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
+        local_lights = [build_local_light(light) for light in KINDS[kind].local]
+        basis, lights = with_local_lights(load_light(LIGHT), local_lights)
+        scene = Scene.grid(
+            objects,
+            CAMERA,
+            torch.full((1, 1, size, size), BACKGROUND),
+            lights.to(self.device),
+            ImageSettings(size, samples=2, encoding="srgb", normals="smooth"),
+            choose("auto"),
+            shared=False,
+            basis=basis,
+        )
         return vary(scene, VARIATION, generator(self.seed, "views"))
 
 
-def recognized(classifier: Classifier, views: Views, environments: Sequence[str], count: int) -> dict[str, list[bool]]:
-    """By name of a light, an environment as `load_light` takes it or one of `count` random lights, whether each view is
-    classified as its label."""
-    drawn = perturb(load_light(LIGHT), count, AMPLITUDE, None, generator(views.seed, "lights"))
+def recognized(
+    classifier: Classifier,
+    views: Views,
+    environments: Sequence[str],
+    count: int,
+) -> dict[str, list[bool]]:
+    """Test in which environment lighting the classifier recognizes each view.
+
+    Args:
+        classifier: Classifier to test.
+        views: Views of objects of one class.
+        environments: Names or files of environments, as `load_light` takes them.
+        count: Number of random lights in addition.
+
+    Returns:
+        Whether each view is classified correctly, by the name of the lighting.
+    """
+    noise = generator(views.seed, "lights")
+    random_lights = perturb(load_light(LIGHT), count, AMPLITUDE, None, noise)
     lights = {Path(name).stem: load_light(name) for name in environments}
-    lights |= {f"{RANDOM}{number}": light for number, light in enumerate(HARMONICS.project_nonnegative(drawn), 1)}
-    scene, rows, correct = views.scene(classifier.size), torch.arange(views.count, device=views.device), {}
+    for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
+        lights[f"{RANDOM}{number}"] = light
+    scene = views.scene(classifier.size)
+    examples = torch.arange(views.count, device=views.device)
+    recognized_by_light = {}
     for name, light in progress(lights.items(), "renders in other light"):
+        conditions = Conditions(light.to(scene.lights).expand(len(scene), -1, -1))
         with torch.no_grad():
-            images = scene.render(Conditions(light.to(scene.lights).expand(len(scene), -1, -1)), rows)
-        correct[name] = _correct(classifier, scene, images).tolist()
-    return correct
+            images = scene.render(conditions, examples)
+        recognized_by_light[name] = _is_correct(classifier, scene, images).tolist()
+    return recognized_by_light
 
 
-def _correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
-    """(E,) bool: whether images (E, 1, 3, H, W) of a scene, whose objects are of one class, are classified as it."""
-    return logits_of(classifier, images, BATCH)[:, 0].argmax(1) == classifier.label(scene.labels[0])
+def _is_correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
+    """Test whether each image (E, 1, 3, H, W) of a scene with one class gets that class, (E,)."""
+    logits = logits_of(classifier, images, BATCH)[:, 0]
+    return logits.argmax(1) == classifier.label(scene.labels[0])
 
 
-def adversaries(classifier: Classifier, views: Views, kind: str, further: bool = False) -> AttackResult:
-    """An attack within a kind's largest radius, by signed steps of a quarter of it, until the classifier errs by more
-    than a sensor's noise changes; or all of FURTHER steps, however surely it errs."""
+def adversaries(
+    classifier: Classifier,
+    views: Views,
+    kind: str,
+    further: bool = False,
+) -> AttackResult:
+    """Attack the lighting within the largest radius of its kind.
+
+    A step changes each value by a quarter of the radius, in the direction of
+    the sign of the gradient.
+
+    Args:
+        classifier: Attacked classifier.
+        views: Views to attack.
+        kind: Key of KINDS.
+        further: Whether to take all FURTHER steps. By default an attack ends
+            when noise of a camera's sensor no longer corrects the prediction,
+            or after STEPS steps.
+
+    Returns:
+        Result of the attack.
+    """
     radius = KINDS[kind].radii[-1]
-    changed = {kind: (SkylightSettings if kind == "skylight" else StepSettings)("linf", radius, "sign", radius / 4)}
-    options: dict[str, Any] = {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
+    settings_class = SkylightSettings if kind == "skylight" else StepSettings
+    limits: dict[str, Any] = {
+        kind: settings_class("linf", radius, "sign", radius / STEPS_PER_RADIUS)
+    }
     if further:
-        options = {"max_steps": FURTHER, "margin": FACTOR}
-    settings = AttackSettings(**(options | changed), batch_size=BATCH)
-    return attack(classifier, views.scene(classifier.size, kind), settings=settings, seed=views.seed, force=True)
+        limits |= {"max_steps": FURTHER, "margin": FACTOR}
+    else:
+        limits |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
+    return attack(
+        classifier,
+        views.scene(classifier.size, kind),
+        settings=AttackSettings(**limits, batch_size=BATCH),
+        seed=views.seed,
+        force=True,
+    )
 
 
-def success_by_light(classifier: Classifier, views: Views, kind: str, out: Path) -> dict[str, Any]:
-    """n: views; correct: of these, before. adversarial, random: at each radius, how many of the correct ones a descent
-    or random draws turn wrong, and the draws alone, with the noise of a sensor; adversarial_without_noise and
-    random_without_noise. The adversaries at the largest radius are kept in out/KIND.npz for `transfers`; one is written
-    to out/KIND.png; predicted: its classes."""
-    result, radii = adversaries(classifier, views, kind), KINDS[kind].radii
-    clean, by_radius = result.clean_correct, success_by_radius(result, [radius / radii[-1] for radius in radii])
-    largest, counts = by_radius[-1], dict[str, Any]()
-    for end, success in (("", result.success), ("_without_noise", result.success_without_noise)):
-        adversarial, random = f"adversarial{end}", f"random{end}"
-        largest[adversarial] |= success[clean].cpu()  # from the start, not from where smaller radii ended
+def success_by_light(
+    classifier: Classifier,
+    views: Views,
+    kind: str,
+    out: Path,
+) -> dict[str, Any]:
+    """Count the views that are misclassified after attacks within each radius.
+
+    The function writes the adversaries of the largest radius to out/KIND.npz,
+    which `transfers` reads. If there are any, it also writes a picture of the
+    first one, before and after the attack, to out/KIND.png.
+
+    Args:
+        classifier: Attacked classifier.
+        views: Views to attack.
+        kind: Key of KINDS.
+        out: Existing folder.
+
+    Returns:
+        Dictionary with the keys
+
+        - n: number of views,
+        - correct: number of views that are classified correctly before,
+        - adversarial: for each radius, how many of the correct views an attack
+          or random draws make misclassified, also with noise of a sensor,
+        - random: for each radius, the same of the random draws alone,
+        - adversarial_without_noise and random_without_noise: the same two
+          counts for images without noise,
+        - predicted: classes of the picture before and after, if there is one.
+    """
+    result = adversaries(classifier, views, kind)
+    radii = KINDS[kind].radii
+    clean = result.clean_correct
+    by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
+    counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
+    for end, success in (
+        ("", result.success),
+        ("_without_noise", result.success_without_noise),
+    ):
+        adversarial = f"adversarial{end}"
+        random = f"random{end}"
+        # Within the largest radius, `result` is an attack from the start. The
+        # attack of `by_radius` continues from the end of the smaller radii.
+        by_radius[-1][adversarial] |= success[clean].cpu()
         counts[adversarial] = [int((row[adversarial] | row[random]).sum()) for row in by_radius]
         counts[random] = [int(row[random].sum()) for row in by_radius]
-    wrong = clean & result.success
-    kept = io.BytesIO()
-    np.savez(kept, wrong=wrong.cpu(), values=result.descent.values.cpu())
-    write_whole(out / f"{kind}.npz", kept.getbuffer())
-    if wrong.any():
-        row = int(wrong.nonzero()[0])
-        logits = torch.stack([result.logits_before[row, 0], result.logits[row, 0]])
+    is_wrong = clean & result.success
+    content = io.BytesIO()
+    np.savez(content, wrong=is_wrong.cpu(), values=result.descent.values.cpu())
+    write_whole(out / f"{kind}.npz", content.getbuffer())
+    if is_wrong.any():
+        example = int(is_wrong.nonzero()[0])
+        logits = torch.stack([result.logits_before[example, 0], result.logits[example, 0]])
         counts["predicted"] = predictions(logits, classifier.classes)["predicted"]
-        pair = to_bytes(torch.cat([result.images_before[row, 0], result.images[row, 0]], dim=2).cpu()).permute(1, 2, 0)
-        method = Image.Resampling.NEAREST if classifier.size < SIDE else Image.Resampling.LANCZOS
-        shown = Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method)
-        write_image(out / f"{kind}.png", shown)
-    return {"n": views.count, "correct": int(clean.sum()), **counts}
+        write_image(out / f"{kind}.png", _draw_pair(result, example))
+    return counts
 
 
-def transfers(attacked: Classifier, other: Classifier, views: Views, out: Path) -> dict[str, dict[str, list[int]]]:
-    """[successes, n, successes without noise] by kind of adversaries, those that `success_by_light` kept in `out` and
-    further ones, rendered at the size of another classifier, which is right before in `n`."""
+def _draw_pair(result: AttackResult, example: int) -> Image.Image:
+    """Draw the first view of an example before and after the attack, side by side."""
+    before = result.images_before[example, 0]
+    after = result.images[example, 0]
+    pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
+    is_enlarged = before.shape[-1] < SIDE
+    method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS
+    return Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method)
+
+
+def transfers(
+    attacked: Classifier,
+    other: Classifier,
+    views: Views,
+    out: Path,
+) -> dict[str, dict[str, list[int]]]:
+    """Test whether the adversaries of one classifier also fool another classifier.
+
+    "first" are the adversaries that `success_by_light` wrote. "further" are
+    adversaries of attacks that continue after their success. All are rendered
+    at the size of the other classifier.
+
+    Args:
+        attacked: Classifier that was attacked.
+        other: Classifier to test.
+        views: Attacked views.
+        out: Folder that `success_by_light` wrote for the attacked classifier.
+
+    Returns:
+        For each kind of lighting and for "further" and "first", three counts:
+        of adversaries that also fool the other classifier, of adversaries
+        whose view it classifies correctly before, and of adversaries that fool
+        it in images without noise of a sensor.
+    """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
         result = adversaries(attacked, views, kind, further=True)
-        found = {"further": (result.clean_correct & result.success, result.descent.values)}
-        with np.load(out / f"{kind}.npz") as kept:
-            found["first"] = torch.from_numpy(kept["wrong"]), torch.from_numpy(kept["values"])
+        is_wrong = result.clean_correct & result.success
+        found = {"further": (is_wrong, result.descent.values)}
+        with np.load(out / f"{kind}.npz") as saved:
+            found["first"] = (torch.from_numpy(saved["wrong"]), torch.from_numpy(saved["values"]))
         problem = build_problem(result.settings, views.scene(other.size, kind))
-        right, counts[kind] = _correct(other, problem.scene, problem.images(problem.start)), {}
-        goal = Goal(torch.full_like(result.goal.source, other.label(problem.scene.labels[0])))
-        model = preprocessed_model(result.settings, other)
-        for name, (wrong, values) in found.items():
-            both = wrong.to(right) & right
-            images = problem.images(values.to(problem.start))
-            predicted = logits_of(model, images, BATCH).argmax(2)
-            of_all = problem.everything, goal, result.settings, result.seed
-            lost = both & fooled_in_views(model, images, predicted, *of_all).all(1)
-            lost_without_noise = both & goal.reached(predicted)
-            counts[kind][name] = [int(part.sum()) for part in (lost, both, lost_without_noise)]
+        test = _TransferTest(result, other, problem)
+        counts[kind] = {name: test.count(*found_here) for name, found_here in found.items()}
     return counts
+
+
+class _TransferTest:
+    """Test of adversaries of one attack on another classifier."""
+
+    def __init__(self, result: AttackResult, other: Classifier, problem: AttackProblem):
+        label = other.label(problem.scene.labels[0])
+        self.result = result
+        self.problem = problem
+        self.is_correct = _is_correct(other, problem.scene, problem.images(problem.start))
+        self.goal = Goal(torch.full_like(result.goal.source, label))
+        self.model = preprocessed_model(result.settings, other)
+
+    def count(self, is_wrong: Tensor, values: Tensor) -> list[int]:
+        """Count fooled and all adversaries whose view was correct before, and those without noise.
+
+        Args:
+            is_wrong: Whether each example fools the attacked classifier, shape (E,).
+            values: Attacked values of all examples, shape (E, D).
+
+        Returns:
+            The three counts of `transfers`.
+        """
+        is_tested = is_wrong.to(self.is_correct) & self.is_correct
+        images = self.problem.images(values.to(self.problem.start))
+        predicted = logits_of(self.model, images, BATCH).argmax(2)
+        is_fooled = fooled_in_views(
+            self.model,
+            images,
+            predicted,
+            self.problem.everything,
+            self.goal,
+            self.result.settings,
+            self.result.seed,
+        ).all(1)
+        is_fooled_without_noise = self.goal.reached(predicted)
+        parts = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
+        return [int(part.sum()) for part in parts]

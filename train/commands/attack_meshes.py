@@ -39,7 +39,8 @@ from train.report.attack_tables import (
     write_sweeps,
     write_transfers,
 )
-from train.runs.run_folder import sole_writer, write_config
+from train.runs.run_config import write_config
+from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer

@@ -8,7 +8,7 @@ from train.commands.results import require_replaceable
 from train.data.photographs import require_outside
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
-from train.runs.run_folder import sole_writer
+from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network, load_run
 from train.settings import label_names, published
 from train.system.device import MixedPrecision, choose_device, choose_precision

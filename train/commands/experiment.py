@@ -1,10 +1,10 @@
-"""pnb-train: the runs of one command, and the table that compares them."""
+"""Train the runs of one pnb-train command, and print the table that compares them."""
 
 import logging
 import shlex
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -21,70 +21,98 @@ from train.report.comparison import format_table
 from train.report.report_page import report_of
 from train.report.summary import summarize
 from train.runs import checkpoint
-from train.runs.run_folder import CONFIG, given_command, require_same_run, resumed, sole_writer
+from train.runs.run_config import CONFIG, given_command, require_same_run, resumed
+from train.runs.run_lock import sole_writer
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
 from train.training.initial import load_initial
 from train.training.run import Run
 
-CHOICES = ("experiment", "augment", "data", "launcher")  # groups of conf/
+# Folders of conf/ from which an override can choose a file.
+CHOICES = ("experiment", "augment", "data", "launcher")
+# File with the lines that a run prints.
 LOG = "train.log"
 
 
 def train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Train what a command asks for, in this process or in each that torchrun starts.
+    """Train the runs of a command, in this process or in each process of torchrun.
 
     Args:
-        config: The configuration of the command.
-        overrides: Its overrides.
+        config: Configuration of the command.
+        overrides: Overrides of the command, such as "train.epochs=3".
     """
-    # A full disk in TensorBoard's thread, which the main thread raises, too, is not reported twice.
-    threading.excepthook = lambda error: None if error.exc_type is OSError else threading.__excepthook__(error)
+    threading.excepthook = _report_thread_error
     with process_group():
         _train(config, overrides)
 
 
+def _report_thread_error(error: threading.ExceptHookArgs) -> None:
+    """Print the error of a thread, unless it is an OSError.
+
+    On a full disk, the thread of TensorBoard raises OSError. The main thread
+    raises this error, too, so that it would be printed twice.
+    """
+    if error.exc_type is not OSError:
+        threading.__excepthook__(error)
+
+
 def _train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Train the arms to compare with and the arm itself in the first process's folder, and print their table."""
-    run, first, command = broadcast(str(config.run)), distributed.rank() == 0, given_command(overrides)
+    """Check all settings, and then train the baselines and the main run in the folder that rank 0 names."""
+    run = broadcast(str(config.run))
+    is_first = distributed.rank() == 0
+    command = given_command(overrides)
     folder = Path(run).absolute()
     config.run = str(folder)
-    if config.train.resume and not any(map(_is_choice, overrides)):  # which stand for all of a command
+    # A chosen file sets many values. Only single values can change when a run
+    # continues with the settings that it began with.
+    if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
     settings = read_settings(ExperimentSettings, config)
-    arms = {}
-    for arm in settings.compare:
-        with keyed("compare"):
-            arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
-    arms[folder] = settings
+    arms = _list_arms(settings, folder)
     for path, arm_settings in arms.items():
-        # Before anything is written.
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, arm_settings)
         require_new_run(path, "run", settings.overwrite, settings.train.resume)
-    log = logged_to(writable_folder(run, "run") / LOG) if first else nullcontext()
+    log = logged_to(writable_folder(run, "run") / LOG) if is_first else nullcontext()
     with log:
         try:
-            with sole_writer("run", *arms) if first else nullcontext():
+            with sole_writer("run", *arms) if is_first else nullcontext():
                 _train_arms(arms, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
-            again = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
-            advice = "no checkpoint yet: start again"
-            if any(map(checkpoint.exists, arms)):
-                advice = f"to go on: {shlex.join(again)}"
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
-            console.info("%s%s", cause, advice)
+            console.info("%s%s", cause, _advise_to_resume(arms, folder))
             raise
 
 
-def _train_arms(arms: dict[Path, ExperimentSettings], folder: Path, command: str) -> None:
-    """Train each arm in its folder, the main one last in `folder`, and compare them."""
+def _list_arms(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
+    """Return the settings of the baselines and of the main run by folder. The main run is the last one."""
+    arms = {}
+    for arm in settings.compare:
+        with keyed("compare"):
+            augment = replace(settings.augment, arm=arm)
+            arms[folder / arm] = replace(settings, compare=[], augment=augment)
+    arms[folder] = settings
+    return arms
+
+
+def _advise_to_resume(arms: Mapping[Path, ExperimentSettings], folder: Path) -> str:
+    """Say how to continue a command that was interrupted."""
+    if not any(map(checkpoint.exists, arms)):
+        return "no checkpoint yet: start again"
+    words = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
+    return f"to go on: {shlex.join(words)}"
+
+
+def _train_arms(arms: Mapping[Path, ExperimentSettings], folder: Path, command: str) -> None:
+    """Train all runs in their folders, and print a table. The main run lies in `folder`."""
     main = arms[folder]
     initial = load_initial(main)
     data = load_data(main, initial.size if initial else None)
     runs = [Run(settings, data, path, initial, command) for path, settings in arms.items()]
-    for run in runs:  # All are loaded before the first one trains, so that every mistake shows.
+    # All runs are loaded before the first one is trained, so that a mistake in
+    # any of them is reported at once.
+    for run in runs:
         run.load()
     for run in runs:
         arm = run.settings.augment.arm
@@ -99,25 +127,45 @@ def _train_arms(arms: dict[Path, ExperimentSettings], folder: Path, command: str
 
 
 def _is_choice(override: str) -> bool:
-    """Tell whether an override chooses a file of conf/."""
+    """Return whether an override chooses a file of conf/."""
     key = override.partition("=")[0]
     return key in CHOICES or "@" in key
 
 
+class _QuietHandler(logging.Handler):
+    """Handler that ignores its own errors.
+
+    On a full disk, train.log lacks lines. The run itself then raises an error,
+    which is the only one that the user sees.
+    """
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Ignore the error, where `logging` would print a traceback."""
+
+
+class _LogFile(_QuietHandler, logging.FileHandler):
+    """Handler that writes to a file."""
+
+
+class _Terminal(_QuietHandler, logging.StreamHandler):
+    """Handler that writes to the console."""
+
+
 @contextmanager
 def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
-    """Log to the console and to a file, until the block ends.
+    """Log to the console and to a file until the block ends.
 
     Args:
-        path: The file. Its folder is made.
+        path: The file. If its folder does not exist, it is made.
         prefix: Text before each line on the console.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
-    terminal = logging.StreamHandler(sys.stdout)
+    file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
+    terminal = _Terminal(sys.stdout)
     file.setFormatter(logging.Formatter("%(message)s"))
     terminal.setFormatter(logging.Formatter(f"{prefix}%(message)s"))
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it reports its font cache
+    # Matplotlib reports that it builds its font cache.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
     root = logging.getLogger()
     level = root.level
     root.setLevel(logging.INFO)

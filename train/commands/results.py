@@ -1,4 +1,4 @@
-"""Results of earlier commands, which no command replaces unless its setting `overwrite` says so."""
+"""Protect the results of earlier commands. Only `overwrite=true` lets a command replace them."""
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
@@ -14,67 +14,88 @@ from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
 from train.report.report_page import PAGE
 from train.report.summary import is_finished
 from train.runs import checkpoint
-from train.runs.run_folder import CONFIG, METRICS, read_config
+from train.runs.run_config import CONFIG, read_config
+from train.runs.run_log import METRICS
 from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
-# By command, the files that show its results in a folder: patterns of `Path.glob`, the most telling first.
+# Files that the commands write to a folder, as patterns of `Path.glob`. An error
+# message names the first file that is found.
 OF_AUDIT = ("*/recognized.json",)
 OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
 OF_ATTACK = (f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
 OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
 OF_FIT = ("light.json", "background.png", "comparison.png")
-SHARED = (CONFIG, PAGE)  # of several commands
-RESULTS = (*OF_RUN, *OF_ATTACK, *OF_AUDIT, *OF_SCORES, *OF_LABORATORY, PUBLISHED, *OF_FIT, *SHARED)
+# Files that several commands write.
+SHARED = (CONFIG, PAGE)
+RESULTS = (
+    *OF_RUN,
+    *OF_ATTACK,
+    *OF_AUDIT,
+    *OF_SCORES,
+    *OF_LABORATORY,
+    PUBLISHED,
+    *OF_FIT,
+    *SHARED,
+)
 
 
 def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[str] = ()) -> None:
-    """Refuse to write where results lie that would be lost.
+    """Check that a command would not replace earlier results.
 
     Args:
-        path: The file or the folder that a command would write. It may be missing.
-        key: The setting that names it.
-        overwrite: Whether the user allows that results are replaced.
-        own: Patterns among RESULTS that do not count, since the command goes on with these files.
+        path: File or folder that the command will write. It may be missing.
+        key: Setting that names it, for the error message.
+        overwrite: Whether the user allows the command to replace results.
+        own: Patterns in RESULTS to ignore, because the command continues with
+            these files.
 
     Raises:
-        InputError: The file exists, or the folder holds results of any command, and `overwrite` is false.
+        InputError: If `overwrite` is false, and the file exists or the folder
+            holds results of a command.
     """
     if overwrite or not path.exists():
         return
     if not path.is_dir():
-        raise InputError(f"{key}={path} exists: choose another file, or set overwrite=true to replace it")
+        advice = "choose another file, or set overwrite=true to replace it"
+        raise InputError(f"{key}={path} exists: {advice}")
     for pattern in RESULTS:
         found = None if pattern in own else next(path.glob(pattern), None)
         if found:
-            held = f"{key}={path} holds results of an earlier command ({found.relative_to(path)})"
-            raise InputError(f"{held}: choose another folder, or set overwrite=true to write over them")
+            name = found.relative_to(path)
+            fault = f"{key}={path} holds results of an earlier command ({name})"
+            advice = "choose another folder, or set overwrite=true to write over them"
+            raise InputError(f"{fault}: {advice}")
 
 
 def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> None:
-    """Refuse a training in a folder with other results than a checkpoint, which `train.training.run.prepare` looks at.
+    """Check that a training run would not replace earlier results.
 
-    A run that ended before its first checkpoint has no results yet, and is started anew by the same command.
+    A folder with a checkpoint passes, because the run itself checks it. A run
+    that ended before its first checkpoint has no results. The same command
+    starts it again.
 
     Args:
-        folder: The folder of a run. It may be missing.
-        key: The setting that names it.
-        overwrite: Whether the user allows that results are replaced.
-        resume: Whether the run is to go on with what is there.
+        folder: Folder of the run. It may be missing.
+        key: Setting that names it, for the error message.
+        overwrite: Whether the user allows the command to replace results.
+        resume: Whether the run continues an earlier one.
 
     Raises:
-        InputError: As of `require_replaceable`.
+        InputError: See `require_replaceable`.
     """
     if checkpoint.exists(folder):
         return
     own: tuple[str, ...] = ()
     if _is_of_training(folder) and not is_finished(folder):
-        own = (CONFIG, METRICS, *((checkpoint.BEST,) if resume else ()))
+        own = (CONFIG, METRICS)
+        if resume:
+            own += (checkpoint.BEST,)
     require_replaceable(folder, key, overwrite, own)
 
 
 def _is_of_training(folder: Path) -> bool:
-    """Say whether the configuration in a folder is one of pnb-train."""
+    """Return whether pnb-train wrote the configuration in a folder."""
     with suppress(InputError):
         return isinstance(read_config(folder / CONFIG).get("train"), Mapping)
     return False

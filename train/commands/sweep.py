@@ -28,7 +28,8 @@ from train.report.comparison import format_table
 from train.report.report_page import PAGE, report_of
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
-from train.runs.run_folder import FAILURE, given_command, locked, require_same_run, state
+from train.runs.run_config import given_command, require_same_run
+from train.runs.run_lock import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system.user_errors import one_sentence, writable_folder

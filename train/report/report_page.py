@@ -25,7 +25,7 @@ from train.report import plots, summary
 from train.report.plots import Picture
 from train.report.summary import Arms, RunSummary, Scored
 from train.runs.epoch_metrics import attack_success
-from train.runs.run_folder import CONFIG, read_config
+from train.runs.run_config import CONFIG, read_config
 from train.system.user_errors import one_sentence
 
 PAGE = "report.html"

@@ -17,8 +17,9 @@ from renderer.errors import InputError, in_one_line
 from train.evaluation.scores.metrics import METRICS, AreaUnderCurve, Thresholds, metric_title, read_metric
 from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.evaluation.tables import Estimate, Table, format_interval
-from train.runs import checkpoint, run_folder
-from train.runs.run_folder import BEFORE, CONFIG, PHASES, read_config, read_json, read_metrics
+from train.runs import checkpoint, run_config, run_lock, run_log
+from train.runs.run_config import CONFIG, read_config, read_json
+from train.runs.run_log import BEFORE, PHASES, read_metrics
 from train.runs.saved_networks import PUBLISHED, load_selected
 from train.settings import label_names, published
 
@@ -200,7 +201,7 @@ def summarize(folder: Path) -> RunSummary:
         raise
     except Exception as error:
         # Entries may be missing or of any type.
-        files = f"{CONFIG}, {run_folder.METRICS} or a {SUMMARY}"
+        files = f"{CONFIG}, {run_log.METRICS} or a {SUMMARY}"
         reason = f"{type(error).__name__}: {in_one_line(error)}"
         problem = f"{folder}: {files} is not as `pnb-train` wrote it ({reason})"
         raise InputError(f"{problem}: use another run") from error
@@ -245,7 +246,7 @@ def _read_run(folder: Path) -> RunSummary:
     return RunSummary(
         folder=folder,
         arm=str(config.augment.arm),
-        settings=run_folder.decisive_settings(config),
+        settings=run_config.decisive_settings(config),
         photographs=read_summaries(folder),
         accuracy=scores["test/accuracy"],
         seed=int(config.seed),
@@ -684,12 +685,12 @@ def _add(found: Findings, path: Path) -> None:
         found.runs.append(summarize(path))
     else:
         epochs = [line for line in read_metrics(path) if "epoch" in line]
-        found.unfinished.append(Unfinished(path, run_folder.state(path), epochs))
+        found.unfinished.append(Unfinished(path, run_lock.state(path), epochs))
 
 
 def _walk(folder: Path) -> Iterator[Path]:
     """Yield the folders of runs and attacks. A run's own evaluations are shown with it."""
-    of_run = {run_folder.METRICS, run_folder.FAILURE, checkpoint.LAST, checkpoint.BEST}
+    of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
     of_others = {LINES, SUMMARY, PUBLISHED}
     for root, below, files in os.walk(folder):
         path = Path(root)

@@ -5,7 +5,7 @@ from statistics import fmean
 
 from tqdm import tqdm
 
-from train.runs.run_folder import PHASES
+from train.runs.run_log import PHASES
 
 # The diagnostics of each round that metrics.jsonl shows.
 SHOWN = ("attack_success_before", "attack_success", "steps")

@@ -1,4 +1,4 @@
-"""What the user can do about an error, in one sentence, and whether a folder can be written to."""
+"""Say in one sentence what the user can do about an error, and check that a folder can be written to."""
 
 import errno
 import tempfile
@@ -8,20 +8,27 @@ from pathlib import Path
 
 from renderer.errors import InputError, is_out_of_memory
 
+# Errors of a full disk, a full quota and a file that is too large.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-LONGEST_NAME = 200  # characters
+# Characters of a text that an error message shows at most.
+MAX_NAME_LENGTH = 200
+# Bytes of the file that tests whether a folder can be written to.
+TEST_SIZE = 2**16
 
 
 @contextmanager
 def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
-    """Put a key in front of the sentences of the library.
+    """Add the key of the settings to the error messages of the library.
+
+    The library does not know the keys of the command line. A message about
+    `radius` becomes a message about `attack.lighting.radius`, for example.
 
     Args:
-        key: Key of the settings that the library was given.
-        names: Names of their fields.
+        key: Key of the settings that the library was given, such as "attack".
+        names: Names of the fields of these settings.
 
     Raises:
-        InputError: The error that was raised inside, with the key.
+        InputError: If the block raises it. The message then starts with the key.
     """
     try:
         yield
@@ -32,41 +39,65 @@ def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
 
 
 def one_sentence(error: BaseException) -> str | None:
-    """What the user can do about an error; None where the error is not the user's."""
+    """Say what the user can do about an error.
+
+    Args:
+        error: The error.
+
+    Returns:
+        One sentence. None if the error is a fault of the program.
+    """
     match error:
         case InputError():
             return str(error)
         case UnicodeEncodeError():
-            name = ascii(error.object[:LONGEST_NAME])
-            return f"{name} has characters that this system or library cannot write: rename it, or set PYTHONUTF8=1"
+            name = ascii(error.object[:MAX_NAME_LENGTH])
+            fault = f"{name} has characters that this system or library cannot write"
+            return f"{fault}: rename it, or set PYTHONUTF8=1"
         case OSError() if error.errno in NO_ROOM:
-            return f"{error.filename or 'the output'} cannot be written ({error.strerror}): make room and start again"
+            fault = f"{error.filename or 'the output'} cannot be written ({error.strerror})"
+            return f"{fault}: make room and start again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
         case RuntimeError() if _is_of_another_process(error):
-            return "another process of this run has ended: fix what ended it, and go on with train.resume=true"
+            fault = "another process of this run has ended"
+            return f"{fault}: fix what ended it, and go on with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
-            return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
+            advice = "ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
+            return f"memory ran out: {advice}"
     return None
 
 
 def _is_of_another_process(error: RuntimeError) -> bool:
-    """Tell whether NCCL or gloo lost another process. gloo names its own source file."""
+    """Return whether NCCL or gloo lost the connection to another process."""
     from torch.distributed import DistError
 
+    # Gloo has no error class. Its messages name its source file.
     return isinstance(error, DistError) or "/gloo/" in str(error)
 
 
 def writable_folder(folder: str | Path, key: str) -> Path:
-    """The folder, which may be missing yet. InputError naming the key where no file can be written into it.
+    """Check that files can be written to a folder.
 
-    A temporary file is written to it or to the nearest folder above that exists.
+    The check writes a temporary file. If the folder does not exist, the file
+    goes to the nearest parent folder that exists.
+
+    Args:
+        folder: The folder.
+        key: Setting that names the folder, for the error message.
+
+    Returns:
+        The folder as a path.
+
+    Raises:
+        InputError: If the file cannot be written.
     """
     path = Path(folder)
     try:
         existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
         with tempfile.TemporaryFile(dir=existing) as file:
-            file.write(bytes(2**16))
+            file.write(bytes(TEST_SIZE))
     except OSError as error:
-        raise InputError(f"{key}={path} cannot be written to ({error.strerror}): choose another folder") from error
+        fault = f"{key}={path} cannot be written to ({error.strerror})"
+        raise InputError(f"{fault}: choose another folder") from error
     return path

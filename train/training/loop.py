@@ -30,7 +30,7 @@ from train.data.sets import Split
 from train.runs import checkpoint
 from train.runs.checkpoint import random_state, restore_random_state
 from train.runs.epoch_metrics import epoch_metrics, format_epoch
-from train.runs.run_folder import PHASES, RunLog
+from train.runs.run_log import PHASES, RunLog
 from train.settings import TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
 from train.system.processes import Interruption, replicated, summed

@@ -1,22 +1,48 @@
-"""How a network is trained: settings, learning-rate schedules, the optimizer, frozen layers."""
+"""Build the optimizer, compute the learning rate, and freeze layers."""
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from augment.classifiers.adapter import nearest
 from renderer.errors import InputError
 from train.settings import ALL_BUT_LAST, TrainSettings
 
-# Factors of the learning rate at a fraction of the training: ×0.2 at 30, 60 and 80 % (Zagoruyko and Komodakis 2016: at
-# epochs 60, 120 and 160 of 200); half a cosine; up over the first fifth and down, the most from a few epochs.
+# "step" multiplies the learning rate by STEP_FACTOR at each of these fractions of
+# the training. Zagoruyko and Komodakis (2016) do so at epochs 60, 120 and 160 of
+# 200.
+MILESTONES = (0.3, 0.6, 0.8)
+STEP_FACTOR = 0.2
+# "one_cycle" begins with a tenth of the learning rate, and reaches all of it after
+# a fifth of the training.
+START_FACTOR = 0.1
+WARMUP = 0.2
+
+
+def _step(done: float) -> float:
+    """Return the factor of the learning rate of "step" after a fraction of the training."""
+    return STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
+
+
+def _cosine(done: float) -> float:
+    """Return the factor of "cosine", half a period of a cosine from 1 to 0."""
+    return (1 + math.cos(math.pi * done)) / 2
+
+
+def _one_cycle(done: float) -> float:
+    """Return the factor of "one_cycle", which rises and falls linearly. It suits trainings of a few epochs."""
+    if done < WARMUP:
+        return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
+    return (1 - done) / (1 - WARMUP)
+
+
+# Factor of the learning rate after a fraction of the training, by schedule.
 SCHEDULE_FACTORS: dict[str, Callable[[float], float]] = {
-    "step": lambda done: 0.2 ** sum(done >= milestone for milestone in (0.3, 0.6, 0.8)),
-    "cosine": lambda done: (1 + math.cos(math.pi * done)) / 2,
-    "one_cycle": lambda done: 0.1 + 0.9 * done / 0.2 if done < 0.2 else (1 - done) / 0.8,
+    "step": _step,
+    "cosine": _cosine,
+    "one_cycle": _one_cycle,
 }
 
 
@@ -25,7 +51,7 @@ def learning_rate(settings: TrainSettings, done: float) -> float:
 
     Args:
         settings: Settings of the training.
-        done: Fraction of the training that is done.
+        done: Fraction of the training that is done, in [0, 1].
 
     Returns:
         The learning rate.
@@ -34,30 +60,59 @@ def learning_rate(settings: TrainSettings, done: float) -> float:
 
 
 def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Optimizer:
-    """SGD with Nesterov's momentum, as the paper's, which decays all weights; or AdamW (Loshchilov and Hutter 2019),
-    which does not decay biases and the weights of norms, as is usual with it, and has its own two momenta."""
-    rate, decay = settings.learning_rate, settings.weight_decay
+    """Build the optimizer.
+
+    "sgd" has Nesterov momentum and decays all weights, as in the paper. "adamw"
+    (Loshchilov and Hutter 2019) decays neither biases nor the weights of
+    normalizations, as is usual, and ignores `settings.momentum`.
+
+    Args:
+        model: Network to train.
+        settings: Settings of the training.
+
+    Returns:
+        Optimizer of all parameters of the network.
+    """
     if settings.optimizer == "sgd":
-        nesterov = settings.momentum > 0
-        options: dict[str, Any] = {"momentum": settings.momentum, "weight_decay": decay, "nesterov": nesterov}
-        return torch.optim.SGD(model.parameters(), rate, **options, fused=True)
-    groups: tuple[list[Tensor], list[Tensor]] = [], []
-    for parameter in model.parameters():
-        groups[parameter.ndim > 1].append(parameter)
-    decays = ({"params": group, "weight_decay": decay * index} for index, group in enumerate(groups))
-    return torch.optim.AdamW(decays, rate, fused=True)
+        return torch.optim.SGD(
+            model.parameters(),
+            settings.learning_rate,
+            momentum=settings.momentum,
+            weight_decay=settings.weight_decay,
+            nesterov=settings.momentum > 0,
+            fused=True,
+        )
+    # Biases and the weights of normalizations are vectors.
+    vectors = [parameter for parameter in model.parameters() if parameter.ndim <= 1]
+    matrices = [parameter for parameter in model.parameters() if parameter.ndim > 1]
+    groups = [
+        {"params": vectors, "weight_decay": 0.0},
+        {"params": matrices, "weight_decay": settings.weight_decay},
+    ]
+    return torch.optim.AdamW(groups, settings.learning_rate, fused=True)
 
 
 def freeze(network: nn.Module, stage: str) -> None:
-    """Let the parameters of a network stay as they are, from its first one to the last of the module of that name, or
-    to the one before its last layer (ALL_BUT_LAST). InputError: there is no such module, or it has none."""
+    """Freeze the parameters of a network from the first one to the end of a module.
+
+    Args:
+        network: Network, which is changed.
+        stage: Name of the last frozen module, such as "blocks.5". With
+            ALL_BUT_LAST, everything before the last layer is frozen.
+
+    Raises:
+        InputError: If there is no module of this name, or if it has no
+            parameters.
+    """
     names = [name for name, _ in network.named_parameters()]
+    modules = [name.rpartition(".")[0] for name in names]
     if stage == ALL_BUT_LAST:
-        frozen = [index for index, name in enumerate(names) if name.rpartition(".")[0] != names[-1].rpartition(".")[0]]
+        frozen = [index for index, module in enumerate(modules) if module != modules[-1]]
     else:
         frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
     if not frozen:
-        parts = nearest(stage, sorted({name.rpartition(".")[0] for name in names}))
-        raise InputError(f"train.freeze={stage} is no part of the network: choose one, such as {parts}")
+        parts = nearest(stage, sorted(set(modules)))
+        fault = f"train.freeze={stage} is no part of the network"
+        raise InputError(f"{fault}: choose one, such as {parts}")
     for parameter in list(network.parameters())[: frozen[-1] + 1]:
         parameter.requires_grad_(False)

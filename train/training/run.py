@@ -24,7 +24,8 @@ from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute
 from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
 from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.runs import checkpoint
-from train.runs.run_folder import BEFORE, RunLog, remove_run, require_same_run, write_config
+from train.runs.run_config import require_same_run, write_config
+from train.runs.run_log import BEFORE, RunLog, remove_run
 from train.runs.saved_networks import WEIGHTS, export, without_normalization
 from train.settings import ExperimentSettings
 from train.system.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shlex
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,12 @@ from renderer.light.harmonics import equirectangular
 from renderer.light.light_files import save_light
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
+from train import console
+from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
 from train.networks import WideResNet, describe
 from train.runs.checkpoint import BEST, save
-from train.runs.run_folder import LOCK, sole_writer
+from train.runs.run_lock import LOCK, sole_writer
 from train.runs.saved_networks import load_run
 
 USER_ERROR = 2
@@ -193,3 +196,12 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
     assert printed == pytest.approx(real, abs=0.00051) and real < 0.15
     assert to_map(light, 128).min() >= 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_log_on_a_full_disk_prints_no_traceback(capsys):
+    with suppress(OSError), logged_to(Path("/dev/full")):
+        console.info("a line")
+    printed = capsys.readouterr()
+    assert printed.out == "a line\n"
+    assert printed.err == ""

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from renderer.settings import facts_of, field_types
 from train.command import Command
-from train.runs.run_folder import given_command
+from train.runs.run_config import given_command
 from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]

@@ -13,7 +13,7 @@ import renderer
 from train.commands.results import require_new_run, require_replaceable
 from train.networks import WideResNet, describe
 from train.runs.checkpoint import BEST, LAST, save
-from train.runs.run_folder import write_config
+from train.runs.run_config import write_config
 
 USER_ERROR = 2
 CLASSES = ["fig", "lime", "orange"]

@@ -18,17 +18,8 @@ from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from train.command import read_settings
-from train.runs.run_folder import (
-    CONFIG,
-    METRICS,
-    RunLog,
-    decisive_settings,
-    read_config,
-    read_metrics,
-    require_same,
-    require_same_run,
-    write_config,
-)
+from train.runs.run_config import CONFIG, decisive_settings, read_config, require_same, require_same_run, write_config
+from train.runs.run_log import METRICS, RunLog, read_metrics
 from train.settings import ExperimentSettings
 
 

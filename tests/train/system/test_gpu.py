@@ -5,7 +5,7 @@ import torch
 
 from tests.runs import completed_run
 from train.runs import checkpoint
-from train.runs.run_folder import read_metrics
+from train.runs.run_log import read_metrics
 from train.training.loop import Trainer
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

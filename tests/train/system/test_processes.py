@@ -21,7 +21,7 @@ from augment.scene.scene import Scene
 from tests.runs import completed_run
 from train.command import read_settings
 from train.runs import checkpoint
-from train.runs.run_folder import read_metrics
+from train.runs.run_log import read_metrics
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, Interruption, process_group
 from train.training import loop

@@ -15,7 +15,7 @@ from renderer.errors import InputError
 from train.data.sets import Split
 from train.networks import WideResNet
 from train.runs import checkpoint
-from train.runs.run_folder import RunLog, read_metrics
+from train.runs.run_log import RunLog, read_metrics
 from train.settings import TrainSettings
 from train.system.device import MixedPrecision
 from train.training.loop import Trainer, evaluate

@@ -26,7 +26,7 @@ from train.report.comparison import format_table
 from train.report.report_page import write_report
 from train.report.summary import summarize
 from train.runs import checkpoint
-from train.runs.run_folder import read_metrics
+from train.runs.run_log import read_metrics
 from train.runs.saved_networks import load_run
 from train.system.hashing import content_hash
 from train.system.processes import Interrupted
@@ -189,7 +189,7 @@ def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(ti
     "writer",
     [
         pytest.param("tensorboard.compat.tensorflow_stub.io.gfile.LocalFileSystem.append", id="TensorBoard"),
-        pytest.param("train.runs.run_folder.RunLog.scalars", id="metrics"),
+        pytest.param("train.runs.run_log.RunLog.scalars", id="metrics"),
         pytest.param("renderer.io.files.os.fsync", id="checkpoint"),
     ],
 )

@@ -1,7 +1,15 @@
-"""Families of projected patterns of the laboratory, drawn at random.
+"""Draw the patterns that the projectors of pnb-lab project.
 
-Points are (2, H, W) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
-family gives each point a weight in [0, 1] between two colors of light, (1, H, W), or one for each channel (3, H, W).
+A family of patterns is a function of points and a random number generator.
+
+- The points have shape (2, H, W). They are positions (x, y) in the image of the
+  projector, which spans [-1, 1] in both directions. An object in the center of
+  the image spans about [-0.3, 0.3].
+- The function returns weights in [0, 1], shape (1, H, W), or (3, H, W) with a
+  weight for each channel. A weight of 1 is the first of two random colors of
+  light, and a weight of 0 is the second one.
+
+The order of the draws decides the patterns of all saved renders.
 """
 
 import math
@@ -16,42 +24,53 @@ from torch import Tensor
 from augment.scene import patterns
 from train.command_settings import SLIDES
 
-RESOLUTION = 512  # pixels per side of a projected image
+# Pixels per side of the image of a projector.
+RESOLUTION = 512
+# Sum of the areas of all spots or leaves. The image has an area of 4, and about
+# half of it is covered because they overlap.
+TOTAL_AREA = 2.8
+# Leaves are ellipses that are this many times as long as wide.
+LEAF_RATIO = 3
+# Random characters of a line of text.
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ "
+LINE_LENGTH = 24
+# Distance between two lines of text, in heights of a letter.
+LINE_SPACING = 1.2
 
 
 def solid(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light of one color."""
+    """Light the whole image in the first color."""
     return patterns.solid(points)[None]
 
 
 def gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """A ramp along x about the middle."""
+    """Draw a linear ramp along x, around the center."""
     return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
 def stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Stripes along y."""
+    """Draw stripes along y."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
     return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
 
 
 def checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Squares of a chessboard."""
+    """Draw the squares of a chessboard."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = torch.from_numpy(rng.uniform(size=2))
     return patterns.checkers(scaled, shift[:, None, None]).double()[None]
 
 
 def half(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """One side of a line through the object."""
+    """Light one side of a line through the object."""
     return patterns.half(points, 0.5 + rng.uniform(-0.12, 0.12)).double()[None]
 
 
 def spots(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Discs of one size at random positions, over about half of the image."""
+    """Draw discs of one size at random positions, which cover about half of the image."""
     radius = rng.uniform(0.08, 0.25)
-    count = round(2.8 / (math.pi * radius**2))
+    count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
     for center in torch.from_numpy(rng.uniform(-1, 1, (count, 2))):
         is_lit |= (points - center[:, None, None]).square().sum(0) < radius**2
@@ -59,7 +78,7 @@ def spots(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def rings(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Rings of one width about a random point."""
+    """Draw rings of one width around a random point."""
     center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
     scaled = radius / rng.uniform(0.12, 0.4)
@@ -68,67 +87,94 @@ def rings(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def window(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """The panes of a window with bars between them and darkness around."""
-    panes = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
-    size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
-    middle = torch.from_numpy(rng.uniform(-0.15, 0.15, 2))[:, None, None]
-    places = (points - middle) / size + panes / 2
-    is_within = (places > 0) & (places < panes)
-    is_pane = (places % 1 - 0.5).abs() < rng.uniform(0.3, 0.45)
-    return (is_within & is_pane).all(dim=0).double()[None]
+    """Draw the light through the panes of a window. The bars and the wall around it are dark."""
+    pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
+    pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
+    center = torch.from_numpy(rng.uniform(-0.15, 0.15, 2))[:, None, None]
+    # Positions in units of panes, from a corner of the window.
+    positions = (points - center) / pane_size + pane_counts / 2
+    is_in_window = (positions > 0) & (positions < pane_counts)
+    is_in_pane = (positions % 1 - 0.5).abs() < rng.uniform(0.3, 0.45)
+    return (is_in_window & is_in_pane).all(dim=0).double()[None]
 
 
 def leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """The shadows of leaves: ellipses at all angles, over about half of the image."""
+    """Draw the shadows of leaves: ellipses at random angles, which cover about half of the image."""
     length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
-    for _ in range(round(2.8 / (math.pi * length**2 / 3))):
+    leaf_area = math.pi * length**2 / LEAF_RATIO
+    for _ in range(round(TOTAL_AREA / leaf_area)):
         angle = rng.uniform(0, math.pi)
         center = torch.from_numpy(rng.uniform(-1, 1, 2))
         offset = points - center[:, None, None]
         along, across = patterns.turned(offset, math.cos(angle), -math.sin(angle))
-        is_lit &= (along / length) ** 2 + (across / length * 3) ** 2 > 1
+        is_lit &= (along / length) ** 2 + (across / length * LEAF_RATIO) ** 2 > 1
     return is_lit.double()[None]
 
 
 def text(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Lines of random capitals, bright, on a dark slide."""
+    """Draw lines of random capital letters, bright on a dark slide."""
     height = int(rng.integers(40, 120))
-    slide, font = Image.new("L", (RESOLUTION, RESOLUTION)), ImageFont.load_default(float(height))
-    for top in range(0, RESOLUTION, int(1.2 * height)):
-        line = "".join(rng.choice(list("ABCDEFGHIJKLMNOPQRSTUVWXYZ "), 24))
-        ImageDraw.Draw(slide).text((-int(rng.integers(height)), top), line, 255, font)
-    return _sampled(np.asarray(slide, dtype=np.float32)[..., None] / 255, points, order=1)
+    slide = Image.new("L", (RESOLUTION, RESOLUTION))
+    font = ImageFont.load_default(float(height))
+    for top in range(0, RESOLUTION, int(LINE_SPACING * height)):
+        line = "".join(rng.choice(list(LETTERS), LINE_LENGTH))
+        # The first letter of a line may be cut off.
+        left = -int(rng.integers(height))
+        ImageDraw.Draw(slide).text((left, top), line, 255, font)
+    values = np.asarray(slide, dtype=np.float32)[..., None] / 255
+    return _sample(values, points, order=1)
 
 
 def colors(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """A smooth field of colors, each channel by itself."""
+    """Draw a smooth field of colors, with independent channels."""
     grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
-    return _sampled(grid, points, order=3).clamp(0, 1)
+    return _sample(grid, points, order=3).clamp(0, 1)
 
 
-def _sampled(image: np.ndarray, points: Tensor, order: int) -> Tensor:
-    """Return an image (H, W, C), which spans [-1, 1], at points, by splines; mirrored beyond its sides."""
+def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
+    """Interpolate an image (H, W, C), which spans [-1, 1] and is mirrored at its borders, by splines at points."""
     size = np.array(image.shape[:2])[:, None, None]
+    # (x, y) in [-1, 1] become rows and columns, in pixels.
     places = (points.flip(0).numpy() + 1) / 2 * size - 0.5
-    channels = [map_coordinates(channel, places, order=order, mode="reflect") for channel in np.moveaxis(image, -1, 0)]
+    channels = [
+        map_coordinates(channel, places, order=order, mode="reflect")
+        for channel in np.moveaxis(image, -1, 0)
+    ]
     return torch.from_numpy(np.stack(channels))
 
 
-FAMILIES = {  # see PATTERNS in train/command_settings.py
+# Functions by the names of the families. PATTERNS in train/command_settings.py
+# lists the same names.
+FAMILIES = {
     family.__name__: family
-    for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
+    for family in (
+        solid,
+        gradient,
+        stripes,
+        checkers,
+        half,
+        spots,
+        rings,
+        window,
+        leaves,
+        text,
+        colors,
+    )
 }
-TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
+# Families with two colors of light. The second color of the others is black.
+TWO_COLORED = ("gradient", "stripes", "checkers")
 
 
-def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()) -> np.ndarray:
+def draw_pattern(
+    family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()
+) -> np.ndarray:
     """Draw a pattern of random colors, at a random angle, scale and position.
 
     Args:
-        family: Name of the family, or SLIDES.
-        rng: Source of random numbers.
-        slides: The pictures (H, W, 3) of the family SLIDES, in linear RGB.
+        family: Key of FAMILIES, or SLIDES for one of the pictures.
+        rng: Random number generator.
+        slides: Pictures for the family SLIDES, linear RGB, shape (H, W, 3).
 
     Returns:
         Linear RGB in [0, 1], shape (RESOLUTION, RESOLUTION, 3), float32.
@@ -137,13 +183,13 @@ def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndar
     second = torch.from_numpy(draw_color(rng))[:, None, None]
     second = second * rng.uniform() * (family in TWO_COLORED)
     angle = rng.uniform(0, 2 * math.pi)
-    middles = patterns.pixel_middles(RESOLUTION)[:, 0].double()
-    points = patterns.turned(middles, math.cos(angle), -math.sin(angle))
+    centers = patterns.pixel_middles(RESOLUTION)[:, 0].double()
+    points = patterns.turned(centers, math.cos(angle), -math.sin(angle))
     if family == SLIDES:
         picture = slides[int(rng.integers(len(slides)))]
         scaled = points * rng.uniform(0.3, 1)
         shift = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
-        light = _sampled(picture, scaled + shift[:, None, None], order=1)
+        light = _sample(picture, scaled + shift[:, None, None], order=1)
     else:
         weight = FAMILIES[family](points, rng)
         light = patterns.two_colors(weight, first, second).expand(3, -1, -1)
@@ -151,10 +197,10 @@ def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndar
 
 
 def draw_color(rng: np.random.Generator) -> np.ndarray:
-    """Draw a color of light, see `augment.scene.patterns.random_colors`.
+    """Draw a color of light with `augment.scene.patterns.random_colors`.
 
     Args:
-        rng: Source of random numbers.
+        rng: Random number generator.
 
     Returns:
         Linear RGB, shape (3,), whose largest channel is 1.

@@ -1,4 +1,4 @@
-"""Path-trace shots of objects, and write them as a folder of photographs."""
+"""Render the path-traced test set of pnb-lab, and write it as a folder of photographs."""
 
 import csv
 import io
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,39 +33,94 @@ from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, FOREIGN, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
-from train.runs.run_folder import LOCK, sole_writer
+from train.runs.run_lock import LOCK, sole_writer
 from train.settings import label_names, read_object, solid_name
 from train.system.user_errors import writable_folder
 
-RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"  # by label, with the number of the setup and the name of its light
-PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
-THROW = 2.6  # half of the width that the projector lights where it aims, in world units
-PROBE_HEIGHT = 64  # rows of the map of a built-in light
-FLOOR = 100.0  # half of the width of table and wall
-SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: at a right-angled edge at most 0.82
+# Pattern of the renders below the folder: LABEL/SETUP_FAMILY.png.
+RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"
+# Columns of the table of renders.
+COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
+# Packages whose versions may change a pixel.
+PACKAGES = ("mitsuba", "numpy", "torch")
+# Half of the width that a projector lights at the object, in world units.
+PROJECTOR_HALF_WIDTH = 2.6
+# Rows of the map of a built-in light.
+PROBE_HEIGHT = 64
+# Half of the width of the table and of the wall, in world units.
+PLANE_HALF_WIDTH = 100.0
+# Smallest cosine between the normals of a face and of a vertex at which the
+# shading is smooth. At a right-angled edge, the cosine is at most 0.82.
+MIN_SMOOTH_COSINE = 0.85
+# Mitsuba's seeds are below this number.
+SEED_COUNT = 2**32
+
+
+class Subject(NamedTuple):
+    """A mesh to render.
+
+    Attributes:
+        label: Class of the mesh, and name of the folder of its renders.
+        mesh: File of the mesh, or name of the solid.
+        parts: The mesh by texture.
+    """
+
+    label: str
+    mesh: str
+    parts: list[Part]
 
 
 def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
-    """The mesh by texture: smooth but at sharp edges, with linear colors and textures (H, W, 3) times `albedo_scale`
-    and at most 1."""
+    """Split a mesh by texture, and convert its colors to linear RGB.
 
-    def scaled(linear: np.ndarray) -> np.ndarray:
-        return np.clip(albedo_scale * linear, 0, 1).astype(np.float32)
+    The shading is smooth, except at sharp edges.
 
+    Args:
+        mesh: Mesh with colors and textures in sRGB.
+        albedo_scale: Factor of all colors. The product is limited to [0, 1].
+
+    Returns:
+        Parts with linear colors, and linear textures of shape (H, W, 3).
+    """
+    normals = corner_normals(mesh.vertices, mesh.faces, "smooth", MIN_SMOOTH_COSINE)
     parts = []
-    for part in split_parts(mesh, corner_normals(mesh.vertices, mesh.faces, "smooth", SHARP), "srgb"):
+    for part in split_parts(mesh, normals, "srgb"):
         texture = part.texture
         if texture is not None:
-            texture = scaled(decode(torch.from_numpy(texture / 255), "srgb").numpy())
-        parts.append(replace(part, colors=scaled(part.colors), texture=texture))
+            linear = decode(torch.from_numpy(texture / 255), "srgb").numpy()
+            texture = _scale_albedo(linear, albedo_scale)
+        colors = _scale_albedo(part.colors, albedo_scale)
+        parts.append(replace(part, colors=colors, texture=texture))
     return parts
 
 
-def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
-    """(size, size, 3) float32 linear radiance by Mitsuba 3, from `spp` samples per pixel and light.
+def _scale_albedo(albedo: np.ndarray, factor: float) -> np.ndarray:
+    """Multiply an albedo by a factor, and limit it to [0, 1]."""
+    return np.clip(factor * albedo, 0, 1).astype(np.float32)
 
-    Projectors and surroundings are rendered one by one and added: with both in one scene each path would choose one of
-    them at random, which is most of the noise. InputError: Mitsuba is not installed.
+
+def path_traced(
+    parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int
+) -> np.ndarray:
+    """Render an object with the path tracer of Mitsuba 3.
+
+    Each light source is rendered alone, and the images are added. With all
+    light sources in one scene, each path would choose one of them at random,
+    and this choice would cause most of the noise.
+
+    Args:
+        parts: Parts of the object, see `lab_parts`.
+        shot: Lighting, camera, pose and table.
+        size: Pixels per side of the image.
+        spp: Paths per pixel and light source.
+        bounces: Maximum number of reflections of a path.
+        seed: Seed of the paths.
+
+    Returns:
+        Radiance in linear RGB, shape (size, size, 3), float32.
+
+    Raises:
+        InputError: If Mitsuba is not installed.
     """
     with mitsuba() as module:
         scene = {
@@ -73,118 +128,205 @@ def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces:
             "integrator": {"type": "path", "max_depth": bounces + 1},
             "sensor": sensor(look_at(shot.camera, shot.aim), size, FOV, "rgb"),
             "table": _plane(np.eye(4), shot.table),
-            **({} if shot.wall is None else {"wall": _plane(look_at(shot.wall, shot.center), shot.table)}),
-            **{f"part_{index}": part for index, part in enumerate(_object(module, parts, shot))},
         }
+        if shot.wall is not None:
+            scene["wall"] = _plane(look_at(shot.wall, shot.center), shot.table)
+        for index, part in enumerate(_object(module, parts, shot)):
+            scene[f"part_{index}"] = part
         scenes = [load(module, {**scene, "light": light}) for light in _lights(shot)]
-        return np.sum([np.array(module.render(scene, spp=spp, seed=seed)) for scene in scenes], axis=0)
+        images = [np.array(module.render(scene, spp=spp, seed=seed)) for scene in scenes]
+        return np.sum(images, axis=0)
 
 
 def _rgb(color: np.ndarray) -> dict[str, Any]:
+    """Describe a linear color (3,) for Mitsuba."""
     return {"type": "rgb", "value": [float(channel) for channel in color]}
 
 
 def _lights(shot: Shot) -> list[dict[str, Any]]:
+    """Describe the light sources for Mitsuba."""
     if shot.environment is not None:
         return [environment({"bitmap": shot.environment})]
     lights = []
     for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
         distance = float(np.linalg.norm(position - shot.center))
-        fov, scale = 2 * float(np.degrees(np.arctan(THROW / distance))), shot.brightness * distance**2
+        fov = 2 * float(np.degrees(np.arctan(PROJECTOR_HALF_WIDTH / distance)))
+        # The irradiance of a projector falls with the square of the distance.
+        power = shot.brightness * distance**2
         pose = look_at(position, shot.center)
-        lights.append(projector(pose, fov, {"bitmap": pattern}, scale / len(shot.patterns)))
-    return [*lights, {"type": "constant", "radiance": _rgb(shot.ambient)}]
+        lights.append(projector(pose, fov, {"bitmap": pattern}, power / len(shot.patterns)))
+    lights.append({"type": "constant", "radiance": _rgb(shot.ambient)})
+    return lights
 
 
 def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
-    """A large square whose front is seen from its own z > 0."""
-    sides = np.diag([FLOOR, FLOOR, 1.0, 1.0])
-    return {"type": "rectangle", "to_world": pose @ sides, "bsdf": {"type": "diffuse", "reflectance": _rgb(color)}}
+    """Describe a large diffuse square for Mitsuba, with its front toward its own +z axis."""
+    scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
+    surface = {"type": "diffuse", "reflectance": _rgb(color)}
+    return {"type": "rectangle", "to_world": pose @ scale, "bsdf": surface}
 
 
 def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
-    """The object rotated, scaled and set down on the table, a shape per part."""
-    rotated = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
-    lowest, shapes = min(positions[:, 2].min() for positions in rotated), []
-    for part, positions in zip(parts, rotated, strict=True):
+    """Rotate and scale the object, set it on the table, and make a Mitsuba shape of each part."""
+    positions_by_part = [
+        (shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts
+    ]
+    lowest = min(positions[:, 2].min() for positions in positions_by_part)
+    shapes = []
+    for part, positions in zip(parts, positions_by_part, strict=True):
         albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
         if part.texture is not None:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
         surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
-        faces, normals = np.arange(len(positions)).reshape(-1, 3), (part.normals @ shot.rotation.T).reshape(-1, 3)
-        positions, uvs, colors = positions - [0, 0, lowest], part.uvs.reshape(-1, 2), part.colors.reshape(-1, 3)
-        twosided = {"type": "twosided", "surface": surface}
-        shapes.append(shape(module, twosided, positions, faces, normals, uvs, colors))
+        faces = np.arange(len(positions)).reshape(-1, 3)
+        normals = (part.normals @ shot.rotation.T).reshape(-1, 3)
+        shapes.append(
+            shape(
+                module,
+                {"type": "twosided", "surface": surface},
+                positions - [0, 0, lowest],
+                faces,
+                normals,
+                part.uvs.reshape(-1, 2),
+                part.colors.reshape(-1, 3),
+            )
+        )
     return shapes
 
 
 def write_laboratory(settings: LabSettings) -> int:
-    """Write the folder `settings.out` and return its number of renders; the settings decide their bytes.
+    """Render the test set, and write it to the folder `settings.out`.
 
-    The folder has class folders of PNG files, photos.csv and lab.json, as `train.data.photographs` reads them.
-    InputError: a folder that is not empty; meshes that cannot be read or have no label; no mesh of a label under study, or no other;
-    Mitsuba is not installed.
+    The folder gets a subfolder of PNG files for each class, photos.csv and
+    lab.json. `train.data.photographs` reads such a folder. The settings and the
+    versions of the packages decide every byte.
+
+    Args:
+        settings: Settings of pnb-lab.
+
+    Returns:
+        Number of renders.
+
+    Raises:
+        InputError: If the folder is not empty, if a mesh cannot be read or has
+            no label, if there is no mesh of a label or no hard negative, or if
+            Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
-    subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
-    environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
-    labels = label_names(settings.label)
-    groups = {label: [subject for subject in subjects if subject[0] == label] for label in labels}
-    others = [subject for subject in subjects if subject[0] not in labels]
-    if missing := [label for label, group in groups.items() if not group or (len(labels) == 1 and not others)]:
-        raise InputError(f"meshes: name at least one of label={missing[0]} and one of another class")
-    slides = [decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy() for path in settings.slides]
+    subjects = [
+        read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))
+    ]
+    paths = [Path(path) for path in settings.environments]
+    environments = {path.stem: _read_environment(path) for path in paths}
+    groups = _group_subjects(subjects, label_names(settings.label))
+    slides = [_read_slide(path) for path in settings.slides]
     shots = draw_shots(settings, environments, slides)
     with sole_writer("out", out):
-        if settings.overwrite:
-            for render in out.glob(RENDERS):
-                render.unlink()
-        elif any(path.name != LOCK for path in out.iterdir()):
-            advice = "choose another, or set overwrite=true to write over its results"
-            raise InputError(f"out={out} holds other files, and a laboratory needs an empty folder: {advice}")
+        _clear(out, settings.overwrite)
         rows = []
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
-            seed = stream_seed(settings.seed, "samples", number) % 2**32
-            for subjects in filter(None, (*groups.values(), others)):
-                label, mesh, parts = subjects[number % len(subjects)]
-                radiance = path_traced(parts, shot, settings.size, settings.spp, settings.bounces, seed)
-                image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
-                path = Path(label) / f"{number:04d}_{shot.family}.png"
-                (out / path).parent.mkdir(parents=True, exist_ok=True)
-                write_image(out / path, Image.fromarray((image * 255).round().byte().numpy()))
-                rows.append((path.as_posix(), shot.family, number, mesh, f"{shot.brightness:.4f}"))
+            for group in groups:
+                subject = group[number % len(group)]
+                path = _write_render(out, settings, subject, shot, number)
+                brightness = f"{shot.brightness:.4f}"
+                rows.append((path, shot.family, number, subject.mesh, brightness))
         table = io.StringIO()
-        csv.writer(table).writerows([("path", "source_tag", "setup", "mesh", "brightness"), *sorted(rows)])
+        csv.writer(table).writerows([COLUMNS, *sorted(rows)])
         write_whole(out / TABLE, table.getvalue())
-        versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+        versions = {"python": platform.python_version()}
+        versions |= {name: version(name) for name in PACKAGES}
         description = {**asdict(settings), "versions": versions}
         write_whole(out / DESCRIPTION, json.dumps(description, indent=2) + "\n")
         return len(rows)
 
 
+def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[list[Subject]]:
+    """Group the meshes by label, with the hard negatives of all labels as the last group, if there are any."""
+    negatives = [subject for subject in subjects if subject.label not in labels]
+    groups = []
+    for label in labels:
+        group = [subject for subject in subjects if subject.label == label]
+        # With several labels, the meshes of each label are negatives of the others.
+        needs_negatives = len(labels) == 1
+        if not group or (needs_negatives and not negatives):
+            raise InputError(f"meshes: name at least one of label={label} and one of another class")
+        groups.append(group)
+    if negatives:
+        groups.append(negatives)
+    return groups
+
+
+def _clear(out: Path, overwrite: bool) -> None:
+    """Remove earlier renders if this is allowed, or raise InputError if the folder is not empty."""
+    if overwrite:
+        for render in out.glob(RENDERS):
+            render.unlink()
+    elif any(path.name != LOCK for path in out.iterdir()):
+        fault = f"out={out} holds other files, and a laboratory needs an empty folder"
+        advice = "choose another, or set overwrite=true to write over its results"
+        raise InputError(f"{fault}: {advice}")
+
+
+def _write_render(
+    out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int
+) -> str:
+    """Render a mesh in a setup, write the image, and return its path relative to the folder."""
+    seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
+    radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
+    exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
+    values = (encode(exposed, "srgb") * 255).round().byte()
+    path = Path(subject.label) / f"{number:04d}_{shot.family}.png"
+    (out / path).parent.mkdir(parents=True, exist_ok=True)
+    write_image(out / path, Image.fromarray(values.numpy()))
+    return path.as_posix()
+
+
+def _read_slide(path: str) -> np.ndarray:
+    """Read the picture of a slide as linear RGB (RESOLUTION, RESOLUTION, 3)."""
+    return decode(read_image(path, RESOLUTION), "srgb").permute(1, 2, 0).numpy()
+
+
 def _read_environment(path: Path) -> np.ndarray:
-    """Radiance (H, W, 3) of a map, or of a built-in light that is made physical; InputError where no light of a map
-    comes from above, and as `read_panorama`."""
+    """Read the radiance (H, W, 3) of a map, or of a built-in light without negative radiance."""
     if str(path) in PROBES:
-        return to_map(HARMONICS.project_nonnegative(load_light(str(path))), PROBE_HEIGHT).clamp(min=0).numpy()
+        light = HARMONICS.project_nonnegative(load_light(str(path)))
+        return to_map(light, PROBE_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
-    if not radiance[: len(radiance) // 2].max() > 0:
-        raise InputError(f"environments: {path} is dark above: give a map with light from above the horizon")
+    upper_half = radiance[: len(radiance) // 2]
+    # This form also refuses NaN.
+    if not upper_half.max() > 0:
+        advice = "give a map with light from above the horizon"
+        raise InputError(f"environments: {path} is dark above: {advice}")
     return radiance
 
 
-def read_subject(item: str | dict[str, Any], index: int) -> tuple[str, str, list[Part]]:
-    """The label, mesh and parts of an entry of `meshes`. The label of a solid is its own name by default, with `other_`
-    before hard negatives.
+def read_subject(item: str | dict[str, Any], index: int) -> Subject:
+    """Read an entry of `meshes`.
 
-    InputError: as `load_object`; a file without a label; a label that is not a folder's name.
+    A solid without a label gets its own name as its label. For a hard negative,
+    FOREIGN precedes the name.
+
+    Args:
+        item: File of a mesh, name of a solid, or settings of an object.
+        index: Index of the entry, for error messages.
+
+    Returns:
+        The mesh with its label.
+
+    Raises:
+        InputError: If the mesh cannot be read, if a file has no label, or if
+            the label cannot be the name of a folder.
     """
     settings = read_object(item, "", f"meshes[{index}]")
-    label, name = settings.label, solid_name(settings.mesh)
+    label = settings.label
+    name = solid_name(settings.mesh)
     if not label and name:
         label = FOREIGN + name if name in HARD_NEGATIVES else name
     if not label:
-        raise InputError(f"meshes[{index}] has no label: give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}")
+        advice = f"give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}"
+        raise InputError(f"meshes[{index}] has no label: {advice}")
     if Path(label).name != label or label == "..":
-        raise InputError(f"meshes[{index}]: the label {label!r} names the renders' folder: leave out slashes")
-    return label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale)
+        fault = f"meshes[{index}]: the label {label!r} names the renders' folder"
+        raise InputError(f"{fault}: leave out slashes")
+    parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
+    return Subject(label, settings.mesh, parts)

@@ -1,7 +1,8 @@
-"""Random draws of light, camera and pose of the renders of pnb-lab.
+"""Draw the lighting, the camera and the pose of the renders of pnb-lab at random.
 
-World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
-RGB; a radiance of 1 is white at an exposure of 1.
+World units: a mesh is normalized to [-1, 1]³ and then scaled. It stands on the
+table z = 0 over the origin. Azimuths and elevations are in degrees. Radiance
+and albedo are linear RGB. A radiance of 1 is white at an exposure of 1.
 """
 
 import math
@@ -18,94 +19,190 @@ from renderer.light.harmonics import equirectangular
 from train.command_settings import LabSettings
 from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
 
-FOV = 25.0  # degrees, of the camera
+# Field of view of the camera in degrees.
+FOV = 25.0
+# Pattern of which a shot is drawn before an environment replaces its lighting.
+PLAIN_PATTERN = "solid"
+# Half of the width of the image at the object, in world units.
+HALF_WIDTHS = (1.2, 1.9)
+# Largest coordinate of the object, in world units.
+SCALES = (0.75, 1)
+# Height of the point that the projectors face, in units of the scale.
+CENTER_HEIGHT = 0.8
+# Largest offset of the point that the camera faces, per coordinate.
+MAX_AIM_OFFSET = 0.25
+PROJECTOR_DISTANCES = (5, 8)
+CAMERA_ELEVATIONS = (18, 60)
+# Largest Euler angles of the object's rotation about z, x and z in degrees.
+MAX_EULER_ANGLES = (360, 60, 360)
+# Largest azimuth of a wall off the direction that is opposite to the camera.
+MAX_WALL_TURN = 30
+WALL_DISTANCES = (1.8, 3.5)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One light, camera, pose and table, for any object; positions, colors and albedo are (3,)."""
+    """Lighting, camera, pose and table of a render of any object.
+
+    Attributes:
+        family: Name of the pattern or of the environment.
+        brightness: Radiance of a white surface. With projectors, the surface
+            faces all of them and their images are white. In an environment,
+            the surface faces up.
+        patterns: Image of each projector, linear RGB, shape (H, W, 3).
+        ambient: Radiance from all directions, linear RGB, shape (3,).
+        table: Albedo of the table and the wall, linear RGB, shape (3,).
+        projectors: Position of each projector, shape (3,).
+        camera: Position of the camera, shape (3,).
+        center: Point that the projectors face, shape (3,).
+        aim: Point that the camera faces, shape (3,).
+        rotation: Rotation matrix of the object, shape (3, 3).
+        scale: Largest coordinate of the object.
+        roughness: Roughness of the surface of the object, in [0, 1].
+        wall: Point of the wall that is nearest to `center`, shape (3,). None
+            without a wall.
+        environment: Radiance on the grid of `equirectangular`, shape
+            (H, W, 3). It replaces the projectors and `ambient`. None if the
+            projectors light the object.
+    """
 
     family: str
-    brightness: float  # radiance of a white surface that faces all projectors, where these are white, or up under a map
-    patterns: Sequence[np.ndarray]  # the projected images (H, W, 3), of as many projectors
-    ambient: np.ndarray  # radiance from everywhere
-    table: np.ndarray  # albedo
-    projectors: Sequence[np.ndarray]  # positions
-    camera: np.ndarray  # position
-    center: np.ndarray  # what the projectors look at
-    aim: np.ndarray  # what the camera looks at
-    rotation: np.ndarray  # (3, 3), of the object
-    scale: float  # the object's largest coordinate
-    roughness: float  # of the object's surface
-    wall: np.ndarray | None = None  # the point of a wall that is nearest to `center`
-    environment: np.ndarray | None = None  # radiance (H, W, 3) of `equirectangular`, for projectors and ambient
+    brightness: float
+    patterns: Sequence[np.ndarray]
+    ambient: np.ndarray
+    table: np.ndarray
+    projectors: Sequence[np.ndarray]
+    camera: np.ndarray
+    center: np.ndarray
+    aim: np.ndarray
+    rotation: np.ndarray
+    scale: float
+    roughness: float
+    wall: np.ndarray | None = None
+    environment: np.ndarray | None = None
 
 
 def draw_shots(
-    settings: LabSettings, environments: Mapping[str, np.ndarray], slides: Sequence[np.ndarray] = ()
+    settings: LabSettings,
+    environments: Mapping[str, np.ndarray],
+    slides: Sequence[np.ndarray] = (),
 ) -> Iterator[Shot]:
-    """`setups` shots, equally many of each pattern and each environment (by name), in this order.
+    """Draw equally many shots of each pattern, and then of each environment.
 
-    Brightness rises evenly in ratios within each. An environment is turned about the vertical by a random angle.
-    slides: as of `draw_pattern`.
+    Within a pattern or an environment, the logarithms of the brightness are
+    spread evenly over `settings.brightness`. An environment is rotated about
+    the vertical axis by a random angle.
+
+    Args:
+        settings: Settings of pnb-lab. `settings.setups` is the number of shots.
+        environments: Radiance by name, shape (H, W, 3).
+        slides: Pictures of the pattern "slides", see `draw_pattern`.
+
+    Yields:
+        The shots.
     """
     dimmest, brightest = settings.brightness
     kinds = [*settings.patterns, *environments]
     per_kind = settings.setups // len(kinds)
     for kind, index in product(kinds, range(per_kind)):
-        draws = [np.random.default_rng(stream_seed(settings.seed, key, kind, index)) for key in ("shot", "more")]
-        radiance = dimmest * (brightest / dimmest) ** ((index + draws[0].uniform()) / per_kind)
-        shot = _draw_shot("solid" if kind in environments else kind, radiance, settings, slides, *draws)
+        rng = np.random.default_rng(stream_seed(settings.seed, "shot", kind, index))
+        extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", kind, index))
+        position = (index + rng.uniform()) / per_kind
+        brightness = dimmest * (brightest / dimmest) ** position
+        pattern = PLAIN_PATTERN if kind in environments else kind
+        shot = _draw_shot(pattern, brightness, settings, slides, rng, extra_rng)
         if kind in environments:
-            sky = environments[kind]
-            directions, solid_angles = equirectangular(*sky.shape[:2])
-            cosines = directions[..., 2].clamp(min=0) * solid_angles
-            on_white = float((cosines[..., None] * torch.from_numpy(sky)).sum((0, 1)).mean()) / math.pi  # and facing up
-            turned = (radiance / on_white * np.roll(sky, draws[0].integers(sky.shape[1]), axis=1)).astype(np.float32)
-            shot = replace(shot, family=kind, environment=turned, wall=None)
+            radiance = _scale_environment(environments[kind], brightness, rng)
+            shot = replace(shot, family=kind, environment=radiance, wall=None)
         yield shot
 
 
+def _scale_environment(
+    radiance: np.ndarray, brightness: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Rotate a map (H, W, 3) about the vertical axis, and scale it to a brightness of a white surface that faces up."""
+    directions, solid_angles = equirectangular(*radiance.shape[:2])
+    weights = directions[..., 2].clamp(min=0) * solid_angles
+    irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
+    white_radiance = float(irradiance.mean()) / math.pi
+    column_offset = rng.integers(radiance.shape[1])
+    rotated = np.roll(radiance, column_offset, axis=1)
+    return (brightness / white_radiance * rotated).astype(np.float32)
+
+
 def _draw_shot(
-    kind: str, brightness: float, settings: LabSettings, slides: Sequence[np.ndarray], *draws: np.random.Generator
+    family: str,
+    brightness: float,
+    settings: LabSettings,
+    slides: Sequence[np.ndarray],
+    rng: np.random.Generator,
+    extra_rng: np.random.Generator,
 ) -> Shot:
-    """A shot under patterns of the families, joined by + in `kind`."""
-    rng, more = draws  # the second is for what not every laboratory has: the others' draws stay the same
-    first, *others = kind.split("+")
-    azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
-    center = np.array([0, 0, 0.8 * scale])
-    aim = center + rng.uniform(-0.25, 0.25, 3)
+    """Draw a shot under the patterns whose names are joined by + in `family`.
 
-    def projector(rng: np.random.Generator) -> np.ndarray:
-        angles = azimuth + _between(settings.azimuth, rng), _between(settings.elevation, rng)
-        return center + _position(*angles, rng.uniform(5, 8))
-
-    roughness = _between(settings.roughness, more)
-    shot = Shot(
-        family=kind,
+    `extra_rng` draws what earlier versions of the laboratory did not have, such
+    as the wall, so that the other draws stay the same.
+    """
+    first_family, *other_families = family.split("+")
+    azimuth = rng.uniform(0, 360)
+    half_width = rng.uniform(*HALF_WIDTHS)
+    scale = rng.uniform(*SCALES)
+    center = np.array([0, 0, CENTER_HEIGHT * scale])
+    aim = center + rng.uniform(-MAX_AIM_OFFSET, MAX_AIM_OFFSET, 3)
+    roughness = _draw_between(settings.roughness, extra_rng)
+    patterns = [draw_pattern(first_family, rng, slides)]
+    patterns += [draw_pattern(name, extra_rng, slides) for name in other_families]
+    ambient = _draw_between(settings.ambient, rng) * draw_color(rng)
+    table = _draw_between(settings.albedo, rng) * draw_color(rng)
+    projectors = [center + _draw_projector(settings, azimuth, rng)]
+    projectors += [center + _draw_projector(settings, azimuth, extra_rng) for _ in other_families]
+    camera_distance = half_width / math.tan(math.radians(FOV / 2))
+    camera = aim + _from_angles(azimuth, rng.uniform(*CAMERA_ELEVATIONS), camera_distance)
+    angles = rng.uniform(0, MAX_EULER_ANGLES)
+    rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
+    wall = _draw_wall(azimuth, extra_rng)
+    has_wall = extra_rng.uniform() < settings.walls
+    is_hidden = any((position - center) @ wall >= wall @ wall for position in projectors)
+    return Shot(
+        family=family,
         brightness=brightness,
-        patterns=[draw_pattern(first, rng, slides), *(draw_pattern(family, more, slides) for family in others)],
-        ambient=_between(settings.ambient, rng) * draw_color(rng),
-        table=_between(settings.albedo, rng) * draw_color(rng),
-        projectors=[projector(rng), *(projector(more) for _ in others)],
-        camera=aim + _position(azimuth, rng.uniform(18, 60), half_width / math.tan(math.radians(FOV / 2))),
+        patterns=patterns,
+        ambient=ambient,
+        table=table,
+        projectors=projectors,
+        camera=camera,
         center=center,
         aim=aim,
-        rotation=Rotation.from_euler("ZXZ", rng.uniform(0, (360, 60, 360)), degrees=True).as_matrix(),
+        rotation=rotation,
         scale=scale,
         roughness=roughness,
+        wall=center + wall if has_wall and not is_hidden else None,
     )
-    behind = _position(azimuth + 180 + more.uniform(-30, 30), 0, more.uniform(1.8, 3.5))
-    free = all((position - center) @ behind < behind @ behind for position in shot.projectors)
-    return replace(shot, wall=center + behind) if more.uniform() < settings.walls and free else shot
 
 
-def _between(limits: Sequence[float], rng: np.random.Generator) -> float:
+def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw the position (3,) of a projector around the point that it faces, from the azimuth of the camera."""
+    projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
+    elevation = _draw_between(settings.elevation, rng)
+    return _from_angles(projector_azimuth, elevation, rng.uniform(*PROJECTOR_DISTANCES))
+
+
+def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw the vector (3,) from the center to a wall behind the object, from the azimuth of the camera."""
+    wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
+    return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))
+
+
+def _draw_between(limits: Sequence[float], rng: np.random.Generator) -> float:
+    """Draw a number uniformly between two limits."""
     return rng.uniform(limits[0], limits[1])
 
 
-def _position(azimuth: float, elevation: float, distance: float) -> np.ndarray:
-    """(3,) from angles in degrees."""
-    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
-    horizontal = math.cos(elevation)
-    return distance * np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)])
+def _from_angles(azimuth: float, elevation: float, distance: float) -> np.ndarray:
+    """Convert an azimuth and an elevation in degrees and a distance to a position, shape (3,)."""
+    azimuth_radians = math.radians(azimuth)
+    elevation_radians = math.radians(elevation)
+    horizontal = math.cos(elevation_radians)
+    x = horizontal * math.cos(azimuth_radians)
+    y = horizontal * math.sin(azimuth_radians)
+    return distance * np.array([x, y, math.sin(elevation_radians)])

@@ -1,0 +1,95 @@
+"""Lock the folder of a run, so that only one process writes to it.
+
+The lock holds among all machines that share the file system.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from renderer.errors import InputError
+from renderer.io.files import remove_unfinished
+
+# File that a process locks.
+LOCK = ".lock"
+# File with the reason why the last training in the folder failed.
+FAILURE = "failed.txt"
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Try to lock a folder until the block ends.
+
+    With the lock, the function removes files that a stopped process left
+    unfinished.
+
+    Args:
+        folder: Folder to lock. If it does not exist, it is made.
+
+    Yields:
+        Whether this process has the lock. If not, another process has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    with suppress(Timeout):
+        lock.acquire(blocking=False)
+    if lock.is_locked:
+        remove_unfinished(folder)
+    try:
+        yield lock.is_locked
+    finally:
+        lock.release()
+
+
+@contextmanager
+def sole_writer(key: str, *folders: Path) -> Iterator[None]:
+    """Lock folders until the block ends, and then remove the folders that are empty.
+
+    Args:
+        key: Setting that names the folders, for the error message.
+        *folders: Folders to lock.
+
+    Raises:
+        InputError: If another process has locked one of the folders.
+    """
+    with ExitStack() as stack:
+        for folder in folders:
+            if not stack.enter_context(locked(folder)):
+                fault = f"{key}={folder} is being written by another process"
+                raise InputError(f"{fault}: wait, or choose another folder")
+        try:
+            yield
+        finally:
+            for folder in folders:
+                _remove_if_empty(folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    """Remove a folder that holds only the lock file."""
+    names = [path.name for path in folder.iterdir()]
+    if names == [LOCK]:
+        (folder / LOCK).unlink()
+        folder.rmdir()
+
+
+def state(folder: Path) -> str:
+    """Describe the state of a run that is not finished.
+
+    Args:
+        folder: Folder of the run, which may be missing.
+
+    Returns:
+        "not begun", "in training", "interrupted", or "failed: " and the reason.
+    """
+    if not folder.exists():
+        return "not begun"
+    with locked(folder) as is_ours:
+        if not is_ours:
+            return "in training"
+    failure = folder / FAILURE
+    if failure.exists():
+        reason = failure.read_text(encoding="utf-8", errors="replace").strip()
+        return f"failed: {reason}"
+    return "interrupted"
