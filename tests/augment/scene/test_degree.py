@@ -116,6 +116,7 @@ def attacked(scene: Scene, settings: MaterialSettings) -> tuple[Scene, str]:
     return result.problem.scene, told
 
 
+@pytest.mark.slow
 def test_an_attack_in_python_lights_the_scene_by_the_degree_that_it_needs(tmp_path):
     """From the map itself; a scene whose degree or light was given stays, and a cut light is told."""
     write_map(tmp_path / "map.exr", to_map(probe("eucalyptus"), 64).clamp(min=0))

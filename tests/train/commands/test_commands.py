@@ -156,6 +156,7 @@ def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
             grab_cut(np.zeros((96, 96, 3), np.uint8), box)
 
 
+@pytest.mark.slow
 def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
     """A cup in front of noise, at another place than the image's middle: rendered and scored as photographed."""
     camera, light = OrthographicCamera(1.0, 0.5, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
