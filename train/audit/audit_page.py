@@ -226,7 +226,7 @@ class _ScoredImage(NamedTuple):
     """Prediction of one network, with the part and the index of the image."""
 
     part: str
-    index: int
+    image_index: int
     prediction: Prediction
 
 
@@ -259,7 +259,7 @@ def _draw_image(folders: Mapping[str, Path], scored: Predictions, row: _ScoredIm
     photograph = row.prediction.photograph
     texts = []
     for network, by_part in scored.items():
-        prediction = by_part[row.part][row.index]
+        prediction = by_part[row.part][row.image_index]
         texts.append(f"{network}: {prediction.probability:.0%} {prediction.predicted}")
     caption = f"{photograph.label}, {photograph.source}: {'; '.join(texts)}"
     image = Image.fromarray(read_square(folders[row.part] / photograph.path, SIDE))
