@@ -276,7 +276,6 @@ def _vary_lighting(
         replace(example, exposure=example.exposure * factor)
         for example, factor in zip(scene.examples, exposures, strict=True)
     ]
-    scene = scene.changed(examples=examples)
     lights = _draw_lights(scene, settings, draws, is_on_table)
     changed: dict[str, Any] = {}
     points = None
@@ -284,7 +283,7 @@ def _vary_lighting(
         albedo = _draw_background_albedo(scene, settings, draws)
         if settings.tables:
             lights = lights.without_ground(is_on_table, albedo)
-        lit = scene.changed(lights=lights.coefficients())
+        lit = scene.changed(examples=examples, lights=lights.coefficients())
         white = albedo.new_ones(3, 1, 1)
         values = albedo * (_facing_irradiance(lit) if settings.lit_background else white)
         if settings.tables:
@@ -292,12 +291,12 @@ def _vary_lighting(
             arriving, points = _light_rooms(lit, lights, walls, is_on_table)
             values[is_on_table] = albedo[is_on_table] * arriving.to(albedo)
         changed["backgrounds"] = encode(clamp(values), scene.settings.encoding)
-        changed["examples"] = _number_backgrounds(examples)
+        examples = _number_backgrounds(examples)
     if settings.camera != CameraEffectSettings():
         changed["camera_effects"] = draw_camera_effects(
             settings.camera, len(scene), scene.settings, draws, scene.lights.device, points
         )
-    return scene.changed(lights=lights.coefficients(), **changed)
+    return scene.changed(examples=examples, lights=lights.coefficients(), **changed)
 
 
 def _draw_lights(
