@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import reprlib
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Collection, Set
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,31 +191,6 @@ def require_choice(name: str, value: object, choices: Collection[str]) -> None:
     """
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"{name}={_short(value)}: choose one of {', '.join(choices)}", name)
-
-
-def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:
-    """Check that limits are a lower and an upper number in a range.
-
-    Args:
-        name: Name of the argument, for the error.
-        limits: Lower and upper limit.
-        least: Smallest allowed value.
-        most: Largest allowed value.
-
-    Raises:
-        InputError: If there are not two numbers, if they are in the wrong order,
-            or if one is outside the range.
-    """
-    try:
-        low, high = limits
-        is_inside = bool(least <= low <= high <= most)
-    except (TypeError, ValueError, RuntimeError):
-        # The value does not consist of two numbers.
-        is_inside = False
-    if not is_inside:
-        raise InputError(
-            f"{name}={_short(limits)}: give [least, most], both from {least:g} to {most:g}", name
-        )
 
 
 def require_finite(**tensors: Tensor) -> None:
