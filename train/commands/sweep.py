@@ -1,6 +1,7 @@
-"""Sweeps, `pnb-train --multirun`: a folder per run, named by its overrides; finished runs are not repeated.
+"""Sweeps: `pnb-train --multirun`.
 
-Hydra's launchers start the runs, in this process or in others; their results are read from their folders.
+Each run has a folder that is named by its overrides. A finished run is not repeated. Hydra's
+launchers start the runs, in this process or in others. The results are read from the folders.
 """
 
 import shutil
@@ -51,7 +52,8 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     runs = _expand([word for word in overrides if not word.startswith("-")])
     first = _compose(runs[0])
     parent = writable_folder(str(first.sweep), "sweep")
-    require_replaceable(parent, "sweep", bool(first.overwrite), own=[PAGE])  # the page of the sweep so far
+    # The folder may hold the page that an earlier call wrote about the same sweep.
+    require_replaceable(parent, "sweep", bool(first.overwrite), own=[PAGE])
     fixed = [text.partition("=")[0] for text in set.intersection(*map(set, runs))]
     folders = [parent / run_name(words, fixed, str(parent)) for words in runs]
     if len(set(folders)) < len(runs):
@@ -109,7 +111,8 @@ def run_in_sweep(config: DictConfig) -> None:
             return
         (folder / FAILURE).unlink(missing_ok=True)
         job = HydraConfig.get()
-        shares_console = "n_jobs" in job.launcher  # joblib's
+        # The runs of joblib's launcher print at the same time.
+        shares_console = "n_jobs" in job.launcher
         print(f"training: {folder}", flush=True)
         prefix = f"#{job.job.num} " if shares_console else ""
         with logged_to(folder / LOG, prefix):
@@ -127,7 +130,7 @@ def run_in_sweep(config: DictConfig) -> None:
                 sentence = one_sentence(error)
                 reason = sentence or traceback.format_exception_only(error)[-1].strip()
                 console.error("failed: %s", reason, exc_info=None if sentence else error)
-                with suppress(OSError):  # on a full disk only the console has it
+                with suppress(OSError):  # On a full disk, only the console shows the reason.
                     write_whole(folder / FAILURE, f"{reason}\n")
 
 
