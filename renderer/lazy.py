@@ -1,32 +1,59 @@
-"""A package's names, each imported with its module when it is first used (PEP 562)."""
+"""Imports the public names of a package when they are first used (PEP 562).
+
+The names stand once, as imports in the stub `__init__.pyi` beside the package's
+`__init__.py`. Type checkers and editors read the same stub.
+"""
 
 from __future__ import annotations
 
-TYPE_CHECKING = False  # as type checkers know it; to import typing would take longer than all of this
+import ast
+
+# Type checkers take this for true. To import typing would take longer than all
+# of this module.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable
 
 
 def attach(
-    package: str, modules: Mapping[str, Sequence[str]]
+    package: str, file: str
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package whose names come from modules below it.
+    """Make the public names of a package from its stub.
 
-    A module's own name stands for the module, unless it has such an attribute. No other name may be that of a module
-    directly in the package, which importing the module would put in its place. `__version__` is the installation's.
+    Args:
+        package: `__name__` of the package.
+        file: `__file__` of the package. The stub lies beside it.
+
+    Returns:
+        `__getattr__`, `__dir__` and `__all__` of the package.
+
+    Example:
+        >>> attach("renderer", renderer.__file__)[2][0]
+        'Camera'
     """
-    home = {name: module for module, names in modules.items() for name in names}
+    modules = _read_stub(file.removesuffix("c") + "i")
+    names = sorted(modules)
 
-    def getattribute(name: str) -> object:
+    def get_attribute(name: str) -> object:
         if name == "__version__":
             from importlib.metadata import version
 
             return version("parametric-norm-balls")
-        if name not in home:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        from importlib import import_module
+        # As `from module import name` does, where the name may be a module, too.
+        return getattr(__import__(modules[name], fromlist=[name]), name)
 
-        module = import_module(f"{package}.{home[name]}")
-        return getattr(module, name, module)
+    return get_attribute, lambda: names, names
 
-    return getattribute, lambda: sorted(home), sorted(home)
+
+def _read_stub(path: str) -> dict[str, str]:
+    """Return the module that each name of a stub is imported from."""
+    with open(path, encoding="utf-8") as stub:
+        tree = ast.parse(stub.read())
+    return {
+        alias.name: str(statement.module)
+        for statement in tree.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }

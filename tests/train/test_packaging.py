@@ -14,13 +14,13 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("renderer", "augment", "train", "conf", "scripts")
+PACKAGES = ("norm_balls", "renderer", "augment", "train", "conf", "scripts")
 TINY = (*("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "augment=none", "train.epochs=1"),)
 
 
 def sources() -> set[str]:
     """Every file that an installation holds, relative to it."""
-    kinds = ("*.py", "*.yaml", "*.jinja", "*.safetensors")
+    kinds = ("*.py", "*.pyi", "py.typed", "*.yaml", "*.jinja", "*.safetensors")
     files = [path for name in PACKAGES for kind in kinds for path in (ROOT / name).rglob(kind)]
     return {re.sub("^scripts/", "pnb_scripts/", path.relative_to(ROOT).as_posix()) for path in files}
 

@@ -1,0 +1,63 @@
+"""`import norm_balls` works beside a user's own train.py, augment.py, renderer.py and conf/."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+
+FOREIGN = ("renderer.py", "augment.py", "train.py", "conf/__init__.py")
+USE = """
+import norm_balls as nb
+
+light = nb.load_light("grace")
+image = nb.render(nb.solid("pear"), nb.orbit_cameras(1, 2.4), light, size=8)
+assert image.isfinite().all() and image.max() > 0
+assert nb.load_run("pretrained/none").size == 32
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder whose modules must not be imported by the library."""
+    for name in FOREIGN:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("raise SystemExit('this module is not the library')")
+    return tmp_path
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_a_script_named_train_uses_the_library(folder):
+    (folder / "train.py").write_text(USE)
+    done = run(folder, "train.py")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_notebook_beside_such_modules_uses_the_library(folder):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(USE)])
+    context = {"metadata": {"path": str(folder)}}
+    # The call raises the error of a cell.
+    nbclient.NotebookClient(notebook, resources=context).execute()
+
+
+@pytest.mark.parametrize("name", ["renderer", "augment", "train", "conf"])
+def test_a_foreign_module_that_was_imported_first_is_named(tmp_path, name):
+    (tmp_path / f"{name}.py").write_text("")
+    done = run(tmp_path, "-c", f"import sys; sys.path[0] = '.'; import {name}, norm_balls")
+    last_line = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1
+    assert last_line.startswith("ImportError: ") and str(tmp_path / name) in last_line
+
+
+def test_packages_of_the_library_that_were_imported_before_stay(folder):
+    code = "import renderer, norm_balls as nb; assert nb.render is renderer.render"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,15 @@
+import logging
+
+from train.command_settings import AuditSettings as AuditSettings
+from train.command_settings import EvaluateSettings as EvaluateSettings
+from train.command_settings import LabSettings as LabSettings
+from train.runs.saved_networks import load_run as load_run
+from train.settings import DataSettings as DataSettings
+from train.settings import EvaluationSettings as EvaluationSettings
+from train.settings import ExperimentSettings as ExperimentSettings
+from train.settings import ModelSettings as ModelSettings
+from train.settings import TrainingSceneSettings as TrainingSceneSettings
+from train.settings import TrainSettings as TrainSettings
+
+console: logging.Logger
+__version__: str
