@@ -72,9 +72,7 @@ def make_trainer(
     defaults = {"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"}
     recipe = TrainSettings(**defaults | settings)
     no_labels = torch.zeros(0, dtype=torch.int64)
-    no_renders = AugmentationService(
-        AugmentationSettings(arm="none"), None, no_labels, 0, Phases()
-    )
+    no_renders = AugmentationService(AugmentationSettings(arm="none"), None, no_labels, 0, Phases())
     return Trainer(recipe, model, ARCHITECTURE, no_renders, folder)
 
 
