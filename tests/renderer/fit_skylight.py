@@ -1,6 +1,13 @@
-"""Fit the sky's coefficients with polynomials and print the largest error: python tests/renderer/fit_skylight.py
+"""Fit polynomials to the coefficients of the sky.
 
-The model is that of `renderer.light.skylight`, and its coefficients are integrals by Gauss-Legendre quadrature.
+The script writes the fit that `renderer.light.skylight` reads, and prints its
+largest error:
+
+    python tests/renderer/fit_skylight.py [FILE]
+
+The model of the sky is the one of Preetham et al. that
+`renderer.light.skylight` describes. Its coefficients are integrals over the
+hemisphere, by Gauss-Legendre quadrature.
 """
 
 import math
@@ -17,26 +24,64 @@ from renderer.light.harmonics import basis
 from renderer.light.skylight import ZENITH, coefficients
 from renderer.settings import TURBIDITY
 
-# Preetham et al., appendix A.2: A to E of Perez's formula for Y, x and y, as slope and offset in turbidity.
+# Preetham et al., appendix A.2: the parameters A to E of Perez's formula, as
+# slope and offset in turbidity. The rows are the luminance Y, x and y.
 PEREZ = np.array(
     [
-        [(0.1787, -1.4630), (-0.3554, 0.4275), (-0.0227, 5.3251), (0.1206, -2.5771), (-0.0670, 0.3703)],
-        [(-0.0193, -0.2592), (-0.0665, 0.0008), (-0.0004, 0.2125), (-0.0641, -0.8989), (-0.0033, 0.0452)],
-        [(-0.0167, -0.2608), (-0.0950, 0.0092), (-0.0079, 0.2102), (-0.0441, -1.6537), (-0.0109, 0.0529)],
+        [
+            (0.1787, -1.4630),
+            (-0.3554, 0.4275),
+            (-0.0227, 5.3251),
+            (0.1206, -2.5771),
+            (-0.0670, 0.3703),
+        ],
+        [
+            (-0.0193, -0.2592),
+            (-0.0665, 0.0008),
+            (-0.0004, 0.2125),
+            (-0.0641, -0.8989),
+            (-0.0033, 0.0452),
+        ],
+        [
+            (-0.0167, -0.2608),
+            (-0.0950, 0.0092),
+            (-0.0079, 0.2102),
+            (-0.0441, -1.6537),
+            (-0.0109, 0.0529),
+        ],
     ]
 )
-# x and y overhead: a row for each of T², T, 1 and a column for each of θ³, θ², θ, 1.
-CHROMATICITY = [
-    [[0.00166, -0.00375, 0.00209, 0], [-0.02903, 0.06377, -0.03202, 0.00394], [0.11693, -0.21196, 0.06052, 0.25886]],
-    [[0.00275, -0.00610, 0.00317, 0], [-0.04214, 0.08970, -0.04153, 0.00516], [0.15346, -0.26756, 0.06670, 0.26688]],
+# Chromaticities x and y overhead. There is a row for each of T², T and 1 of the
+# turbidity T, and a column for each of θ³, θ², θ and 1 of the sun's zenith
+# angle θ.
+ZENITH_X = [
+    [0.00166, -0.00375, 0.00209, 0],
+    [-0.02903, 0.06377, -0.03202, 0.00394],
+    [0.11693, -0.21196, 0.06052, 0.25886],
 ]
-RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]  # IEC 61966-2-1
-DEGREES = (13, 11)  # in the zenith, the paper's, and in 1/turbidity: with the paper's 7 the error is 25 times larger
-UPRIGHT = [l * l + l + m for l in range(7) for m in range(l + 1)]  # the 28 coefficients that are fitted
+ZENITH_Y = [
+    [0.00275, -0.00610, 0.00317, 0],
+    [-0.04214, 0.08970, -0.04153, 0.00516],
+    [0.15346, -0.26756, 0.06670, 0.26688],
+]
+# Matrix of IEC 61966-2-1.
+RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+# Degree in the zenith angle, which is the paper's, and in the inverse of
+# turbidity. With the paper's degree of 7, the error is 25 times larger.
+DEGREES = (13, 11)
+# Indices of the 28 fitted coefficients, which are those with m >= 0.
+UPRIGHT = [l * l + l + m for l in range(7) for m in range(l + 1)]
+# The exponential exp(b / cosine) is below 1e-57 at a cosine of the zenith angle
+# of 1e-3. The limit keeps 1 / cosine finite at the horizon.
+MIN_COSINE = 1e-3
 
 
 def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
-    """out: the file that the renderer reads, unless another is named as the script's argument."""
+    """Fit the sky, write the fit, and print its error.
+
+    Args:
+        out: File to write. The default is the file that the renderer reads.
+    """
     fit = fit_polynomials(*DEGREES).float()
     save_file({"fit": fit}, out)
     error = fit_error(fit, 50, np.random.default_rng(0))
@@ -44,67 +89,157 @@ def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
 
 
 def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) -> torch.Tensor:
-    """What `coefficients` evaluates: (zenith_degree + 1, turbidity_degree + 1, 28, 3) float64.
+    """Fit the coefficients of skies whose sun is at azimuth 0.
 
-    Chebyshev coefficients, in the zenith and in 1/turbidity, of the sky's coefficients with m = 0..l where the sun is
-    at azimuth 0; those with m < 0 vanish by symmetry. Least squares over quadratures of so many nodes at twice as many
-    Chebyshev points. The model has a pole at a turbidity of 1.65: polynomials in turbidity itself, of the paper's
-    degrees 13 and 7, are off by up to 4 %, those in its inverse by 0.15 %. Monomials would lose float32's digits.
+    The fit is a least-squares fit to quadratures at Chebyshev points, with
+    twice as many points as polynomials in each variable. Coefficients with
+    m < 0 vanish by symmetry.
+
+    The model has a pole at a turbidity of 1.65. Polynomials of the paper's
+    degrees 13 and 7 in turbidity are therefore off by up to 4%, and polynomials
+    in its inverse by 0.15%. Monomials would lose digits of float32.
+
+    Args:
+        zenith_degree: Degree in the zenith angle of the sun.
+        turbidity_degree: Degree in the inverse of turbidity.
+        nodes: Number of nodes of the quadratures.
+
+    Returns:
+        Chebyshev coefficients, float64, shape
+        (zenith_degree + 1, turbidity_degree + 1, 28, 3).
     """
-    degrees = zenith_degree, turbidity_degree
-    x, y = (grid.ravel() for grid in np.meshgrid(*(chebpts1(2 * (degree + 1)) for degree in degrees)))
-    suns = zip(math.pi / 4 * (x + 1), 5 / (y + 1.5), strict=True)  # as `coefficients` maps them to x and y
-    skies = np.stack([coefficients_by_quadrature(zenith, 0.0, turbidity, nodes)[UPRIGHT] for zenith, turbidity in suns])
-    fit = np.linalg.lstsq(chebvander2d(x, y, degrees), skies.reshape(len(skies), -1))[0]
-    return torch.from_numpy(fit).view(zenith_degree + 1, turbidity_degree + 1, len(UPRIGHT), 3)
+    zenith_points = chebpts1(2 * (zenith_degree + 1))
+    turbidity_points = chebpts1(2 * (turbidity_degree + 1))
+    x, y = (grid.ravel() for grid in np.meshgrid(zenith_points, turbidity_points))
+    # `renderer.light.skylight.coefficients` maps zenith and turbidity to x and y
+    # by the inverse of these formulas.
+    zeniths = math.pi / 4 * (x + 1)
+    turbidities = 5 / (y + 1.5)
+    skies = np.stack(
+        [
+            coefficients_by_quadrature(zenith, 0.0, turbidity, nodes)[UPRIGHT]
+            for zenith, turbidity in zip(zeniths, turbidities, strict=True)
+        ]
+    )
+    polynomials = chebvander2d(x, y, (zenith_degree, turbidity_degree))
+    [fit, *_] = np.linalg.lstsq(polynomials, skies.reshape(len(skies), -1))
+    shape = (zenith_degree + 1, turbidity_degree + 1, len(UPRIGHT), 3)
+    return torch.from_numpy(fit).view(shape)
 
 
 def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
-    """The largest error of a fit on random skies, relative to the L2 norm of a sky's coefficients by quadrature."""
-    suns = rng.uniform([ZENITH[0], 0, TURBIDITY[0]], [ZENITH[1], 2 * math.pi, TURBIDITY[1]], (skies, 3))
+    """Return the largest error of a fit on random skies.
+
+    The error is relative to the L2 norm of the sky's coefficients by
+    quadrature.
+    """
+    lowest = [ZENITH[0], 0, TURBIDITY[0]]
+    highest = [ZENITH[1], 2 * math.pi, TURBIDITY[1]]
+    suns = rng.uniform(lowest, highest, (skies, 3))
     exact = np.stack([coefficients_by_quadrature(*sun) for sun in suns])
     zenith, azimuth, turbidity = torch.from_numpy(suns.T)
     errors = coefficients(zenith, azimuth, turbidity, fit).numpy() - exact
-    return float((np.linalg.norm(errors, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))).max())
+    relative_errors = np.linalg.norm(errors, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
+    return float(relative_errors.max())
 
 
-def coefficients_by_quadrature(zenith: float, azimuth: float, turbidity: float, nodes: int = 48) -> np.ndarray:
-    """(49, 3) coefficients of the sky by quadrature over 4 nodes² directions of the upper hemisphere.
+def coefficients_by_quadrature(
+    zenith: float, azimuth: float, turbidity: float, nodes: int = 48
+) -> np.ndarray:
+    """Integrate the sky's radiance times harmonics over the upper hemisphere.
 
-    48 nodes leave an error of up to 2e-8 of the coefficients' norm (in the clearest air with the sun overhead; mostly
-    1e-9) and 24 of up to 1e-5. In polar coordinates around the sun, so that the cusp there is an end of the
-    integration: whole circles until they touch the horizon, and from there arcs above it, at angles
-    π/2 - zenith cos t, in which their length is smooth.
+    The quadrature has 4 · nodes² directions in polar coordinates around the
+    sun, so that the cusp there is an end of the integration. Circles around the
+    sun are whole until they touch the horizon. From there on only the arcs above
+    the horizon count, at angles of π/2 - zenith · cos t. Their length is smooth
+    in t.
+
+    With 48 nodes the error is mostly 1e-9 of the norm of the coefficients, and
+    up to 2e-8 in the clearest air with the sun overhead. With 24 nodes it is up
+    to 1e-5.
+
+    Args:
+        zenith: Zenith angle of the sun in radians.
+        azimuth: Azimuth of the sun in radians.
+        turbidity: Turbidity of the air.
+        nodes: Number of nodes in the angle to the sun, for the circles and for
+            the arcs.
+
+    Returns:
+        Coefficients, shape (49, 3).
     """
-    tilt = max(zenith, 1e-8)  # overhead there are no arcs, and the ratio of the tangents is 0/0
-    (u, weights), (v, along) = (((1 + x) / 2, weight / 2) for x, weight in map(roots_legendre, (nodes, 2 * nodes)))
-    t, lowest = math.pi * u, math.pi / 2 - tilt
-    angles = np.concatenate([lowest * u, math.pi / 2 - tilt * np.cos(t)])[:, None]
-    steps = np.concatenate([lowest * weights, tilt * np.sin(t) * math.pi * weights])[:, None]
-    arcs = np.concatenate([np.full(nodes, math.pi), np.arccos(-np.tan(tilt * np.cos(t)) / math.tan(tilt))])[:, None]
-    solid_angles = np.sin(angles) * steps * 2 * arcs * along
-    angles, bearings = np.broadcast_arrays(angles, arcs * (2 * v - 1))  # a bearing of 0 is up
-    x, y = -np.sin(angles) * np.cos(bearings), np.sin(angles) * np.sin(bearings)
+    # A sun overhead has no arcs, and the ratio of the tangents would be 0/0.
+    tilt = max(zenith, 1e-8)
+    u, u_weights = _unit_interval_quadrature(nodes)
+    v, v_weights = _unit_interval_quadrature(2 * nodes)
+    t = math.pi * u
+    horizon_angle = math.pi / 2 - tilt
+    arc_angles = math.pi / 2 - tilt * np.cos(t)
+    angles = np.concatenate([horizon_angle * u, arc_angles])[:, None]
+    arc_steps = tilt * np.sin(t) * math.pi * u_weights
+    steps = np.concatenate([horizon_angle * u_weights, arc_steps])[:, None]
+    half_arcs = np.arccos(-np.tan(tilt * np.cos(t)) / math.tan(tilt))
+    half_widths = np.concatenate([np.full(nodes, math.pi), half_arcs])[:, None]
+    solid_angles = np.sin(angles) * steps * 2 * half_widths * v_weights
+
+    # A bearing of 0 is up.
+    angles, bearings = np.broadcast_arrays(angles, half_widths * (2 * v - 1))
+    x = -np.sin(angles) * np.cos(bearings)
+    y = np.sin(angles) * np.sin(bearings)
     around_sun = np.stack([x, y, np.cos(angles)], axis=-1).reshape(-1, 3)
     directions = Rotation.from_euler("yz", [tilt, azimuth]).apply(around_sun)
     sky = radiance(directions[:, 2], angles.ravel(), zenith, turbidity)
-    return basis(torch.from_numpy(directions), 6).numpy().T @ (solid_angles.reshape(-1, 1) * sky)
+    harmonics = basis(torch.from_numpy(directions), 6).numpy()
+    return harmonics.T @ (solid_angles.reshape(-1, 1) * sky)
+
+
+def _unit_interval_quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nodes and weights of Gauss-Legendre quadrature over [0, 1]."""
+    positions, weights = roots_legendre(nodes)
+    return (1 + positions) / 2, weights / 2
 
 
 def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: float) -> np.ndarray:
-    """Sky radiance (N, 3), linear RGB in kcd/m², from (N,) cosines of the zenith angle and angles to the sun.
+    """Evaluate the sky's radiance.
 
-    Saturated skies leave the gamut and are not clamped: around a clear sunset blue falls to -2.6 % of the largest.
+    Saturated skies leave the gamut and are not clamped. Around a clear sunset,
+    blue falls to -2.6% of the largest value.
+
+    Args:
+        cosine: Cosines of the zenith angles of directions, shape (N,).
+        angle: Angles between the directions and the sun in radians, shape (N,).
+        zenith: Zenith angle of the sun in radians.
+        turbidity: Turbidity of the air.
+
+    Returns:
+        Radiance, linear RGB in kcd/m², shape (N, 3).
     """
     chi = (4 / 9 - turbidity / 120) * (math.pi - 2 * zenith)
-    luminance = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192
-    overhead = [luminance, *(np.polyval([np.polyval(row, zenith) for row in rows], turbidity) for rows in CHROMATICITY)]
-    # 1/cos overflows at the horizon; from a cosine of 1e-3 on, its exponential is below 1e-57.
-    cosine, angle = np.append(cosine.clip(1e-3), 1), np.append(angle, zenith)  # the last direction is overhead
+    luminance_overhead = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192
+    overhead = np.array(
+        [
+            luminance_overhead,
+            _chromaticity_overhead(ZENITH_X, zenith, turbidity),
+            _chromaticity_overhead(ZENITH_Y, zenith, turbidity),
+        ]
+    )
+    # The last direction is straight up.
+    cosine = np.append(cosine.clip(MIN_COSINE), 1)
+    angle = np.append(angle, zenith)
     a, b, c, d, e = (PEREZ @ [turbidity, 1]).T[:, :, None]
-    perez = (1 + a * np.exp(b / cosine)) * (1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2)
-    luminance, x, y = np.array(overhead)[:, None] * perez[:, :-1] / perez[:, -1:]
-    return (np.stack([x, y, 1 - x - y], axis=1) * (luminance / y)[:, None]) @ np.linalg.inv(RGB_TO_XYZ).T
+    gradation = 1 + a * np.exp(b / cosine)
+    indicatrix = 1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2
+    perez = gradation * indicatrix
+    luminance, x, y = overhead[:, None] * perez[:, :-1] / perez[:, -1:]
+    chromaticities = np.stack([x, y, 1 - x - y], axis=1)
+    xyz = chromaticities * (luminance / y)[:, None]
+    return xyz @ np.linalg.inv(RGB_TO_XYZ).T
+
+
+def _chromaticity_overhead(rows: list[list[float]], zenith: float, turbidity: float) -> float:
+    """Evaluate a chromaticity overhead from its table."""
+    by_turbidity = [np.polyval(row, zenith) for row in rows]
+    return np.polyval(by_turbidity, turbidity)
 
 
 if __name__ == "__main__":

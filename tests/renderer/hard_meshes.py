@@ -1,4 +1,4 @@
-"""Meshes that are hard to shade, one color per face, and a rasterizer that shows any face."""
+"""Meshes that are hard to shade, with one color per face, and a rasterizer that shows any face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,97 +10,161 @@ from numpy.typing import ArrayLike
 from renderer.geometry.mesh import Mesh, concatenate
 from renderer.visibility.rasterizers import Rasterizer
 
+NO_FACE = -1
+
 
 @dataclass(frozen=True)
 class Chart(Rasterizer):
-    """Whose every image is a chart: sample i sees face i, however thin that is."""
+    """Rasterizer whose sample i sees face i, however thin the face is."""
 
     name: str = "chart"
     description: str = "a chart of the faces"
 
-    def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
-        ids = np.full((len(points), resolution**2), -1, dtype=np.int32)
+    def rasterize(
+        self,
+        points: np.ndarray,
+        faces: np.ndarray,
+        resolution: int,
+        closed: bool = False,
+    ) -> np.ndarray:
+        ids = np.full((len(points), resolution**2), NO_FACE, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))
         return ids.reshape(-1, resolution, resolution)
 
 
 def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
-    """One color per face, in multiples of 1/64, which every number type holds exactly."""
+    """Create a mesh with one random color per face.
+
+    Colors are multiples of 1/64, which every number type holds exactly.
+    """
     colors = np.random.default_rng(0).integers(16, 65, (len(faces), 1, 3)) / 64
-    return replace(Mesh.plain(vertices, faces), corner_colors=colors.repeat(3, axis=1).astype(np.float32))
+    corner_colors = colors.repeat(3, axis=1).astype(np.float32)
+    return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
 
 
 def sphere(subdivisions: int = 2, lowest: float = 0.8) -> Mesh:
-    """A dented sphere of 20·4^subdivisions faces, of radius `lowest` to 1."""
+    """Create a dented sphere.
+
+    Args:
+        subdivisions: The sphere has 20 · 4^subdivisions faces.
+        lowest: The smallest radius. The largest is 1.
+    """
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    rng = np.random.default_rng(1)
-    return painted(shape.vertices * rng.uniform(lowest, 1, (len(shape.vertices), 1)), shape.faces)
+    radii = np.random.default_rng(1).uniform(lowest, 1, (len(shape.vertices), 1))
+    return painted(shape.vertices * radii, shape.faces)
 
 
 def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
-    """Needles and flat caps with edges of 1, `count` of each in all three orders of corners, facing a camera."""
+    """Create thin triangles whose longest edges have a length of about 1.
+
+    The third corner of a needle is beside the second corner. The third corner
+    of a flat cap is between the first two.
+
+    Args:
+        height: Height of the triangles.
+        count: Number of needles, and of caps. Each occurs in all three orders
+            of corners.
+        towards: Direction that the triangles roughly face, shape (3,).
+    """
     rng = np.random.default_rng(2)
-    normal = _unit(rng.normal(size=(2 * count, 3)) + 3 * towards)
-    along = _unit(np.cross(normal, rng.normal(size=(2 * count, 3))))
+    shape = (2 * count, 3)
+    normal = _unit(rng.normal(size=shape) + 3 * towards)
+    along = _unit(np.cross(normal, rng.normal(size=shape)))
     across = np.cross(normal, along)
-    foot = np.repeat([1.0, 0.4], count)[:, None]  # where the third corner is: beside the second, or between the two
-    corner = rng.uniform(-1, 1, (2 * count, 3))
-    corners = np.stack([corner, corner + along, corner + foot * along + height * across], axis=1)
+    # Position of the third corner along the edge between the other two.
+    foot = np.repeat([1.0, 0.4], count)[:, None]
+    first = rng.uniform(-1, 1, shape)
+    second = first + along
+    third = first + foot * along + height * across
+    corners = np.stack([first, second, third], axis=1)
     orders = [np.roll(corners, shift, axis=1) for shift in range(3)]
-    return painted(np.concatenate(orders).reshape(-1, 3), np.arange(18 * count).reshape(-1, 3))
+    vertices = np.concatenate(orders).reshape(-1, 3)
+    return painted(vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
 def with_faces_without_area(mesh: Mesh) -> Mesh:
-    """Beside each face one on its own first edge, one that is a point, and one with a third corner in mid-edge."""
-    mesh = replace(mesh, vertices=mesh.vertices.astype(np.float32).astype(np.float64))  # the middles are then exact
-    first, second = mesh.faces[:, 0], mesh.faces[:, 1]
-    middle = len(mesh.vertices) + np.arange(len(mesh.faces))
-    vertices = np.concatenate([mesh.vertices, (mesh.vertices[first] + mesh.vertices[second]) / 2])
-    lines = [(first, second, second), (first, first, first), (first, second, middle)]
-    return painted(vertices, np.concatenate([mesh.faces, *(np.stack(line, axis=1) for line in lines)]))
+    """Add three faces without area for each face of a mesh.
+
+    The first is the first edge of the face. The second is a point. The third
+    has its third corner in the center of the edge.
+    """
+    # Sums of two float32 numbers are exact in float64, and so are the centers.
+    vertices = mesh.vertices.astype(np.float32).astype(np.float64)
+    first = mesh.faces[:, 0]
+    second = mesh.faces[:, 1]
+    centers = (vertices[first] + vertices[second]) / 2
+    center = len(vertices) + np.arange(len(mesh.faces))
+    edges = np.stack([first, second, second], axis=1)
+    points = np.stack([first, first, first], axis=1)
+    divided_edges = np.stack([first, second, center], axis=1)
+    return painted(
+        np.concatenate([vertices, centers]),
+        np.concatenate([mesh.faces, edges, points, divided_edges]),
+    )
 
 
 def box() -> Mesh:
-    """Its normals are the axes, the harmonics' poles among them."""
+    """Create a box. Its normals are the axes, which contain the poles of the harmonics."""
     shape = trimesh.creation.box((1.2, 1.0, 0.8))
     return painted(shape.vertices, shape.faces)
 
 
 def opened(mesh: Mesh) -> Mesh:
-    """Without its upper faces, so that the inside is seen."""
-    return painted(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces][:, :, 2].mean(axis=1) < 0.2])
+    """Remove the upper faces of a mesh, so that its inside is visible."""
+    heights = mesh.vertices[mesh.faces][:, :, 2].mean(axis=1)
+    return painted(mesh.vertices, mesh.faces[heights < 0.2])
 
 
 def heap() -> Mesh:
-    """A ball that touches the plate below it, beside a thin wall: open, self-touching and of several parts."""
+    """Create a ball that touches a plate, and a thin wall beside it.
+
+    The mesh is open, touches itself and has several parts.
+    """
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
-    plate = painted([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    lifted_ball = painted(ball.vertices + np.array([0, 0, 0.4]), ball.faces)
+    plate = painted(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]],
+        [[0, 1, 2], [0, 2, 3]],
+    )
     wall = painted([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]])
-    return concatenate([painted(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
+    return concatenate([lifted_ball, plate, wall])
 
 
 def boards() -> Mesh:
-    """Five thin boards, 0.03 apart."""
-    box = trimesh.creation.box((0.8, 0.8, 0.02))
-    return concatenate([painted(box.vertices + np.array([0, 0, 0.05 * each]), box.faces) for each in range(5)])
+    """Create five boards of thickness 0.02 with gaps of 0.03 between them."""
+    board = trimesh.creation.box((0.8, 0.8, 0.02))
+    heights = [0.0, 0.05, 0.1, 0.15, 0.2]
+    return concatenate(
+        [painted(board.vertices + np.array([0, 0, height]), board.faces) for height in heights]
+    )
 
 
 def non_manifold() -> Mesh:
-    """Three faces on one edge, and two tetrahedra that share a corner."""
-    fan = [[0, 0, -0.7], [0, 0, 0.7], [0.8, 0, 0], [-0.4, 0.7, 0], [-0.4, -0.7, 0]]
-    tips = [[0.3, 0, 0.1], [0, 0.3, 0.2], [0.2, 0.2, 0.5]]
-    edge = painted(fan, [[0, 1, 2], [0, 1, 3], [1, 0, 4]])
-    tetrahedron = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
-    bow = painted([[0, 0, 0], *tips, *(-np.array(tips)).tolist()], tetrahedron + [_after(f, 3) for f in tetrahedron])
-    return concatenate([edge, bow])
-
-
-def _after(face: list[int], count: int) -> list[int]:
-    """A face of the second tetrahedron, mirrored: the shared corner is the first of both."""
-    return [corner + count if corner else 0 for corner in reversed(face)]
+    """Create three faces with a common edge, and two tetrahedra with a common corner."""
+    fan = [
+        [0, 0, -0.7],
+        [0, 0, 0.7],
+        [0.8, 0, 0],
+        [-0.4, 0.7, 0],
+        [-0.4, -0.7, 0],
+    ]
+    faces_on_edge = painted(fan, [[0, 1, 2], [0, 1, 3], [1, 0, 4]])
+    tips = np.array([[0.3, 0, 0.1], [0, 0.3, 0.2], [0.2, 0.2, 0.5]])
+    vertices = np.concatenate([np.zeros((1, 3)), tips, -tips])
+    # Corner 0 is common to both tetrahedra. The second one is mirrored, and the
+    # reversed order of its corners makes its faces point outward again.
+    tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    mirrored = np.where(tetrahedron == 0, 0, tetrahedron + len(tips))[:, ::-1]
+    return concatenate(
+        [
+            faces_on_edge,
+            painted(vertices, np.concatenate([tetrahedron, mirrored])),
+        ]
+    )
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (N, 3) to unit length."""
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 

@@ -1,4 +1,4 @@
-"""What several tests compare with: scipy's harmonics, the sRGB standard, and meshes."""
+"""Independent references for tests: SciPy's harmonics, the sRGB standard, and test meshes."""
 
 import math
 from dataclasses import replace
@@ -14,17 +14,31 @@ from renderer.light.harmonics import lambertian_factors
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:
-    """Normal numbers in float64."""
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    """Draw standard normal numbers in float64."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+
+def draw_uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    """Draw numbers in [0, 1) in float64."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(*shape, dtype=torch.float64, generator=generator)
 
 
 def random_directions(count: int, seed: int = 0) -> torch.Tensor:
-    """(N, 3) float64 unit vectors."""
+    """Draw unit vectors, float64, shape (count, 3)."""
     return torch.nn.functional.normalize(draw(count, 3, seed=seed))
 
 
 def real_harmonics(complex_values: np.ndarray) -> np.ndarray:
-    """(K, ...) real combinations of scipy's complex harmonics (L, M, ...), whose sign (-1)^m is taken out."""
+    """Combine SciPy's complex harmonics into real ones without the Condon-Shortley sign.
+
+    Args:
+        complex_values: Values by band and order, shape (L, M, ...).
+
+    Returns:
+        Real values, shape (L², ...), with index l² + l + m.
+    """
     rows = []
     for l in range(len(complex_values)):
         for m in range(-l, l + 1):
@@ -35,46 +49,68 @@ def real_harmonics(complex_values: np.ndarray) -> np.ndarray:
 
 
 def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarray:
-    """(N, K) of directions (N, 3) of any length."""
+    """Compute harmonics, shape (N, K), for directions (N, 3) of any length."""
     x, y, z = np.asarray(directions, dtype=np.float64).T
-    return real_harmonics(sph_harm_y_all(degree, degree, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))).T
+    polar = np.arctan2(np.hypot(x, y), z)
+    azimuth = np.arctan2(y, x)
+    return real_harmonics(sph_harm_y_all(degree, degree, polar, azimuth)).T
 
 
-def scipy_irradiance(normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor) -> np.ndarray:
-    """(N, 3) Σ A_l U_lm Y_lm(n); test_harmonics proves the factors A_l."""
+def scipy_irradiance(
+    normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor
+) -> np.ndarray:
+    """Compute the irradiance Σ A_l U_lm Y_lm(n), shape (N, 3).
+
+    test_harmonics.py checks the factors A_l that this function takes from the
+    renderer.
+    """
     degree = math.isqrt(len(light)) - 1
     factors = lambertian_factors(degree).numpy()
-    return scipy_basis(normals, degree) @ (factors[:, None] * np.asarray(light, dtype=np.float64))
+    reflected = factors[:, None] * np.asarray(light, dtype=np.float64)
+    return scipy_basis(normals, degree) @ reflected
 
 
 def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
-    """Dented, with two textures and bare faces, colors at all corners, and texture coordinates that wrap around."""
-    rng, count = np.random.default_rng(seed), len(faces)
+    """Dent a mesh, and give its faces one of two textures or none.
+
+    All corners have their own colors and texture coordinates. The coordinates
+    lie outside of [0, 1], too.
+    """
+    rng = np.random.default_rng(seed)
+    face_count = len(faces)
+    dents = rng.uniform(0.7, 1, (len(vertices), 1))
+    colors = rng.uniform(0.1, 1, (face_count, 3, 3))
+    uvs = rng.uniform(-1, 2, (face_count, 3, 2))
+    large_texture = rng.integers(0, 256, (3, 4, 3), dtype=np.uint8)
+    small_texture = rng.integers(0, 256, (2, 3, 3), dtype=np.uint8)
     return replace(
-        Mesh.plain(vertices * rng.uniform(0.7, 1, (len(vertices), 1)), faces),
-        corner_colors=rng.uniform(0.1, 1, (count, 3, 3)).astype(np.float32),
-        corner_uvs=rng.uniform(-1, 2, (count, 3, 2)).astype(np.float32),
-        texture_ids=np.arange(count, dtype=np.int32) % 3 - 1,
-        textures=tuple(rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in [(3, 4), (2, 3)]),
+        Mesh.plain(vertices * dents, faces),
+        corner_colors=colors.astype(np.float32),
+        corner_uvs=uvs.astype(np.float32),
+        texture_ids=np.arange(face_count, dtype=np.int32) % 3 - 1,
+        textures=(large_texture, small_texture),
     )
 
 
 def mesh_of(shape: trimesh.Trimesh, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
+    """Convert a shape of trimesh to a mesh of one color."""
     return Mesh.plain(shape.vertices, shape.faces, color)
 
 
 def corners_of(mesh: Mesh) -> np.ndarray:
-    """(F, 3, 3) positions."""
+    """Return the positions of the corners of all faces, shape (F, 3 corners, 3)."""
     return mesh.vertices[mesh.faces]
 
 
 def srgb_of(linear: ArrayLike) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Encode linear values by IEC 61966-2-1."""
     linear = np.asarray(linear)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    curve = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, curve)
 
 
 def linear_of(srgb: ArrayLike) -> np.ndarray:
-    """The inverse of `srgb_of`."""
+    """Decode values by IEC 61966-2-1."""
     srgb = np.asarray(srgb)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    curve = ((srgb + 0.055) / 1.055) ** 2.4
+    return np.where(srgb <= 0.04045, srgb / 12.92, curve)

@@ -1,11 +1,12 @@
-"""The attack command: the run over meshes."""
+"""The attack command: attack each mesh of a scene, or a saved adversary."""
 
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from augment.classifiers import Classifier
 from augment.losses import NO_CLASS
 from augment.random_streams import generator
 from augment.scene.build import build_scene
-from augment.scene.objects import load_object, on_ground
+from augment.scene.objects import SceneObject, load_object, on_ground
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -46,14 +47,66 @@ from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, writable_folder
 
+# Settings that `find_scene` may change, in the order in which they are printed.
+SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
+
+
+class MeshAttack(NamedTuple):
+    """The attack on one mesh.
+
+    Attributes:
+        name: Name of the mesh: its file or its solid.
+        scene: Settings of the attacked scene.
+        result: Result of `augment.attack`.
+    """
+
+    name: str
+    scene: AttackSceneSettings
+    result: AttackResult
+
+
+@dataclass(frozen=True)
+class TransferTargets:
+    """Other classifiers, views and objects to which successful adversaries are shown.
+
+    Attributes:
+        classifiers: Other classifiers.
+        azimuths: Angles in degrees by which the cameras are turned about the
+            vertical.
+        objects: Objects that replace the attacked one.
+    """
+
+    classifiers: Sequence[Classifier] = ()
+    azimuths: Sequence[float] = ()
+    objects: Sequence[SceneObject] = ()
+
+    def __bool__(self) -> bool:
+        """Return whether there is anything to transfer to."""
+        return bool(self.classifiers or self.azimuths or self.objects)
+
+    def transfer(self, result: AttackResult) -> list[dict[str, Any]]:
+        """Show the adversaries of a result to all targets, see `augment.transfer`."""
+        return transfer(
+            result,
+            classifiers=self.classifiers,
+            azimuths=self.azimuths,
+            objects=self.objects,
+        )
+
 
 def run(settings: AttackExperimentSettings) -> None:
-    """Attack each mesh or the reloaded adversary, write what came of it, and print a summary."""
-    with keyed("transfer", vars(settings.transfer)):
-        azimuths, meshes = settings.transfer.azimuths, settings.transfer.meshes
-        require_transferable(settings.attack.parameters, azimuths, meshes)
-    with keyed("attack", vars(settings.attack)):
-        require_renderers(settings.attack.renderers)
+    """Attack each mesh or the reloaded adversary, write the results, and print a summary.
+
+    Without an attack, print how the reloaded adversary is classified.
+
+    Args:
+        settings: Settings of pnb-attack.
+
+    Raises:
+        InputError: If a setting or an input file is wrong, or if a classifier
+            misclassifies a mesh before the attack.
+    """
+    _require_attack_settings(settings)
     adversary = reload(settings.reload) if settings.reload else None
     if adversary is None:
         with keyed("attack"):
@@ -65,66 +118,160 @@ def run(settings: AttackExperimentSettings) -> None:
         print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
         if not settings.attack.parameters:
             return
-    others = load_others(settings, classifier, device)
+    targets = load_targets(settings, classifier, device)
     out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
-    sweeps: dict[str, Sweep] = {}
     with sole_writer("out", out):
         _remove_adversaries(out)
-        for index, (name, scene, result) in enumerate(attacks(settings, classifier, device, adversary)):
-            if scene != settings.scene:
-                print(f"{name} is misclassified in the scene as it is, but not with {overrides(scene, settings.scene)}")
-            checks = check(result) if settings.attack.checks else None
-            folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
-            lines = save(result, folder, checks, settings.attack.renderers)
-            print(format_attack(name, result, checks, lines))
-            print(f"images, adversaries and numbers: {folder}\n")
-            if others:
-                print(f"{write_transfers(transfer(result, **others), folder / TRANSFERS)}\n")
+        sweeps: dict[str, Sweep] = {}
+        mesh_attacks = attacks(settings, classifier, device, adversary)
+        for index, mesh_attack in enumerate(mesh_attacks):
+            # Windows allows no colon in the name of a folder.
+            stem = Path(mesh_attack.name.replace(":", "_")).stem
+            folder = out / f"{index}_{stem}"
+            _write_attack(mesh_attack, folder, settings, targets)
             if settings.attack.radius_scales:
-                sweeps[folder.name] = success_by_radius(result, settings.attack.radius_scales)
-                print(f"{format_sweep(sweeps[folder.name])}\n")
+                sweep = success_by_radius(mesh_attack.result, settings.attack.radius_scales)
+                sweeps[folder.name] = sweep
+                print(f"{format_sweep(sweep)}\n")
         if sweeps:
-            write_sweeps(sweeps, {name: steps.norm for name, steps in settings.attack.parameters.items()}, out)
+            norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
+            write_sweeps(sweeps, norms, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         write_config(out, settings, command=command_line("attack"))
 
 
+def _require_attack_settings(settings: AttackExperimentSettings) -> None:
+    """Check settings that no file and no classifier is needed for."""
+    with keyed("transfer", vars(settings.transfer)):
+        require_transferable(
+            settings.attack.parameters,
+            settings.transfer.azimuths,
+            settings.transfer.meshes,
+        )
+    with keyed("attack", vars(settings.attack)):
+        require_renderers(settings.attack.renderers)
+
+
+def _write_attack(
+    mesh_attack: MeshAttack,
+    folder: Path,
+    settings: AttackExperimentSettings,
+    targets: TransferTargets,
+) -> None:
+    """Check the attack on one mesh, write its files into a folder, and print its summary."""
+    name = mesh_attack.name
+    result = mesh_attack.result
+    if mesh_attack.scene != settings.scene:
+        changes = overrides(mesh_attack.scene, settings.scene)
+        print(f"{name} is misclassified in the given scene, but not with {changes}")
+    checks = check(result) if settings.attack.checks else None
+    lines = save(result, folder, checks, settings.attack.renderers)
+    print(format_attack(name, result, checks, lines))
+    print(f"images, adversaries and numbers: {folder}\n")
+    if targets:
+        table = write_transfers(targets.transfer(result), folder / TRANSFERS)
+        print(f"{table}\n")
+
+
 def _remove_adversaries(out: Path) -> None:
-    """Remove those of an earlier call, which the report would count among the new ones."""
+    """Remove the adversaries of an earlier call, which a report would show among the new ones."""
     for lines in out.glob(f"*/{LINES}"):
         for example in lines.parent.glob("example_*"):
-            shutil.rmtree(example) if example.is_dir() else example.unlink()
-        for file in (lines, lines.with_name(TRANSFERS)):
-            file.unlink(missing_ok=True)
+            if example.is_dir():
+                shutil.rmtree(example)
+            else:
+                example.unlink()
+        lines.unlink()
+        lines.with_name(TRANSFERS).unlink(missing_ok=True)
     for name in (TABLE, FIGURE):
         (out / name).unlink(missing_ok=True)
 
 
 def attacks(
-    settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
-) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
-    """(name, settings of the attacked scene, result) of an adversary, around which norm-balls then are, or without one
-    of each mesh, in a scene that `scene.search` found. InputError also where the classifier is wrong before."""
+    settings: AttackExperimentSettings,
+    classifier: Classifier,
+    device: torch.device,
+    adversary: Adversary | None = None,
+) -> Iterator[MeshAttack]:
+    """Attack a saved adversary or, without one, each mesh of the scene.
 
-    build = partial(build_attacked, settings, size=classifier.size, device=device)
-    target, seed, force = settings.target, settings.seed, settings.attack.force
+    A mesh that is misclassified in the given scene is attacked in the scene
+    that `scene.search` finds.
+
+    Args:
+        settings: Settings of pnb-attack.
+        classifier: Classifier to attack.
+        device: Device of the light and the images.
+        adversary: Adversary at which the attack starts, and around which its
+            norm-balls lie.
+
+    Yields:
+        Attack on each mesh.
+
+    Raises:
+        InputError: If a mesh is misclassified before the attack, or if the
+            adversary consists of changed pixels.
+    """
     if adversary is not None:
-        if adversary.pixels is not None:
-            raise InputError(f"reload={settings.reload}: no attack goes on from changed pixels: leave attack= out")
-        scene = adversary.scene(choose_rasterizer(settings.renderer), device)
-        result = attack(classifier, scene, target, settings.attack, seed=seed, force=True)
-        yield adversary.shown.name, settings.scene, result
+        yield _attack_adversary(settings, classifier, device, adversary)
         return
     for index, item in enumerate(settings.scene.meshes):
-        named, chosen = read_object(item, settings.label, f"scene.meshes[{index}]"), settings.scene
-        if settings.scene.search and not force:
-            draws = generator(seed, named.mesh, "search")
-            chosen = find_scene(classifier, chosen, settings.attack, partial(build, named), chosen.search, draws)
-        attacked = build(named, chosen)
-        with keyed("attack", vars(settings.attack)):
-            result = attack(classifier, attacked, target, settings.attack, seed=seed, force=force)
-        yield named.mesh, chosen, result
+        mesh = read_object(item, settings.label, f"scene.meshes[{index}]")
+        yield _attack_mesh(settings, classifier, device, mesh)
+
+
+def _attack_adversary(
+    settings: AttackExperimentSettings,
+    classifier: Classifier,
+    device: torch.device,
+    adversary: Adversary,
+) -> MeshAttack:
+    """Attack the scene of a saved adversary."""
+    if adversary.pixels is not None:
+        fault = "no attack goes on from changed pixels"
+        raise InputError(f"reload={settings.reload}: {fault}: leave attack= out")
+    scene = adversary.scene(choose_rasterizer(settings.renderer), device)
+    result = attack(
+        classifier,
+        scene,
+        settings.target,
+        settings.attack,
+        seed=settings.seed,
+        force=True,
+    )
+    return MeshAttack(adversary.shown.name, settings.scene, result)
+
+
+def _attack_mesh(
+    settings: AttackExperimentSettings,
+    classifier: Classifier,
+    device: torch.device,
+    mesh: ObjectSettings,
+) -> MeshAttack:
+    """Attack one mesh in the given scene, or in a scene that a search finds."""
+    build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
+    scene_settings = settings.scene
+    if scene_settings.search and not settings.attack.force:
+        scene_settings = find_scene(
+            classifier,
+            scene_settings,
+            settings.attack,
+            build,
+            scene_settings.search,
+            generator(settings.seed, mesh.mesh, "search"),
+        )
+    scene = build(scene_settings)
+    with keyed("attack", vars(settings.attack)):
+        result = attack(
+            classifier,
+            scene,
+            settings.target,
+            settings.attack,
+            seed=settings.seed,
+            force=settings.attack.force,
+        )
+    return MeshAttack(mesh.mesh, scene_settings, result)
 
 
 def build_attacked(
@@ -134,7 +281,10 @@ def build_attacked(
     size: int,
     device: torch.device,
 ) -> Scene:
-    """Build the scene of one mesh: an example per view and background, or per background if the views are shared.
+    """Build the scene of one mesh.
+
+    If the views are shared, the scene has an example per background. Otherwise
+    it has an example per view and background.
 
     Args:
         settings: All settings of the attack.
@@ -149,50 +299,133 @@ def build_attacked(
     Raises:
         InputError: If a setting of the scene does not fit, which the message names.
     """
-    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
-    options["attack"] = settings.attack
-    options["rasterizer"] = choose_rasterizer(settings.renderer)
+    # An error of the rasterizer already names its key, renderer.rasterizer.
+    rasterizer = choose_rasterizer(settings.renderer)
     with keyed("scene", vars(scene)):
-        return build_scene([item], size, scene.views, shared=settings.attack.shared, **options)
+        return build_scene(
+            [item],
+            size,
+            scene.views,
+            shared=settings.attack.shared,
+            scene=scene,
+            renderer=settings.renderer,
+            attack=settings.attack,
+            rasterizer=rasterizer,
+            device=device,
+        )
 
 
-def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
-    """The arguments that `augment.transfer` is given. InputError as of the loaders, and for a missing class."""
-    others, scene, label = settings.transfer, settings.scene, settings.label
-    named = [item if isinstance(item, dict) else {"classifier": item} for item in others.classifiers]
-    if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
-        raise InputError(f"transfer.classifiers: {unknown} is not known: give names, or {{classifier, weights}}")
-    classifiers = [load_network(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
-    items = [*read_objects(others.meshes, label, "transfer.meshes").values()]
-    for network, name in [*((other, label) for other in classifiers), *((attacked, item.label) for item in items)]:
-        network.label(name)  # before anything is attacked
-    objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
-    arguments = {"classifiers": classifiers, "azimuths": others.azimuths, "objects": objects}
-    return {name: argument for name, argument in arguments.items() if argument}
+def load_targets(
+    settings: AttackExperimentSettings, attacked: Classifier, device: torch.device
+) -> TransferTargets:
+    """Load the classifiers and the meshes to which adversaries are transferred.
+
+    Args:
+        settings: Settings of pnb-attack.
+        attacked: Classifier that is attacked. It classifies the other meshes.
+        device: Device of the other classifiers.
+
+    Returns:
+        Targets of the transfer, which may be none.
+
+    Raises:
+        InputError: If a classifier or a mesh cannot be loaded, or if a
+            classifier lacks a class that it is asked for.
+    """
+    label = settings.label
+    classifiers = []
+    for item in settings.transfer.classifiers:
+        classifier = _load_classifier(item).to(device)
+        # A missing class is an error before anything is attacked.
+        classifier.label(label)
+        classifiers.append(classifier)
+    objects = []
+    meshes = read_objects(settings.transfer.meshes, label, "transfer.meshes")
+    for mesh in meshes.values():
+        attacked.label(mesh.label)
+        loaded = load_object(mesh, settings.scene.vertices)
+        objects.append(on_ground(loaded, settings.scene.ground))
+    return TransferTargets(classifiers, settings.transfer.azimuths, objects)
+
+
+def _load_classifier(item: Any) -> Classifier:
+    """Load an item of `transfer.classifiers`: a name, or a mapping {classifier, weights}."""
+    named = item if isinstance(item, dict) else {"classifier": item}
+    for key in named:
+        if key not in ("classifier", "weights"):
+            advice = "give names, or {classifier, weights}"
+            raise InputError(f"transfer.classifiers: {key} is not known: {advice}")
+    return load_network(str(named.get("classifier")), named.get("weights"))
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
-    """The arguments of the command line for a scene that was found in place of another."""
-    names = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
-    changed = (name for name in names if getattr(scene, name) != getattr(before, name))
-    return " ".join(shlex.quote(f"scene.{name}={getattr(scene, name)}") for name in changed)
+    """Write the words of a command line that turn one scene into another.
+
+    Args:
+        scene: Settings of the scene that a search found.
+        before: Settings of the scene that was given.
+
+    Returns:
+        Words such as "scene.polar=80.0 scene.exposure=2.0".
+    """
+    words = []
+    for name in SEARCHED_SETTINGS:
+        value = getattr(scene, name)
+        if value != getattr(before, name):
+            words.append(shlex.quote(f"scene.{name}={value}"))
+    return " ".join(words)
 
 
 def format_reloaded(
-    adversary: Adversary, images: Tensor, classifier: Classifier, settings: AttackSettings, seed: int
+    adversary: Adversary,
+    images: Tensor,
+    classifier: Classifier,
+    settings: AttackSettings,
+    seed: int,
 ) -> str:
-    """A line per view: how images (V, 3, size, size) that were rendered anew are classified, also with noise."""
+    """Say how a classifier predicts the images of a reloaded adversary.
+
+    Args:
+        adversary: Adversary with the images that were saved.
+        images: Images that were rendered again, in [0, 1], shape
+            (V, 3, size, size).
+        classifier: Classifier of the images.
+        settings: Settings of the attack, which say whether there is sensor
+            noise.
+        seed: Seed of the noise.
+
+    Returns:
+        A line for each view: the predicted class, whether the prediction is the
+        same with sensor noise, and the largest difference from the saved image.
+    """
     model = preprocessed_model(settings, classifier)
+    # The views are one example, so logits and predictions have shape (1, V, ...).
     logits = logits_of(model, images[None], len(images))
     predicted = logits.argmax(2)
-    goal = Goal(torch.full_like(predicted, NO_CLASS), predicted)  # to be classified as without noise
-    same = fooled_in_views(model, images[None], predicted, torch.zeros(1).long(), goal, settings, seed)
-    largest = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
-    rows = zip(*predictions(logits[0], classifier.classes).values(), same[0].tolist(), largest.tolist(), strict=True)
-    noise = {True: ", and so with a sensor's noise", False: ", but not always with a sensor's noise"}
-    return "\n".join(
-        f"view {view}: {adversary.shown.label} is classified as {name} ({confidence:.1%})"
-        f"{noise[steady] if settings.sensor_noise else ''}; "
-        f"values differ from the saved image's by {difference:.3g}/255 at most"
-        for view, (name, confidence, steady, difference) in enumerate(rows)
+    # The goal of a view is met if it is classified as without noise.
+    goal = Goal(source=torch.full_like(predicted, NO_CLASS), target=predicted)
+    is_steady = fooled_in_views(
+        model,
+        images[None],
+        predicted,
+        examples=torch.zeros(1, dtype=torch.int64),
+        goal=goal,
+        settings=settings,
+        seed=seed,
     )
+    differences = (images - adversary.images.to(images)).abs().flatten(1).amax(1)
+    named = predictions(logits[0], classifier.classes)
+    lines = []
+    for view in range(len(images)):
+        predicted_name = named["predicted"][view]
+        confidence = named["confidence"][view]
+        line = f"view {view}: {adversary.shown.label} is classified as {predicted_name}"
+        line += f" ({confidence:.1%})"
+        if settings.sensor_noise:
+            steady = ", and so with a sensor's noise"
+            unsteady = ", but not always with a sensor's noise"
+            line += steady if is_steady[0, view] else unsteady
+        difference = 255 * float(differences[view])
+        line += f"; values differ from the saved image's by {difference:.3g}/255 at most"
+        lines.append(line)
+    return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""pnb-fit: camera and light of a photograph."""
+"""The fit command: find the camera and the light of a photograph of a mesh."""
 
 import math
 import shlex
@@ -24,47 +24,68 @@ from train.commands.results import require_replaceable
 from train.settings import read_object
 from train.system.user_errors import writable_folder
 
-DETAIL = 448  # pixels per side of the background that is written
-ATTACKED = 224  # pixels per side of the images that the printed attack renders, for its default classifier
-WHOLE = 0.98  # a pixel with a larger share is the object's
-DOUBTFUL, WRONG = 0.9, 0.3  # overlap of the outlines, error of the pixels
+# Pixels per side of the background that is written.
+BACKGROUND_SIZE = 448
+# Pixels per side of the images that the printed attack renders for its default
+# classifier.
+ATTACKED_SIZE = 224
+# A pixel belongs to the object if the mask covers more than this fraction of it.
+MIN_COVERAGE = 0.98
+# Below this overlap of the silhouettes, or above this error of the pixels, the
+# command warns that the mesh hardly fits.
+MIN_OVERLAP = 0.9
+MAX_ERROR = 0.3
+# Iterations of GrabCut, which OpenCV's tutorial uses, too.
+GRAB_CUT_STEPS = 5
 
 
 def fit(settings: FitSettings) -> None:
-    """Find camera and light of a photograph, write them, and print the command that attacks them.
+    """Fit the camera and the light of a photograph, write them, and print a command that attacks them.
+
+    Args:
+        settings: Settings of pnb-fit.
 
     Raises:
         InputError: If a file cannot be read, or no object is found.
     """
-    image, out = read_file(settings.photograph), writable_folder(settings.out, "out")
+    image = read_file(settings.photograph)
+    out = writable_folder(settings.out, "out")
     require_replaceable(out, "out", settings.overwrite)
     mask = read_mask(settings.mask, image) if settings.mask else grab_cut(image, settings.box)
-    mesh = load_object(ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)).mesh
+    mesh_settings = ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)
     found = fit_photograph(
         image,
         mask,
-        mesh,
+        load_object(mesh_settings).mesh,
         settings.size,
         fov=None if settings.fov is None else math.radians(settings.fov),
         albedo_scale=settings.albedo_scale,
         encoding=settings.encoding,
         bounces=settings.bounces,
     )
-    behind = found.window.cut(image, DETAIL, settings.encoding)
-    share = found.window.cut(mask[..., None], DETAIL, beyond=0)
     out.mkdir(parents=True, exist_ok=True)
-    write_values(out / "background.png", encode(behind, settings.encoding))
-    write_values(out / "mask.png", share.expand(3, -1, -1))
+    background = found.window.cut(image, BACKGROUND_SIZE, settings.encoding)
+    write_values(out / "background.png", encode(background, settings.encoding))
+    coverage = found.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
+    write_values(out / "mask.png", coverage.expand(3, -1, -1))
     save_light(out / "light.json", found.scene.light)
     attacked = attack_settings(settings, found.scene.camera, out)
-    photograph, shown = render_attacked(attacked)
-    inside = read_image(out / "mask.png", ATTACKED)[0] > WHOLE
-    error = relative_error(shown[:, inside], photograph[:, inside], settings.encoding)
-    write_values(out / "comparison.png", torch.cat([photograph, shown], dim=2))
-    print(f"outlines overlap by {found.scene.overlap:.1%}; the object's pixels differ by {error:.1%}")
-    if found.scene.overlap < DOUBTFUL or error > WRONG:
-        print("warning: the mesh hardly fits; look at comparison.png, and check photograph, mask, mesh and fov")
+    error = _compare(attacked, out, settings.encoding)
+    overlap = found.scene.overlap
+    print(f"outlines overlap by {overlap:.1%}; the object's pixels differ by {error:.1%}")
+    if overlap < MIN_OVERLAP or error > MAX_ERROR:
+        advice = "look at comparison.png, and check photograph, mask, mesh and fov"
+        print(f"warning: the mesh hardly fits; {advice}")
     print(shlex.join(attack_command(attacked)))
+
+
+def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
+    """Write comparison.png, and return the relative error of the pixels that the object covers."""
+    photograph, rendered = render_attacked(attacked)
+    write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
+    # The written mask is gray, so its channels are equal.
+    object_mask = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
+    return relative_error(rendered[:, object_mask], photograph[:, object_mask], encoding)
 
 
 def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackExperimentSettings:
@@ -100,7 +121,14 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
 
 
 def attack_command(settings: AttackExperimentSettings) -> list[str]:
-    """Write the command with the settings of `attack_settings`, as a list of its words."""
+    """Write the command that attacks with the settings of `attack_settings`.
+
+    Args:
+        settings: Settings of pnb-attack.
+
+    Returns:
+        Words of the command line.
+    """
     scene = settings.scene
     renderer = settings.renderer
     [mesh] = scene.meshes
@@ -131,53 +159,143 @@ def attack_command(settings: AttackExperimentSettings) -> list[str]:
 def render_attacked(settings: AttackExperimentSettings) -> tuple[torch.Tensor, torch.Tensor]:
     """Render the scene that pnb-attack would attack.
 
+    Args:
+        settings: Settings of pnb-attack.
+
     Returns:
-        The background and the image that is attacked, both encoded, shape (3, ATTACKED, ATTACKED).
+        The background and the image before the attack, both encoded, of shape
+        (3, ATTACKED_SIZE, ATTACKED_SIZE).
     """
-    item = read_object(settings.scene.meshes[0], settings.label, "scene.meshes[0]")
-    scene = build_attacked(settings, item, settings.scene, ATTACKED, torch.device("cpu"))
-    first = torch.arange(1)
-    return scene.backgrounds[0], scene.render(scene.conditions(first), first)[0, 0]
+    mesh = read_object(settings.scene.meshes[0], settings.label, "scene.meshes[0]")
+    device = torch.device("cpu")
+    scene = build_attacked(settings, mesh, settings.scene, ATTACKED_SIZE, device)
+    first_example = torch.arange(1)
+    images = scene.render(scene.conditions(first_example), first_example)
+    # The images have shape (1, 1, 3, ATTACKED_SIZE, ATTACKED_SIZE).
+    return scene.backgrounds[0], images[0, 0]
 
 
-def relative_error(shown: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
-    """Root mean square difference of encoded pixels in linear light, relative to the photograph's root mean square."""
+def relative_error(rendered: torch.Tensor, photograph: torch.Tensor, encoding: str) -> float:
+    """Compute the relative root mean square error of rendered pixels in linear light.
+
+    Args:
+        rendered: Encoded pixels of the render, shape (3, N).
+        photograph: Encoded pixels of the photograph, shape (3, N).
+        encoding: Encoding of both.
+
+    Returns:
+        Root mean square difference, divided by the root mean square of the
+        photograph.
+    """
     expected = decode(photograph.double(), encoding)
-    return float((decode(shown.double(), encoding) - expected).norm() / expected.norm())
+    difference = decode(rendered.double(), encoding) - expected
+    return float(difference.norm() / expected.norm())
 
 
 def read_file(path: str) -> np.ndarray:
-    """(H, W, 3) uint8, upright."""
+    """Read an image file.
+
+    Args:
+        path: The file. An orientation in its metadata is applied.
+
+    Returns:
+        Pixels in sRGB, shape (H, W, 3), uint8.
+
+    Raises:
+        InputError: If the file is missing or is no image.
+    """
     try:
         return np.asarray(read_rgb(Path(path), 10**6))
-    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+    except Exception as error:  # Pillow's decoders raise almost any error at a broken file.
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error
 
 
 def read_mask(path: str, image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8."""
+    """Read the mask of an object.
+
+    Args:
+        path: Image file, white where the object is.
+        image: Photograph that the mask belongs to, shape (H, W, 3).
+
+    Returns:
+        Mask in [0, 255], shape (H, W), uint8.
+
+    Raises:
+        InputError: If the file is no image, or is not as large as the
+            photograph.
+    """
     mask = read_file(path)[..., 0]
     if mask.shape != image.shape[:2]:
-        size, expected = (" × ".join(map(str, shape[1::-1])) for shape in (mask.shape, image.shape))
-        raise InputError(f"mask={path} has {size} pixels: give one of the photograph's size, {expected}")
+        given = _format_size(mask)
+        expected = _format_size(image)
+        advice = f"give one of the photograph's size, {expected}"
+        raise InputError(f"mask={path} has {given} pixels: {advice}")
     return mask
 
 
+def _format_size(image: np.ndarray) -> str:
+    """Write the width and the height of an image (H, W, ...), such as "640 × 480"."""
+    height, width = image.shape[:2]
+    return f"{width} × {height}"
+
+
 def grab_cut(image: np.ndarray, box: list[int]) -> np.ndarray:
-    """(H, W) uint8: what OpenCV takes for the foreground in a box (Rother et al. 2004)."""
+    """Segment the object in a box with OpenCV's GrabCut (Rother et al. 2004).
+
+    Args:
+        image: Photograph in sRGB, shape (H, W, 3), uint8.
+        box: Left, top, right and bottom of the box in pixels.
+
+    Returns:
+        255 for pixels of the object and 0 for the others, shape (H, W), uint8.
+
+    Raises:
+        InputError: If OpenCV is not installed, or if the box does not lie in
+            the photograph.
+    """
     try:
         cv2: Any = import_module("cv2")
     except ImportError as error:
-        raise InputError("box= needs OpenCV: pip install opencv-python-headless, or give mask=FILE") from error
+        advice = "pip install opencv-python-headless, or give mask=FILE"
+        raise InputError(f"box= needs OpenCV: {advice}") from error
     height, width = image.shape[:2]
-    if len(box) != 4 or not (0 <= box[0] < box[2] <= width and 0 <= box[1] < box[3] <= height):
-        raise InputError(f"box={box} is not [left, top, right, bottom] within {width} × {height} pixels")
-    labels, models = np.zeros((height, width), np.uint8), np.zeros((2, 1, 65))
-    rectangle = box[0], box[1], box[2] - box[0], box[3] - box[1]
-    cv2.grabCut(image[..., ::-1].copy(), labels, rectangle, *models, 5, cv2.GC_INIT_WITH_RECT)
-    return np.where(labels % 2 == 1, 255, 0).astype(np.uint8)  # certain and probable foreground
+    if not _is_box_within(box, height, width):
+        expected = f"[left, top, right, bottom] within {width} × {height} pixels"
+        raise InputError(f"box={box} is not {expected}")
+    left, top, right, bottom = box
+    rectangle = (left, top, right - left, bottom - top)
+    labels = np.zeros((height, width), np.uint8)
+    # OpenCV's functions take BGR, and store their color models in these arrays.
+    bgr = image[..., ::-1].copy()
+    background_model = np.zeros((1, 65))
+    foreground_model = np.zeros((1, 65))
+    cv2.grabCut(
+        bgr,
+        labels,
+        rectangle,
+        background_model,
+        foreground_model,
+        GRAB_CUT_STEPS,
+        cv2.GC_INIT_WITH_RECT,
+    )
+    is_object = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    return np.where(is_object, 255, 0).astype(np.uint8)
+
+
+def _is_box_within(box: list[int], height: int, width: int) -> bool:
+    """Return whether a box [left, top, right, bottom] has an area and lies in an image."""
+    if len(box) != 4:
+        return False
+    left, top, right, bottom = box
+    return 0 <= left < right <= width and 0 <= top < bottom <= height
 
 
 def write_values(path: Path, image: torch.Tensor) -> None:
-    """Write values (3, H, W) in [0, 1] as an image of 8 bits."""
-    write_image(path, Image.fromarray(to_bytes(image.permute(1, 2, 0)).numpy()))
+    """Write an image with 8 bits per channel.
+
+    Args:
+        path: File to write. Its suffix chooses the format.
+        image: Values in [0, 1], shape (3, H, W).
+    """
+    pixels = to_bytes(image.permute(1, 2, 0)).numpy()
+    write_image(path, Image.fromarray(pixels))

@@ -1,8 +1,10 @@
-"""pnb-publish: a run's network as half-precision safetensors."""
+"""The publish command: write the network of a run as half-precision safetensors."""
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+from augment.classifiers import Classifier
 from train.command_settings import PublishSettings
 from train.commands.results import require_replaceable
 from train.evaluation.scores import scoring
@@ -15,32 +17,70 @@ from train.system.user_errors import writable_folder
 
 
 def publish_network(settings: PublishSettings) -> None:
-    """Write a run's network, and print where.
+    """Write the network of a run, and print its folder.
+
+    Args:
+        settings: Settings of pnb-publish.
 
     Raises:
-        InputError: If there is no network, or nobody could use it.
+        InputError: If there is no network, or if it cannot be loaded from what
+            would be written.
     """
-    out, given = writable_folder(settings.out, "out"), Path(settings.run)
+    out = writable_folder(settings.out, "out")
+    given = Path(settings.run)
     path, state = load_selected(given)
-    own = [PUBLISHED] if path.resolve() == (out / PUBLISHED).resolve() else []  # it gets an operating point
+    # A published network may be written again, with another operating point.
+    is_in_place = path.resolve() == (out / PUBLISHED).resolve()
+    own = [PUBLISHED] if is_in_place else []
     require_replaceable(out, "out", settings.overwrite, own)
-    if path.suffix != Path(PUBLISHED).suffix:  # a run of pnb-train
-        run = summarize(given)
-        # Names of files in place of their paths, which are of this machine alone.
-        state["settings"] = mapped(dict(run.settings), lambda text: Path(text).name if text[:1] == "/" else text)
-        state["versions"] = dict(run.config.versions)
-        photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
-        state["scores"] = {**run.scores, **photographs}
-    if settings.calibrate or not str(state["architecture"].get("name")).startswith(PYTHON):  # its user runs that code
-        network = load_run(path, model=settings.model)  # or InputError, since nobody could use it
-    if settings.calibrate and settings.false_positive_rate:
-        network.half().float()  # as it is published
-        folder, rate = published(Path(settings.calibrate)), settings.false_positive_rate
-        predictor = Predictor(network, network.classes, network.size)
-        points = scoring.choose_operating_points(predictor, folder, settings.label, rate)
-        state["operating_point"] = [asdict(point) for point in points]
-        for point in points:
-            print(f"{point.label}: threshold {point.threshold:.3f} for {scoring.describe_point(asdict(point))}")
+    is_run = path.suffix != Path(PUBLISHED).suffix
+    if is_run:
+        state |= _describe_run(given)
+    # A network that a function of the user makes is not built here, unless it
+    # has to be: only its user is meant to run that function.
+    is_python = str(state["architecture"].get("name")).startswith(PYTHON)
+    if settings.calibrate or not is_python:
+        # Loading fails for a network that nobody could use.
+        network = load_run(path, model=settings.model)
+        if settings.calibrate and settings.false_positive_rate:
+            state["operating_point"] = _calibrate(
+                network, settings.calibrate, settings.label, settings.false_positive_rate
+            )
     out.mkdir(parents=True, exist_ok=True)
     publish(out / PUBLISHED, state)
     print(f"published in {settings.out}")
+
+
+def _describe_run(folder: Path) -> dict[str, Any]:
+    """Collect the settings, versions and scores of a run, which its network carries."""
+    run = summarize(folder)
+    photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
+    return {
+        "settings": mapped(dict(run.settings), _without_folder),
+        "versions": dict(run.config.versions),
+        "scores": {**run.scores, **photographs},
+    }
+
+
+def _without_folder(text: str) -> str:
+    """Return the name of a file in place of an absolute path, which exists on this machine alone."""
+    return Path(text).name if text.startswith("/") else text
+
+
+def _calibrate(
+    network: Classifier, folder: str, label: Any, false_positive_rate: float
+) -> list[dict[str, Any]]:
+    """Choose the threshold of each label on a folder of photographs, and print it."""
+    # The thresholds are those of the published weights, which have 16 bits.
+    network.half().float()
+    points = scoring.choose_operating_points(
+        Predictor(network, network.classes, network.size),
+        published(Path(folder)),
+        label,
+        false_positive_rate,
+    )
+    entries = [asdict(point) for point in points]
+    for entry in entries:
+        meaning = scoring.describe_point(entry)
+        print(f"{entry['label']}: threshold {entry['threshold']:.3f} for {meaning}")
+    return entries

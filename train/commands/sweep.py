@@ -1,7 +1,8 @@
-"""Sweeps: `pnb-train --multirun`.
+"""Sweeps: the runs of `pnb-train --multirun`.
 
-Each run has a folder that is named by its overrides. A finished run is not repeated. Hydra's
-launchers start the runs, in this process or in others. The results are read from the folders.
+Each run has a folder that is named by its overrides. A finished run is not
+repeated. Hydra's launchers start the runs, in this process or in others. The
+results are read from the folders.
 """
 
 import shutil
@@ -51,43 +52,60 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     """
     runs = _expand([word for word in overrides if not word.startswith("-")])
     first = _compose(runs[0])
+    overwrite = bool(first.overwrite)
     parent = writable_folder(str(first.sweep), "sweep")
     # The folder may hold the page that an earlier call wrote about the same sweep.
-    require_replaceable(parent, "sweep", bool(first.overwrite), own=[PAGE])
-    fixed = [text.partition("=")[0] for text in set.intersection(*map(set, runs))]
-    folders = [parent / run_name(words, fixed, str(parent)) for words in runs]
+    require_replaceable(parent, "sweep", overwrite, own=[PAGE])
+    shared_keys = _shared_keys(runs)
+    folders = [parent / run_name(words, shared_keys, str(parent)) for words in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has a run twice: give each value once")
     for folder, words in zip(folders, runs, strict=True):
-        if is_finished(folder) or checkpoint.exists(folder):
-            settings = read_settings(ExperimentSettings, _compose(words))
-            require_same_run(folder, settings, finished=True)
-        else:
-            require_new_run(folder, "sweep", bool(first.overwrite), resume=True)
-    # `run_name` does not show what all runs share.
-    sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, fixed))}]")
+        _require_usable_folder(folder, words, overwrite)
+    # Hydra names the folder of a run by its overrides, but for these keys.
+    excluded = ",".join(map(quoted, shared_keys))
+    sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{excluded}]")
     try:
         start()
     finally:
         print(format_sweep(folders), flush=True)
-    print(report_of([folder for folder in folders if folder.exists()], parent))
+    existing = [folder for folder in folders if folder.exists()]
+    print(report_of(existing, parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
 
 
+def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
+    """List the keys of the overrides that all runs of a sweep have."""
+    shared = set.intersection(*map(set, runs))
+    return [override.partition("=")[0] for override in shared]
+
+
+def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bool) -> None:
+    """Check that the folder of a run is empty, or holds the same run."""
+    if is_finished(folder) or checkpoint.exists(folder):
+        settings = read_settings(ExperimentSettings, _compose(overrides))
+        require_same_run(folder, settings, finished=True)
+    else:
+        require_new_run(folder, "sweep", overwrite, resume=True)
+
+
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
     """List the overrides of every run, as Hydra's basic sweeper makes them."""
-    values: dict[str, list[str]] = {}
+    choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
         if key == "run":
             raise InputError("run= names the folder of a single run: name a sweep's with sweep=")
         if key == "launcher" and override.value() == "slurm" and not shutil.which("sbatch"):
-            raise InputError("launcher=slurm needs Slurm's sbatch, which is missing: start the sweep on the cluster")
-        swept = override.is_sweep_override()
-        choices = override.sweep_string_iterator() if swept else [override.get_value_element_as_str()]
-        values[key] = [f"{key}={value}" for value in choices]
-    return list(product(*values.values()))
+            fault = "launcher=slurm needs Slurm's sbatch, which is missing"
+            raise InputError(f"{fault}: start the sweep on the cluster")
+        if override.is_sweep_override():
+            values = list(override.sweep_string_iterator())
+        else:
+            values = [override.get_value_element_as_str()]
+        choices_of_key[key] = [f"{key}={value}" for value in values]
+    return list(product(*choices_of_key.values()))
 
 
 def _compose(overrides: Sequence[str]) -> DictConfig:
@@ -99,55 +117,82 @@ def _compose(overrides: Sequence[str]) -> DictConfig:
 def run_in_sweep(config: DictConfig) -> None:
     """Make a run of a sweep in its folder, or resume it, unless it is finished.
 
-    The reason of a failure is written to failed.txt. SystemExit and KeyboardInterrupt stop the sweep.
+    The reason of a failure is written to failed.txt. SystemExit and
+    KeyboardInterrupt stop the sweep.
 
     Args:
         config: The configuration of the run. `config.run` is its folder.
     """
     folder = Path(config.run)
-    with locked(folder) as ours:
-        if is_finished(folder) or not ours:
-            print(f"{'finished before' if ours else 'in training elsewhere'}: {folder}", flush=True)
-            return
-        (folder / FAILURE).unlink(missing_ok=True)
-        job = HydraConfig.get()
-        # The runs of joblib's launcher print at the same time.
-        shares_console = "n_jobs" in job.launcher
-        print(f"training: {folder}", flush=True)
-        prefix = f"#{job.job.num} " if shares_console else ""
-        with logged_to(folder / LOG, prefix):
-            try:
-                settings = read_settings(ExperimentSettings, config)
-                settings.train.resume = checkpoint.exists(folder)
-                command = given_command([*map(_unescaped, job.overrides.task)])
-                initial = load_initial(settings)
-                run = Run(settings, load_data(settings, initial.size if initial else None), folder, initial, command)
-                run.load()
-                run.fit()
-                run.score()
-                run.export()
-            except Exception as error:
-                sentence = one_sentence(error)
-                reason = sentence or traceback.format_exception_only(error)[-1].strip()
-                console.error("failed: %s", reason, exc_info=None if sentence else error)
-                with suppress(OSError):  # On a full disk, only the console shows the reason.
-                    write_whole(folder / FAILURE, f"{reason}\n")
+    with locked(folder) as has_lock:
+        if not has_lock:
+            print(f"in training elsewhere: {folder}", flush=True)
+        elif is_finished(folder):
+            print(f"finished before: {folder}", flush=True)
+        else:
+            (folder / FAILURE).unlink(missing_ok=True)
+            print(f"training: {folder}", flush=True)
+            _run_and_record_failure(config, folder)
+
+
+def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
+    """Make a run, and write the reason to failed.txt if it fails."""
+    job = HydraConfig.get()
+    # The runs of joblib's launcher print at the same time.
+    shares_console = "n_jobs" in job.launcher
+    prefix = f"#{job.job.num} " if shares_console else ""
+    with logged_to(folder / LOG, prefix):
+        try:
+            _run(config, folder, list(job.overrides.task))
+        except Exception as error:
+            sentence = one_sentence(error)
+            reason = sentence or traceback.format_exception_only(error)[-1].strip()
+            # Only an error that is not the user's is shown with its traceback.
+            console.error("failed: %s", reason, exc_info=None if sentence else error)
+            # On a full disk, only the console shows the reason.
+            with suppress(OSError):
+                write_whole(folder / FAILURE, f"{reason}\n")
+
+
+def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
+    """Make all parts of a run, or resume it from its checkpoint."""
+    settings = read_settings(ExperimentSettings, config)
+    settings.train.resume = checkpoint.exists(folder)
+    command = given_command([_unescaped(override) for override in overrides])
+    initial = load_initial(settings)
+    data = load_data(settings, initial.size if initial else None)
+    run = Run(settings, data, folder, initial, command)
+    run.load()
+    run.fit()
+    run.score()
+    run.export()
 
 
 def _unescaped(override: str) -> str:
     r"""Quote a text that Hydra's sweeper escapes: path='a b' instead of path=a\ b."""
     value = OverridesParser.create().parse_override(override).value()
     if "\\" in override and isinstance(value, str):
-        return f"{override.partition('=')[0]}={quoted(value)}"
+        key = override.partition("=")[0]
+        return f"{key}={quoted(value)}"
     return override
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
-    """The table of the finished runs, means over several seeds, and the state of the other runs."""
-    finished = [summarize(folder) for folder in folders if is_finished(folder)]
+    """Write the results of a sweep.
+
+    Args:
+        folders: Folders of all runs of the sweep.
+
+    Returns:
+        The number of finished runs, their table with means over several seeds,
+        and the state of the other runs.
+    """
+    finished = [folder for folder in folders if is_finished(folder)]
     parts = [f"{len(finished)} of {len(folders)} runs are finished"]
     if finished:
-        parts.append(format_table(finished))
-    if unfinished := [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]:
-        parts += [*unfinished, "to go on, give the same command again"]
+        parts.append(format_table([summarize(folder) for folder in finished]))
+    unfinished = [folder for folder in folders if folder not in finished]
+    if unfinished:
+        parts += [f"{folder}: {state(folder)}" for folder in unfinished]
+        parts.append("to go on, give the same command again")
     return "\n" + "\n\n".join(parts)

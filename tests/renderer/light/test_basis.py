@@ -1,4 +1,4 @@
-"""Which coefficients of a sum of lights belong to which light."""
+"""The parts of a sum of lights: which coefficients, positions and files belong to which light."""
 
 import xml.etree.ElementTree as xml
 
@@ -10,29 +10,54 @@ from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.shapes import sphere
 from renderer.io.mitsuba import SCENE, write_mitsuba_scene
-from renderer.light.basis import Harmonics, SumBasis, parts_of, split_light
+from renderer.light.basis import (
+    Harmonics,
+    SumBasis,
+    parts_of,
+    split_light,
+)
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
 from renderer.settings import ImageSettings
 
-LAMPS = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0)))
+# The three lights have 9, 2 and 9 coefficients.
 SKY = Harmonics(2)
+LAMPS = Lamps(((2.0, 0.0, 1.0), (0.0, 2.0, 1.0)))
+PROJECTOR = Projector(3)
+# Each order of the lights, with the first coefficient of each light.
+ORDERS = [
+    ([SKY, LAMPS, PROJECTOR], [0, 9, 11]),
+    ([LAMPS, SKY, PROJECTOR], [0, 2, 11]),
+]
 
 
-@pytest.mark.parametrize("parts", [(SKY, LAMPS, Projector(3)), (LAMPS, SKY, Projector(3))])
-def test_each_light_of_a_sum_has_its_own_coefficients_in_the_order_of_the_parts(parts):
-    ends = torch.tensor([0, *(part.size for part in parts)]).cumsum(0).tolist()
-    values = torch.arange(float(ends[-1]))[:, None].expand(-1, 3)
-    expected = {part: values[first:end] for part, first, end in zip(parts, ends, ends[1:], strict=False)}
-    basis = SumBasis(parts)
-    found = {part: values[rows] for rows, part in parts_of(basis)}
-    assert list(found) == list(parts)
-    assert all(torch.equal(found[part], expected[part]) for part in parts)
-    split = split_light(basis, values)
-    assert torch.equal(split.environment, expected[SKY])
-    assert [part for part, _ in split.local_lights] == [part for part in parts if part != SKY]
-    assert all(torch.equal(coefficients, expected[part]) for part, coefficients in split.local_lights)
+def numbered_coefficients() -> torch.Tensor:
+    """Return coefficients (20, 3) whose values are their row numbers."""
+    return torch.arange(20.0)[:, None].expand(-1, 3)
+
+
+@pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
+def test_the_parts_of_a_sum_have_their_coefficients_in_the_order_of_the_parts(parts, first_rows):
+    found = parts_of(SumBasis(tuple(parts)))
+    assert [part.basis for part in found] == parts
+    assert [part.rows.start for part in found] == first_rows
+    assert [part.rows.stop for part in found] == [*first_rows[1:], 20]
+
+
+@pytest.mark.parametrize(("parts", "first_rows"), ORDERS)
+def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_rows):
+    coefficients = numbered_coefficients()
+    split = split_light(SumBasis(tuple(parts)), coefficients)
+    assert split.environment[0, 0] == first_rows[parts.index(SKY)]
+    assert len(split.environment) == SKY.size
+    (lamps, lamp_values), (projector, pattern) = split.local_lights
+    assert lamps == LAMPS
+    assert (
+        lamp_values[:, 0].tolist() == coefficients[first_rows[parts.index(LAMPS)] :][:2, 0].tolist()
+    )
+    assert projector == PROJECTOR
+    assert pattern[:, 0].tolist() == list(range(11, 20))
 
 
 def test_a_sum_has_one_environment_light_at_most():
@@ -41,16 +66,36 @@ def test_a_sum_has_one_environment_light_at_most():
 
 
 def test_only_lamps_are_moved():
-    there = torch.tensor([[0.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
-    moved = SumBasis((SKY, Projector(3), LAMPS)).moved(there)
-    assert moved.parts[:2] == (SKY, Projector(3))
-    assert moved.parts[2] == Lamps(((0.0, 0.0, 3.0), (1.0, 0.0, 3.0)))
+    positions = torch.tensor([[0.0, 0.0, 3.0], [1.0, 0.0, 3.0]])
+    moved = SumBasis((SKY, PROJECTOR, LAMPS)).moved(positions)
+    assert moved.parts == (
+        SKY,
+        PROJECTOR,
+        Lamps(((0.0, 0.0, 3.0), (1.0, 0.0, 3.0))),
+    )
 
 
-def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(tmp_path):
-    lights = [(Projector(2), torch.full((4, 3), 0.25)), (Projector(2), torch.full((4, 3), 0.5))]
-    ball, camera = Mesh.plain(*sphere(1)), OrthographicCamera(1.0, 0.0, 2.0)
-    write_mitsuba_scene(tmp_path, ball, 1.0, [camera], ImageSettings(4), "light.exr", lights)
+def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(
+    tmp_path,
+):
+    dark_pattern = torch.full((4, 3), 0.25)
+    bright_pattern = torch.full((4, 3), 0.5)
+    lights = [
+        (Projector(2), dark_pattern),
+        (Projector(2), bright_pattern),
+    ]
+    ball = Mesh.plain(*sphere(1))
+    camera = OrthographicCamera(1.0, 0.0, 2.0)
+    write_mitsuba_scene(
+        tmp_path,
+        ball,
+        1.0,
+        [camera],
+        ImageSettings(4),
+        "light.exr",
+        lights,
+    )
     emitters = xml.parse(tmp_path / SCENE).findall("emitter[@type='projector']")
     files = [emitter.find(".//string[@name='filename']").get("value") for emitter in emitters]
-    assert [read_map(tmp_path / file).unique().tolist() for file in files] == [[0.25], [0.5]]
+    shown_values = [read_map(tmp_path / file).unique().tolist() for file in files]
+    assert shown_values == [[0.25], [0.5]]

@@ -1,3 +1,5 @@
+"""Harmonics against SciPy, Lambertian factors against integrals, rotations against directions."""
+
 import math
 
 import numpy as np
@@ -8,62 +10,116 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, spherical_in
 
-from renderer.light.harmonics import DIFFUSE_DEGREE, basis, lambertian_factors, project, rotate
+from renderer.errors import InputError
+from renderer.light.harmonics import (
+    DIFFUSE_DEGREE,
+    basis,
+    lambertian_factors,
+    nonzero_coefficients,
+    project,
+    rotate,
+)
 from renderer.settings import MAX_DEGREE
 from renderer.surface.shading import irradiance
 
 EPS = np.finfo(np.float64).eps
-every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])
-EQUATOR = [[1.0, 0.0, 0.0], [-1.0, 0.0, -0.0], [-0.0, 1.0, 0.0], [0.0, -1.0, -0.0], [-0.6, 0.8, 0.0], [-1.0, -0.0, 0.0]]
-POLES = [[0.0, 0.0, 1.0], [-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, -0.0, -1.0]]
+every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
+# Directions with both signs of zero, for which polar angles are special.
+POLES = [
+    [0.0, 0.0, 1.0],
+    [-0.0, 0.0, 1.0],
+    [0.0, -0.0, -1.0],
+    [-0.0, -0.0, -1.0],
+]
+EQUATOR = [
+    [1.0, 0.0, 0.0],
+    [-1.0, 0.0, -0.0],
+    [-0.0, 1.0, 0.0],
+    [0.0, -1.0, -0.0],
+    [-0.6, 0.8, 0.0],
+    [-1.0, -0.0, 0.0],
+]
 
 
 @every_degree
 def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
-    directions = torch.cat([random_directions(200), torch.tensor(POLES + EQUATOR, dtype=torch.float64)])
-    np.testing.assert_allclose(basis(directions, degree).numpy(), scipy_basis(directions, degree), rtol=0, atol=1e-13)
+    special = torch.tensor(POLES + EQUATOR, dtype=torch.float64)
+    directions = torch.cat([random_directions(200), special])
+    expected = scipy_basis(directions, degree)
+    np.testing.assert_allclose(basis(directions, degree), expected, rtol=0, atol=1e-13)
 
 
-@every_degree
-def test_autograd_is_right_at_and_beside_the_poles_on_the_equator_and_off_the_sphere(degree):
-    """Where the derivatives in polar angles are not finite, too."""
-    special = torch.tensor([*POLES, [1e-4, 0, 1], *EQUATOR[:2], [3e-2, -5e-2, 4e-2]], dtype=torch.float64)
+@pytest.mark.parametrize("degree", [1, 6, MAX_DEGREE])
+def test_gradients_are_finite_differences_at_and_near_the_poles_and_off_the_sphere(
+    degree,
+):
+    """Derivatives in polar angles would not be finite at the poles."""
+    near_the_pole = [1e-4, 0, 1]
+    short = [3e-2, -5e-2, 4e-2]
+    special = torch.tensor(
+        [*POLES, near_the_pole, *EQUATOR[:2], short],
+        dtype=torch.float64,
+    )
     directions = torch.cat([special, 7 * random_directions(2)]).requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda d: basis(d, degree), directions, fast_mode=degree > 1)
+    assert torch.autograd.gradcheck(
+        lambda values: basis(values, degree),
+        directions,
+        fast_mode=degree > 1,
+    )
+
+
+def clamped_cosine_factor(l: int) -> float:
+    """Integrate the Legendre polynomial of band l times the clamped cosine over the sphere."""
+    integral, _ = quad(
+        lambda cosine: cosine * eval_legendre(l, cosine),
+        0,
+        1,
+        epsabs=1e-13,
+    )
+    return 2 * math.pi * integral
 
 
 def test_lambertian_factors_are_the_legendre_coefficients_of_the_clamped_cosine():
-    expected = [
-        2 * math.pi * quad(lambda u, l=l: u * eval_legendre(l, u), 0, 1, epsabs=1e-13)[0]
-        for l in range(DIFFUSE_DEGREE + 1)
-    ]
-    by_coefficient = np.repeat(expected, 2 * np.arange(DIFFUSE_DEGREE + 1) + 1)
+    by_band = [clamped_cosine_factor(l) for l in range(DIFFUSE_DEGREE + 1)]
+    expected = np.repeat(by_band, 2 * np.arange(DIFFUSE_DEGREE + 1) + 1)
     factors = lambertian_factors(MAX_DEGREE)
-    kept = factors[: len(by_coefficient)]
-    np.testing.assert_allclose(kept, by_coefficient, rtol=0, atol=1e-12)  # quad's own bound
-    assert not factors[len(by_coefficient) :].any()
+    np.testing.assert_allclose(factors[: len(expected)], expected, rtol=0, atol=1e-12)
+    assert not factors[len(expected) :].any()
 
 
-def test_the_bands_that_diffuse_surfaces_are_not_shown_change_irradiance_by_no_more_than_a_sixtieth():
-    """A beam lights a surface by Σ (2l + 1) / (4 π) A_l P_l(cos θ), whose true value is cos θ or 0."""
+def test_nonzero_coefficients_are_those_of_the_bands_0_and_1_and_of_even_bands():
+    found = nonzero_coefficients(MAX_DEGREE).tolist()
+    bands = [0, 1, *range(2, DIFFUSE_DEGREE + 1, 2)]
+    assert found == [index for l in bands for index in range(l * l, (l + 1) ** 2)]
+
+
+def test_the_bands_above_the_diffuse_degree_change_the_irradiance_of_a_beam_by_a_sixtieth():
+    """A beam at an angle θ gives a surface Σ (2l + 1) / 4π A_l P_l(cos θ).
+
+    The exact value is cos θ, or 0 behind the surface.
+    """
     cosines = np.linspace(-1, 1, 2001)
-    factors = lambertian_factors(DIFFUSE_DEGREE)[np.arange(DIFFUSE_DEGREE + 1) ** 2].numpy()
-    series = np.polynomial.legendre.legval(cosines, (2 * np.arange(DIFFUSE_DEGREE + 1) + 1) / (4 * math.pi) * factors)
+    l = np.arange(DIFFUSE_DEGREE + 1)
+    factors = lambertian_factors(DIFFUSE_DEGREE)[l**2].numpy()
+    series = np.polynomial.legendre.legval(cosines, (2 * l + 1) / (4 * math.pi) * factors)
     assert np.abs(series - cosines.clip(0)).max() < 1 / 60
 
 
-def test_constants_first_computed_in_inference_mode_serve_training_later():
-    """They are cached, and autograd refuses to save tensors made in that mode."""
+def test_constants_that_are_first_computed_in_inference_mode_serve_training_later():
+    """The constants are cached, and autograd cannot save tensors of that mode."""
     with torch.inference_mode():
         irradiance(draw(3, 2), draw(64, 3), torch.float64)
         basis(draw(2, 3), 7)
-    inputs = [draw(3, 2).requires_grad_(), draw(64, 3).requires_grad_()]
-    (irradiance(*inputs, torch.float64).sum() + basis(inputs[0].T, 7).sum()).backward()
-    assert all(tensor.grad.isfinite().all() for tensor in inputs)
+    normals = draw(3, 2).requires_grad_()
+    light = draw(64, 3).requires_grad_()
+    total = irradiance(normals, light, torch.float64).sum() + basis(normals.T, 7).sum()
+    total.backward()
+    assert normals.grad.isfinite().all()
+    assert light.grad.isfinite().all()
 
 
-def test_projection_of_an_exponential_has_its_closed_form():
-    """exp(z) = Σ (2l + 1) i_l(1) P_l(z), with the modified spherical Bessel functions."""
+def test_the_projection_of_an_exponential_has_its_closed_form():
+    """exp(z) = Σ (2l + 1) i_l(1) P_l(z), with the modified spherical Bessel functions i_l."""
     projected = project(lambda directions: directions[:, 2:].exp(), MAX_DEGREE)[:, 0].numpy()
     l = np.arange(MAX_DEGREE + 1)
     expected = np.zeros_like(projected)
@@ -72,17 +128,20 @@ def test_projection_of_an_exponential_has_its_closed_form():
 
 
 @every_degree
-def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(degree):
-    """Errors are of the light's norm, 21 × √3 at most on average."""
-    light, directions = draw((degree + 1) ** 2, 3), random_directions(20)
-    rotation = torch.from_numpy(Rotation.random(rng=np.random.default_rng(degree)).as_matrix())
-    rotated, turned = rotate(light, rotation), directions @ rotation.T
-    torch.testing.assert_close(
-        basis(turned, degree) @ rotated, basis(directions, degree) @ light, rtol=0, atol=1e-13 * (degree + 1)
-    )
+def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(
+    degree,
+):
+    """Errors are relative to the norm of the light, which is about 1.7 (degree + 1)."""
+    light = draw((degree + 1) ** 2, 3)
+    directions = random_directions(20)
+    matrix = Rotation.random(rng=np.random.default_rng(degree)).as_matrix()
+    rotation = torch.from_numpy(matrix)
+    found = basis(directions @ rotation.T, degree) @ rotate(light, rotation)
+    expected = basis(directions, degree) @ light
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13 * (degree + 1))
 
 
 @pytest.mark.parametrize("degree", [-1, MAX_DEGREE + 1])
 def test_degrees_out_of_range_are_refused(degree):
-    with pytest.raises(ValueError, match=f"degree={degree}"):
+    with pytest.raises(InputError, match=r"^degree"):
         basis(random_directions(1), degree)

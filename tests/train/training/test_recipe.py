@@ -1,10 +1,12 @@
+"""Schedules, losses and augmentations against their formulas."""
+
 import math
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
 
 from augment import distributed
 from augment.losses import ranking_loss
@@ -20,27 +22,47 @@ LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
 
 @pytest.fixture
-def images() -> torch.Tensor:
-    return torch.randint(0, 256, (6, 3, 16, 16), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+def images() -> Tensor:
+    """Draw six images of noise."""
+    draws = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (6, 3, 16, 16), dtype=torch.uint8, generator=draws)
 
 
 @pytest.fixture
 def model() -> nn.Module:
+    """Make a network of four classes, in training mode."""
     torch.manual_seed(0)
     return WideResNet(4, 10, 1, 0.3)
 
 
-@pytest.mark.parametrize("name, value", [("learning_rate", math.nan), ("distillation", 1.0), ("ema_decay", -0.1)])
+@pytest.fixture
+def teacher() -> nn.Module:
+    """Make another network of the same classes, which does not learn."""
+    torch.manual_seed(1)
+    return WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+
+
+def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
+    """Sum q log(q / p) over images, for the softmax q of targets and p of logits."""
+    q = targets.softmax(1)
+    p = logits.softmax(1)
+    return (q * (q / p).log()).sum()
+
+
+@pytest.mark.parametrize(
+    "name, value", [("learning_rate", math.nan), ("distillation", 1.0), ("ema_decay", -0.1)]
+)
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(InputError, match=rf"\b{name}\b"):
         TrainSettings(**{name: value})
 
 
-@pytest.mark.parametrize("epochs", [10, 50, 150])
-def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent_of_the_epochs(epochs):
+@pytest.mark.parametrize("epochs", [10, 150])
+def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent(epochs):
     rates = [SCHEDULE_FACTORS["step"](epoch / epochs) for epoch in range(epochs)]
-    parts = [3, 3, 2, 2]
-    assert rates == [0.2**fall for fall, part in enumerate(parts) for _ in range(part * epochs // 10)]
+    tenth = epochs // 10
+    expected = 3 * tenth * [1.0] + 3 * tenth * [0.2] + 2 * tenth * [0.04] + 2 * tenth * [0.008]
+    assert rates == pytest.approx(expected)
 
 
 PROGRESS = np.linspace(0, 1, 1001)
@@ -49,109 +71,142 @@ PROGRESS = np.linspace(0, 1, 1001)
 @pytest.mark.parametrize(
     "schedule, expected",
     [
-        ("cosine", np.cos(math.pi / 2 * PROGRESS) ** 2),  # half a cosine, by the half-angle formula
+        # By the half-angle formula, this is half a period of a cosine.
+        ("cosine", np.cos(math.pi / 2 * PROGRESS) ** 2),
         ("one_cycle", np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
     ],
 )
 def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
-    np.testing.assert_allclose([SCHEDULE_FACTORS[schedule](progress) for progress in PROGRESS], expected, atol=1e-12)
+    factors = [SCHEDULE_FACTORS[schedule](progress) for progress in PROGRESS]
+    np.testing.assert_allclose(factors, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])
-def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_divergence_from_a_teacher(
-    model, images, smoothing
-):
-    """The teacher's probabilities q are a constant: Σ q log(q / p)."""
-    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
-    settings = TrainSettings(init_from="base", label_smoothing=smoothing, distillation=4.0)
-    loss, hits = TrainingLoss(model.eval(), settings, (), teacher).compute(images, LABELS, rendered)
+def test_the_loss_is_the_smoothed_cross_entropy(model, images, smoothing):
+    settings = TrainSettings(label_smoothing=smoothing)
+    is_render = torch.arange(6) < 2
+    loss, hits = TrainingLoss(model.eval(), settings, (), None).compute(images, LABELS, is_render)
     logits = model(images / 255)
-    p, q = logits[2:].softmax(1), teacher(images[2:] / 255).softmax(1)
-    uniform, divergence = -F.log_softmax(logits, 1).mean(), (q * (q / p).log()).sum() / 6
-    cross_entropy = F.cross_entropy(logits, LABELS)
-    torch.testing.assert_close(loss, (1 - smoothing) * cross_entropy + smoothing * uniform + 4 * divergence)
+    log_probabilities = logits.log_softmax(1)
+    of_labels = -log_probabilities[torch.arange(6), LABELS].mean()
+    of_all = -log_probabilities.mean()
+    torch.testing.assert_close(loss, (1 - smoothing) * of_labels + smoothing * of_all)
     assert hits == (logits.argmax(1) == LABELS).sum()
 
-    kept = [0, 2, 3]  # on renders, the classes beside the label, among themselves
-    p, q = logits[:2, kept].softmax(1), teacher(images[:2] / 255)[:, kept].softmax(1)
-    ranked = TrainingLoss(model, settings, (1,), teacher).compute(images, LABELS, rendered)[0]
-    torch.testing.assert_close(ranked, loss + 4 * (q * (q / p).log()).sum() / 6)
+
+@pytest.mark.parametrize("studied", [(), (1,), (1, 3)])
+def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images, studied):
+    """All classes of data count, and on renders those that are not studied."""
+    is_render = torch.arange(6) < 2
+    settings = TrainSettings(init_from="base", distillation=4.0)
+    batch = (images, LABELS, is_render)
+    alone, _ = TrainingLoss(model.eval(), TrainSettings(), studied, None).compute(*batch)
+    loss, _ = TrainingLoss(model, settings, studied, teacher).compute(*batch)
+
+    logits = model(images / 255)
+    targets = teacher(images / 255)
+    divergence = kl_divergence(targets[2:], logits[2:])
+    if studied:
+        others = [label for label in range(4) if label not in studied]
+        divergence = divergence + kl_divergence(targets[:2, others], logits[:2, others])
+    torch.testing.assert_close(loss, alone + 4 * divergence / 6)
 
 
-def test_unlabeled_images_have_the_teachers_answers_as_labels_but_no_cross_entropy(model, images):
-    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+def test_unlabeled_images_have_the_teachers_answers_but_no_cross_entropy(model, teacher, images):
+    """The ranking loss and the hits use the answers as labels."""
+    is_render = torch.arange(6) < 2
     settings = TrainSettings(init_from="base", distillation=4.0, ranking=2.0)
-    answers = torch.where(rendered, LABELS, teacher(images / 255).argmax(1))
+    answers = torch.where(is_render, LABELS, teacher(images / 255).argmax(1))
     studied = (int(answers[-1]),)
-    labeled, hits = TrainingLoss(model.eval(), settings, studied, teacher).compute(images, answers, rendered)
-    cross_entropy = F.cross_entropy(model(images / 255)[2:], answers[2:], reduction="sum") / 6
-    loss = TrainingLoss(model, settings, studied, teacher, labeled=False)
-    unlabeled = loss.compute(images, LABELS * rendered, rendered)
+    with_labels = TrainingLoss(model.eval(), settings, studied, teacher)
+    labeled, hits = with_labels.compute(images, answers, is_render)
+    logits = model(images / 255)
+    cross_entropy = F.cross_entropy(logits[2:], answers[2:], reduction="sum") / 6
+    without_labels = TrainingLoss(model, settings, studied, teacher, labeled=False)
+    unlabeled = without_labels.compute(images, LABELS * is_render, is_render)
     torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
 
 
-def test_the_ranking_is_added_by_its_weight(model, images):
-    labels = LABELS - 1  # two of "anything but class 0"
-    alone, both = (
-        TrainingLoss(model.eval(), TrainSettings(ranking=weight), (1,), None).compute(images, labels, labels == 0)[0]
-        for weight in (0.0, 4.0)
-    )
-    torch.testing.assert_close(both, alone + 4 * ranking_loss(model(images / 255), labels, 1))
+@pytest.mark.parametrize("studied", [(1,), (1, 3)])
+def test_the_mean_ranking_of_the_studied_classes_is_added_by_its_weight(model, images, studied):
+    # Two images show anything but class 0.
+    labels = LABELS - 1
+    batch = (images, labels, labels == 0)
+    alone, _ = TrainingLoss(model.eval(), TrainSettings(), studied, None).compute(*batch)
+    both, _ = TrainingLoss(model, TrainSettings(ranking=4.0), studied, None).compute(*batch)
+    logits = model(images / 255)
+    rankings = [ranking_loss(logits, labels, label) for label in studied]
+    torch.testing.assert_close(both, alone + 4 * torch.stack(rankings).mean())
 
 
-def test_several_classes_are_ranked_alike_and_left_out_of_the_teachers_predictions_on_renders(model, images):
-    labels, rendered = torch.tensor([1, 3, 0, 2, 1, -2]), torch.arange(6) > 1
-    teacher = WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
-    logits, answers = model.eval()(images / 255), teacher(images / 255)
-    settings = TrainSettings(init_from="base", ranking=4.0, distillation=2.0)
-    loss, hits = TrainingLoss(model, settings, (1, 3), teacher).compute(images, labels, rendered)
-    entropy = F.cross_entropy(logits[:5], labels[:5], reduction="sum") - logits.softmax(1)[5, [0, 2]].sum().log()
-    ranked = (ranking_loss(logits, labels, 1) + ranking_loss(logits, labels, 3)) / 2
-    q, p = answers[:2].softmax(1), logits[:2].softmax(1)
-    others, kept = answers[2:, [0, 2]].softmax(1), logits[2:, [0, 2]].softmax(1)
-    kept_answers = ((q * (q / p).log()).sum() + (others * (others / kept).log()).sum()) / 6
-    torch.testing.assert_close(loss, entropy / 6 + 4 * ranked + 2 * kept_answers)
+def test_a_hard_negative_shows_none_of_several_studied_classes(model, images):
+    """The last image has the complementary label of class 1. Class 3 is studied, too."""
+    labels = torch.tensor([1, 3, 0, 2, 1, -2])
+    loss_of_both = TrainingLoss(model.eval(), TrainSettings(), (1, 3), None)
+    loss, hits = loss_of_both.compute(images, labels, torch.arange(6) > 1)
+    logits = model(images / 255)
+    probability_of_others = logits[5].softmax(0)[[0, 2]].sum()
+    entropy = F.cross_entropy(logits[:5], labels[:5], reduction="sum")
+    torch.testing.assert_close(loss, (entropy - probability_of_others.log()) / 6)
     predicted = logits.argmax(1)
-    assert hits == (predicted[:5] == labels[:5]).sum() + (int(predicted[5]) not in (1, 3))
+    last_is_right = int(predicted[5]) not in (1, 3)
+    assert hits == (predicted[:5] == labels[:5]).sum() + last_is_right
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_an_augmentation_is_a_function_of_seed_and_step_and_leaves_model_and_random_state_alone(name, images, model):
-    before = torch.get_rng_state()
-    first, again = (Baseline(name, model, 3).apply(images, LABELS, 7) for _ in range(2))
-    assert first.dtype == torch.uint8 and first.shape == images.shape
-    assert torch.equal(first, again)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert model.training and all(parameter.grad is None for parameter in model.parameters())
+def test_an_augmentation_is_a_function_of_seed_and_step(name, images, model):
+    first = Baseline(name, model, 3).apply(images, LABELS, 7)
+    assert first.dtype == torch.uint8
+    assert first.shape == images.shape
+    assert torch.equal(Baseline(name, model, 3).apply(images, LABELS, 7), first)
     if name == "none":
         assert torch.equal(first, images)
-    else:
-        assert not torch.equal(first, Baseline(name, model, 3).apply(images, LABELS, 8))
-        assert not torch.equal(first, Baseline(name, model, 4).apply(images, LABELS, 7))
+        return
+    assert not torch.equal(Baseline(name, model, 3).apply(images, LABELS, 8), first)
+    assert not torch.equal(Baseline(name, model, 4).apply(images, LABELS, 7), first)
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_an_augmentation_leaves_model_and_random_state_alone(name, images, model):
+    before = torch.get_rng_state()
+    Baseline(name, model, 3).apply(images, LABELS, 7)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert model.training
+    assert all(parameter.grad is None for parameter in model.parameters())
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
-def test_every_image_is_changed_by_draws_of_its_own_whatever_the_number_of_processes(name, images, model, monkeypatch):
+def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(
+    name, images, model, monkeypatch
+):
     same = images[:1].expand(6, -1, -1, -1)
     whole = Baseline(name, model, 0).apply(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1
     monkeypatch.setattr(distributed, "rank", lambda: 1)
-    assert torch.equal(Baseline(name, model, 0).apply(same[3:], LABELS[3:], 1), whole[3:])
+    second_half = Baseline(name, model, 0).apply(same[3:], LABELS[3:], 1)
+    assert torch.equal(second_half, whole[3:])
 
 
 def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
+    """The loss rises much more than by noise of the same size."""
     adversarial = Baseline("pgd", model, 0).apply(images, LABELS, 0)
-    assert (to_unit(adversarial) - to_unit(images)).abs().max() <= PGD.radius + 1e-6
+    changes = to_unit(adversarial) - to_unit(images)
+    assert changes.abs().max() <= PGD.radius + 1e-6
+    draws = torch.Generator().manual_seed(1)
+    noise = torch.randint(-8, 9, images.shape, generator=draws)
+    noisy = (images.int() + noise).clamp(0, 255)
     model.eval()
-    before, after = (F.cross_entropy(model(to_unit(batch)), LABELS) for batch in (images, adversarial))
-    noise = torch.randint(-8, 9, images.shape, generator=torch.Generator().manual_seed(1))
-    random = F.cross_entropy(model(to_unit((images.int() + noise).clamp(0, 255))), LABELS)
-    assert after > before + 10 * abs(random - before)
+    losses = [F.cross_entropy(model(batch / 255), LABELS) for batch in (images, adversarial, noisy)]
+    before, attacked, random = losses
+    assert attacked > before + 10 * abs(random - before)
 
 
 def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(images, model):
-    labels = torch.full((6,), -1 - 2)
-    one, both = (Baseline("pgd", model.eval(), 0, absent).apply(images, labels, 0) for absent in ([], [0]))
-    before, with_one, with_both = (model(to_unit(batch)).softmax(1).mean(0) for batch in (images, one, both))
-    assert with_one[2] > before[2]
-    assert with_both[[0, 2]].sum() > max(with_one[[0, 2]].sum(), before[[0, 2]].sum())
+    not_class_2 = torch.full((6,), -1 - 2)
+    model.eval()
+    attacked = Baseline("pgd", model, 0).apply(images, not_class_2, 0)
+    attacked_with_0 = Baseline("pgd", model, 0, [0]).apply(images, not_class_2, 0)
+    batches = (images, attacked, attacked_with_0)
+    before, with_2, with_both = (model(batch / 255).softmax(1).mean(0) for batch in batches)
+    assert with_2[2] > before[2]
+    assert with_both[[0, 2]].sum() > max(with_2[[0, 2]].sum(), before[[0, 2]].sum())
