@@ -218,12 +218,33 @@ def precompute_transfer(
     return TransferOperators(operators)
 
 
-def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
-    """A light (basis.size, 3) as an image: (3, size, size) float32, sRGB-encoded, of a diffuse white ball on white.
+def light_sphere(
+    light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS
+) -> Tensor:
+    """Render a white diffuse ball in a light, to show the light as an image.
 
-    The ball is that of radius 1 about the origin, which says how far lights in the scene are, and fills the image as
-    the camera sees it from afar. Even light of radiance 1 is white. A mirror would show the series ringing and the
-    coefficients that reach no surface. InputError: NaN.
+    The ball has radius 1 and lies at the origin, so that the image also shows
+    how far lamps are from it. It fills the image, as seen from afar. Under even
+    light of radiance 1, the ball is white. A ball that mirrors would instead
+    show coefficients that no diffuse surface reflects.
+
+    Args:
+        light: Coefficients of the light, shape (basis.size, 3).
+        size: Pixels per side.
+        camera: Camera whose direction shows the ball.
+        basis: Basis of the coefficients.
+
+    Returns:
+        Image before a white background, sRGB-encoded, shape (3, size, size),
+        float32.
+
+    Raises:
+        InputError: If the light has values that are not finite.
+
+    Example:
+        >>> image = renderer.light_sphere(renderer.load_light("grace"), size=16)
+        >>> image.shape
+        torch.Size([3, 16, 16])
     """
     sky, local = split_light(basis, light.detach().cpu().float())
     sky = None if sky is None else sky / math.pi

@@ -623,7 +623,6 @@ SCENES = [
     *calls_of(
         "meshes",
         scene,
-        [(MESH, 3)],
         [(MESH, None)],
         [(TRIMESH, "orange")],
         [(None, "orange")],
@@ -864,7 +863,6 @@ ATTACKS = [
         "target",
         lambda x: attack(target=x, force=True),
         3,
-        1,
         True,
         "pear",
         ["other", "other"],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
@@ -19,7 +19,13 @@ from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.attacks.settings import AttackSettings
-from augment.classifiers.adapter import Classifier, class_index, require_classifier
+from augment.classifiers.adapter import Classifier, class_index
+from augment.classifiers.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    gradient_flags_kept,
+)
 from augment.losses import logit_gap
 from augment.model_passes import BatchSize
 from augment.progress import Phases, progress
@@ -133,11 +139,14 @@ def require_result(result: object) -> None:
 
 
 def attack(
-    classifier: Classifier,
+    classifier: Classifier | Callable[[Tensor], Tensor],
     scene: Scene,
-    target: str | Sequence[str] | None = None,
+    target: str | int | Sequence[str | int] | None = None,
     settings: AttackSettings | None = None,
     *,
+    classes: Sequence[str] | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
     seed: int = 0,
     force: bool = False,
 ) -> AttackResult:
@@ -146,13 +155,24 @@ def attack(
     The classifier is left as it was found.
 
     Args:
-        classifier: The classifier to attack. The scene lies on its device.
-        scene: The scene, with E examples of V views.
+        classifier: The classifier to attack, or a plain network from images of
+            the scene's size to logits, such as a `torch.nn.Module`. The scene
+            lies on its device.
+        scene: The scene, with E examples of V views. Its labels are names or
+            indices of classes.
         target: A class, a class for each of the views that share what is
             attacked, or "least_likely" for the class of each image's lowest
             confidence. None for any error.
         settings: What is changed, and within which norm-balls. By default, the
             light is changed without a limit.
+        classes: Names of the classes of a plain network, in the order of its
+            outputs. None for "0", "1" and so on.
+        normalization: What a plain network needs in front of it: "imagenet", or
+            mean and standard deviation of the channels red, green and blue, in
+            units of [0, 1]. None if it takes images in [0, 1], or normalizes
+            them itself.
+        value_range: Values of black and white that a plain network takes before
+            normalization.
         seed: Seed of the restarts and of the noise.
         force: Whether to attack also what the classifier gets wrong before.
 
@@ -163,7 +183,9 @@ def attack(
     Raises:
         InputError: If an argument is of another type, an example is
             misclassified before the attack, the classifier lacks a class, or a
-            target is the right class of an example.
+            target is the right class of an example. If a plain network is in
+            training mode, would normalize images twice, or does not return a
+            row of logits for each image.
 
     Example:
         >>> def logits(images):
@@ -177,11 +199,26 @@ def attack(
         >>> result.success, result.images.shape
         (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
     """
-    require_classifier("classifier", classifier)
     require_kind("scene", scene, Scene, "a scene, such as augment.build_scene(...)")
     require_kind("settings", settings, AttackSettings | None, "augment.AttackSettings(...) or None")
     require_seed("seed", seed)
     require_flag("force", force)
+    size = scene.settings.size
+    device = scene.lights.device
+    with gradient_flags_kept(classifier):
+        adapted = as_classifier(classifier, size, classes, normalization, value_range, device)
+        return _attack(adapted, scene, target, settings, seed, force)
+
+
+def _attack(
+    classifier: Classifier,
+    scene: Scene,
+    target: str | int | Sequence[str | int] | None,
+    settings: AttackSettings | None,
+    seed: int,
+    force: bool,
+) -> AttackResult:
+    """Change a scene until a classifier errs, as `attack` does."""
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     scene = with_needed_degree(scene, settings.material)
@@ -324,7 +361,7 @@ def require_clean_correct(
 
 
 def target_labels(
-    target: str | Sequence[str] | None, source: Tensor, logits: Tensor, classifier: Classifier
+    target: str | int | Sequence[str | int] | None, source: Tensor, logits: Tensor, classifier: Classifier
 ) -> Tensor | None:
     """Return the class that an attack leads each view to.
 
@@ -347,7 +384,8 @@ def target_labels(
     if isinstance(target, str) and target == LEAST_LIKELY:
         return logits.argmin(2)
     view_count = logits.shape[1]
-    names = [target] * view_count if isinstance(target, str) else _target_names(target, classifier)
+    is_one_class = isinstance(target, str) or is_whole(target)
+    names = [str(target)] * view_count if is_one_class else _target_names(target)
     if len(names) != view_count:
         counts = f"{len(names)} classes for {view_count} views that share what is attacked"
         raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")
@@ -358,14 +396,9 @@ def target_labels(
     return labels
 
 
-def _target_names(target: Sequence[str], classifier: Classifier) -> list[str]:
+def _target_names(target: object) -> list[str]:
     """Return the names of a list of target classes, and refuse everything else."""
-    suggested = classifier.classes[0]
-    # Whoever gives the index of a class is told the name of this class.
-    index: Any = target
-    if is_whole(index) and 0 <= int(index) < len(classifier.classes):
-        suggested = classifier.classes[index]
-    advice = f"the name of a class, such as {suggested!r}, or a name for each view"
+    advice = "the name or the index of a class, or one for each view"
     return [str(name) for name in as_list("target", target, str | Integral, advice)]
 
 

@@ -189,8 +189,19 @@ class Classifier(nn.Module):
         """Stays in eval mode: running batch statistics, no dropout."""
         return super().train(False)
 
-    def label(self, class_name: str) -> int:
-        """The index of a class; InputError with the nearest names for one that the classifier lacks."""
+    def label(self, class_name: str | int) -> int:
+        """Return the index of a class.
+
+        Args:
+            class_name: Name of the class, or its index.
+
+        Returns:
+            The index.
+
+        Raises:
+            InputError: If there is no such class. The sentence suggests the
+                nearest names.
+        """
         return class_index(self.classes, class_name, f"classifier={self.name}")
 
 
@@ -259,12 +270,33 @@ class Normalized(nn.Module):
         return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
 
 
-def class_index(classes: Sequence[str], name: str, key: str) -> int:
-    """The label of a class name; InputError, naming the key that it came from, where the list lacks it."""
-    require_kind("label", name, str, "the name of a class")
-    if name not in classes:
-        raise InputError(f"{key}: {name!r} is not a class of the model: choose one, such as {nearest(name, classes)}")
-    return classes.index(name)
+def class_index(classes: Sequence[str], name: str | int, key: str) -> int:
+    """Return the index of a class.
+
+    Args:
+        classes: Names of all classes.
+        name: Name of the class, or its index, which may be written as text.
+        key: What names the class, for the error.
+
+    Returns:
+        The index.
+
+    Raises:
+        InputError: If there is no such class. The sentence suggests the nearest
+            names.
+    """
+    require_kind("label", name, str | int, "the name of a class, or its index")
+    if name in classes:
+        return classes.index(str(name))
+    text = str(name)
+    if text.isascii() and text.isdecimal():
+        if int(text) < len(classes):
+            return int(text)
+        indices = f"indices go from 0 to {len(classes) - 1}"
+        raise InputError(f"{key}: the label {text} is not a class: {indices}")
+    raise InputError(
+        f"{key}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
+    )
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from augment.attacks.settings import AttackSettings
     from augment.settings import VariationSettings
 
+LABEL = "the name of a class, or its index"
 # What a mesh is given as: a file, solid:NAME or a mesh.
 Shown = str | Path | Mesh
 # The settings of a scene that are options of `build_scene`.
@@ -41,7 +42,7 @@ RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 
 def build_scene(
-    meshes: Sequence[ObjectSettings | tuple[Shown, str]],
+    meshes: Sequence[ObjectSettings | tuple[Shown, str | int]],
     size: int,
     views: int = 1,
     *,
@@ -56,8 +57,8 @@ def build_scene(
     """Build a scene of every mesh, from a circle of cameras, in front of every background.
 
     Args:
-        meshes: Pairs of a mesh and the name of its class, or `ObjectSettings`.
-            A mesh is a file, solid:NAME or a `Mesh`.
+        meshes: Pairs of a mesh and the name or the index of its class, or
+            `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`.
         size: Pixels per side of the images.
         views: Number of cameras on the circle.
         shared: Whether the views of an object in front of a background are one
@@ -153,25 +154,25 @@ def _as_meshes(meshes: object) -> list[Any]:
         raise InputError(f"meshes is empty: give {expected}")
     for index, member in enumerate(members):
         if isinstance(member, ObjectSettings):
-            require_kind(f"meshes[{index}].label", member.label, str, "the name of a class")
+            require_kind(f"meshes[{index}].label", member.label, str, LABEL)
             continue
         if len(member) != 2:
             raise InputError(f"meshes[{index}] is {describe(member)}: give {expected}")
         mesh, label = member
         if not isinstance(mesh, str | Path):
             require_mesh(f"meshes[{index}]", mesh)
-        require_kind(f"meshes[{index}]: its label", label, str, "the name of a class")
+        require_kind(f"meshes[{index}]: its label", label, str | int, LABEL)
     return members
 
 
-def _load_member(member: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObject:
+def _load_member(member: ObjectSettings | tuple[Shown, str | int], vertices: int) -> SceneObject:
     """Load a member of `meshes`, subdivided until it has more than a number of vertices."""
     if isinstance(member, ObjectSettings):
         return load_object(member, vertices)
     mesh, label = member
     if isinstance(mesh, Mesh):
-        return SceneObject(label, normalize(subdivide(mesh, vertices)))
-    return load_object(ObjectSettings(str(mesh), label), vertices)
+        return SceneObject(str(label), normalize(subdivide(mesh, vertices)))
+    return load_object(ObjectSettings(str(mesh), str(label)), vertices)
 
 
 def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:

@@ -1,0 +1,174 @@
+"""Makes a classifier of a network that a user hands over as it is.
+
+A plain network knows neither the size of its images nor the names of its
+classes. The number of its classes is found by calling it once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+from augment.classifiers.adapter import Classifier, NetworkCall, Normalized, as_class_names
+from renderer.errors import InputError, describe
+from renderer.validation import as_list, require_kind
+
+# Normalization of most networks that were trained on ImageNet.
+IMAGENET = "imagenet"
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+COLORS = 3
+UNIT_RANGE = (0.0, 1.0)
+# Images of the call that checks a network. Two tell probabilities from logits.
+CHECKED_COUNT = 2
+# Names of the modules of torchvision, kornia and this library that normalize.
+NORMALIZING = frozenset({"Normalize", "Normalized"})
+
+Normalization = str | tuple[Sequence[float], Sequence[float]] | None
+
+
+def as_classifier(
+    network: Classifier | Callable[[Tensor], Tensor],
+    size: int,
+    classes: Sequence[str] | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    device: torch.device | str = "cpu",
+) -> Classifier:
+    """Make a classifier of a plain network, and check it on gray images.
+
+    Args:
+        network: A classifier, which is returned as it is, or a network from
+            images to logits: a `torch.nn.Module` in evaluation mode, or a
+            function.
+        size: Pixels per side of the images.
+        classes: Names of the classes in the order of the logits. None for the
+            indices "0", "1" and so on.
+        normalization: "imagenet", or mean and standard deviation of the
+            channels red, green and blue, in units of [0, 1]. None if the
+            network takes images as they are, or normalizes them itself.
+        value_range: Values of black and white that the network takes before
+            normalization, such as (0, 255) or (-1, 1).
+        device: Device of the images.
+
+    Returns:
+        The classifier. It contains the network itself.
+
+    Raises:
+        InputError: If the network is in training mode, would normalize twice,
+            fails on the images or returns something else than one row of
+            logits for each image, or if the number of names does not fit.
+
+    Example:
+        >>> network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
+        >>> classifier = as_classifier(network, size=8, normalization="imagenet")
+        >>> classifier.classes
+        ('0', '1', '2')
+    """
+    if isinstance(network, Classifier):
+        if classes is not None or normalization is not None or value_range != UNIT_RANGE:
+            raise InputError(
+                "classes, normalization and value_range are for a plain network: "
+                "leave them out, because a Classifier has its own"
+            )
+        return network
+    require_kind(
+        "classifier", network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
+    )
+    names = None if classes is None else as_class_names("classes", classes)
+    if isinstance(network, nn.Module) and network.training:
+        raise InputError("classifier is a network in training mode: call its eval() first")
+    function = _preprocessed(network, normalization, value_range).to(device)
+    count = _count_outputs(function, size, device)
+    if names is not None and len(names) != count:
+        raise InputError(
+            f"classes has {len(names)} names, and the network returns {count} outputs: "
+            "give one name per output"
+        )
+    name = type(network).__name__
+    return Classifier(function, size, names or [str(index) for index in range(count)], name)
+
+
+@contextmanager
+def gradient_flags_kept(network: object) -> Iterator[None]:
+    """Let the parameters of a network require gradients as before, when the block ends.
+
+    Args:
+        network: A module. Other values are ignored.
+    """
+    parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
+    flags = [parameter.requires_grad for parameter in parameters]
+    try:
+        yield
+    finally:
+        for parameter, flag in zip(parameters, flags, strict=True):
+            parameter.requires_grad_(flag)
+
+
+class _Function(nn.Module):
+    """A function from images to logits as a module."""
+
+    def __init__(self, function: Callable[[Tensor], Tensor]):
+        super().__init__()
+        self.function = function
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.function(images)
+
+
+def _preprocessed(
+    network: Callable[[Tensor], Tensor],
+    normalization: Normalization,
+    value_range: tuple[float, float],
+) -> nn.Module:
+    """Put the scaling and the normalization of images in front of a network."""
+    module = network if isinstance(network, nn.Module) else _Function(network)
+    mean, std = _mean_and_std(normalization)
+    black, white = as_list("value_range", value_range, float | int, "the values of black and white")
+    if not black < white:
+        raise InputError(f"value_range is ({black}, {white}): give black before white")
+    if normalization is None and (black, white) == UNIT_RANGE:
+        return module.eval()
+    if normalization is not None:
+        _require_no_normalization(module)
+    # (black + (white - black) x - mean) / std in the form of `Normalized`.
+    span = white - black
+    scaled_mean = [(value - black) / span for value in mean]
+    scaled_std = [value / span for value in std]
+    return Normalized(module, scaled_mean, scaled_std).eval()
+
+
+def _mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
+    """Return the mean and the standard deviation of each channel."""
+    if normalization is None:
+        return (0.0,) * COLORS, (1.0,) * COLORS
+    if normalization == IMAGENET:
+        return IMAGENET_MEAN, IMAGENET_STD
+    expected = "'imagenet', or (mean, std) of three numbers each"
+    rows = as_list("normalization", normalization, tuple | list, expected)
+    if [len(row) for row in rows] != [COLORS, COLORS] or not min(rows[1]) > 0:
+        raise InputError(f"normalization is {describe(normalization)}: give {expected}")
+    return rows[0], rows[1]
+
+
+def _require_no_normalization(network: nn.Module) -> None:
+    """Raise InputError if a network contains a module that normalizes images."""
+    for module in network.modules():
+        kind = type(module).__name__
+        if kind in NORMALIZING:
+            raise InputError(
+                f"normalization is given, and the network contains {kind}, so that images would "
+                "be normalized twice: leave normalization out"
+            )
+
+
+@torch.no_grad()
+def _count_outputs(network: nn.Module, size: int, device: torch.device | str) -> int:
+    """Call a network on gray images, and return the number of its outputs."""
+    shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device)
+    images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
+    call = NetworkCall("classifier")
+    return call(network, images.contiguous()).shape[1]

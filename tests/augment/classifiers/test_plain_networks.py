@@ -1,0 +1,121 @@
+"""A plain network is attacked as it is, after a check on gray images."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torchvision.transforms import Normalize
+
+import augment
+from augment.classifiers.plain_networks import as_classifier
+from renderer import InputError
+
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+SIZE = 8
+CLASSES = ("orange", "lemon", "apple")
+
+
+@pytest.fixture
+def network() -> nn.Module:
+    """Return a network of three classes, in evaluation mode."""
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 3), nn.Tanh()).eval()
+
+
+@pytest.fixture
+def images() -> Tensor:
+    return torch.rand(4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+
+
+def scene(label: str | int) -> augment.Scene:
+    return augment.build_scene([("solid:orange", label)], SIZE)
+
+
+def light(steps: int = 2) -> augment.AttackSettings:
+    return augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=steps)
+
+
+def test_classes_without_names_are_indices(network):
+    assert as_classifier(network, SIZE).classes == ("0", "1", "2")
+
+
+def test_imagenet_normalization_is_that_of_torchvision(network, images):
+    classifier = as_classifier(network, SIZE, normalization="imagenet")
+    torch.testing.assert_close(classifier(images), network(Normalize(MEAN, STD)(images)))
+
+
+def test_own_mean_and_std_are_in_units_of_the_value_range(network, images):
+    mean, std = (100.0, 110.0, 120.0), (50.0, 60.0, 70.0)
+    classifier = as_classifier(network, SIZE, normalization=(mean, std), value_range=(0, 255))
+    torch.testing.assert_close(classifier(images), network(Normalize(mean, std)(255 * images)))
+
+
+def test_values_are_scaled_to_the_range_of_the_network(network, images):
+    classifier = as_classifier(network, SIZE, value_range=(-1, 1))
+    torch.testing.assert_close(classifier(images), network(2 * images - 1))
+
+
+def test_a_plain_network_is_attacked_like_its_classifier(network):
+    classifier = augment.Classifier(network, SIZE, CLASSES)
+    expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
+    by_name = augment.attack(
+        network, scene("orange"), settings=light(), classes=CLASSES, force=True
+    )
+    by_index = augment.attack(network, scene(0), settings=light(), force=True)
+    for result in (by_name, by_index):
+        assert torch.equal(result.images, expected.images)
+        assert torch.equal(result.logits, expected.logits)
+
+
+def test_an_index_is_a_target_as_its_name_is(network):
+    classifier = augment.Classifier(network, SIZE, CLASSES)
+    options = {"settings": light(), "force": True}
+    by_name = augment.attack(classifier, scene("orange"), target="apple", **options)
+    by_index = augment.attack(classifier, scene("orange"), target=2, **options)
+    assert torch.equal(by_name.images, by_index.images)
+
+
+def test_the_parameters_of_the_network_require_gradients_as_before(network):
+    network[1].bias.requires_grad_(False)
+    augment.attack(network, scene(0), settings=light(), force=True)
+    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
+
+
+class WithDictionary(nn.Module):
+    """A network that returns a dictionary."""
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        return {"logits": images.mean((2, 3))}
+
+
+def test_a_network_in_training_mode_is_refused(network):
+    with pytest.raises(InputError, match="training mode"):
+        as_classifier(network.train(), SIZE)
+
+
+def test_an_output_that_is_no_tensor_is_refused():
+    with pytest.raises(InputError, match="dict"):
+        as_classifier(WithDictionary().eval(), SIZE)
+
+
+def test_normalizing_twice_is_refused(network):
+    normalized = nn.Sequential(Normalize(MEAN, STD), network).eval()
+    with pytest.raises(InputError, match="normalization"):
+        as_classifier(normalized, SIZE, normalization="imagenet")
+
+
+def test_a_wrong_number_of_names_is_refused(network):
+    with pytest.raises(InputError, match="classes"):
+        as_classifier(network, SIZE, classes=CLASSES[:2])
+
+
+@pytest.mark.parametrize("options", [{"classes": CLASSES}, {"value_range": (0, 255)}])
+def test_a_classifier_takes_no_options_of_plain_networks(network, options):
+    classifier = augment.Classifier(network, SIZE, CLASSES)
+    with pytest.raises(InputError, match="plain network"):
+        as_classifier(classifier, SIZE, **options)
+
+
+def test_an_index_beyond_the_classes_is_refused(network):
+    with pytest.raises(InputError, match="label 3"):
+        augment.attack(network, scene(3))
