@@ -20,7 +20,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
-    monkeypatch.setattr(common, "BURST", 0.0)
+    monkeypatch.setattr(common, "MIN_TIMED_SECONDS", 0.0)
     for name, value in {"DEGREES": (2, 6), "PER_SIDE": (1, 8), "MANY_VIEWS": (8, 9)}.items():
         monkeypatch.setattr(renderer, name, value)
     tiny = ["--sizes", "8", "--subdivisions", "1", "--rounds", "1", "--rasterizer", "numpy"]
