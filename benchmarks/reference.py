@@ -69,8 +69,8 @@ def harmonics(unit_normals: Tensor, degree: int) -> Iterator[tuple[int, Tensor]]
         Index of a harmonic, and its values at the normals, shape (N,).
     """
     x, y, z = unit_normals.unbind(1)
-    # With the polar angle θ and the azimuth φ of a normal, sin^m θ · cos mφ
-    # and sin^m θ · sin mφ.
+    # A normal with the polar angle θ and the azimuth φ has sin^m θ · cos mφ
+    # here, and sin^m θ · sin mφ in the next line.
     cosine = torch.ones_like(z)
     sine = torch.zeros_like(z)
     for m in range(degree + 1):
