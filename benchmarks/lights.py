@@ -229,10 +229,9 @@ def measure_costs(
 
 def make_light(basis: Basis) -> Tensor:
     """Return a light probe, or random coefficients in [0, 1] for lamps and projectors."""
-    # Numbers are drawn for the probe, too, because the recorded errors of lamps
-    # and projectors come from the numbers after them.
-    random_light = torch.rand(basis.size, 3)
-    return load_light("grace") if basis == HARMONICS else random_light
+    if basis == HARMONICS:
+        return load_light("grace")
+    return torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0))
 
 
 def take_light_step(operator: TransferOperator, light: Tensor) -> None:
