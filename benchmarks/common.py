@@ -1,6 +1,8 @@
-"""Timing in turns, errors, and CSV files.
+"""Timing of calls in turns, relative errors, and files of measurements.
 
-Run a benchmark as a module from the repository's root: python -m benchmarks.renderer
+Run a benchmark as a module in the root of the repository:
+
+    python -m benchmarks.renderer
 """
 
 import csv
@@ -18,41 +20,103 @@ import torch
 from torch.utils.benchmark import Timer
 
 Key = TypeVar("Key")
+
+# A row of measurements: the value of each column.
 Row = dict[str, Any]
-BURST = 2e-3  # seconds: a shorter call is repeated for as long, since one call alone is within the clock's noise
-LIMIT = 20.0  # seconds by the comparison's clock, after which a comparison stops at the end of its third round
+
+# A call that takes fewer seconds is repeated until the repeats take this long
+# together, because a single short call drowns in the noise of the clock.
+MIN_TIMED_SECONDS = 2e-3
+# A comparison stops after this many seconds, but not before MIN_ROUNDS.
+MAX_COMPARISON_SECONDS = 20.0
+MIN_ROUNDS = 3
 
 
-def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[Key, float]:
-    """Return the median milliseconds of each call over the rounds of `times_in_turn`."""
-    return {key: statistics.median(times) for key, times in times_in_turn(calls, rounds, device).items()}
+def medians(
+    calls: Mapping[Key, Callable[[], object]],
+    rounds: int,
+    device: str = "cpu",
+) -> dict[Key, float]:
+    """Measure calls with `times_in_turn`, and take the median over the rounds.
+
+    Args:
+        calls: Calls to measure, by name.
+        rounds: Largest number of rounds.
+        device: Device that the calls use, "cpu" or "cuda".
+
+    Returns:
+        Median time of each call in milliseconds.
+    """
+    times = times_in_turn(calls, rounds, device)
+    return {key: statistics.median(values) for key, values in times.items()}
 
 
 def times_in_turn(
-    calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu"
+    calls: Mapping[Key, Callable[[], object]],
+    rounds: int,
+    device: str = "cpu",
 ) -> dict[Key, list[float]]:
-    """Measure the milliseconds of each call in every round, on one thread.
+    """Measure every call once per round, on one thread.
 
-    All calls take turns in every round, so that noise hits all alike. On a CPU the clock is the process's own time,
-    which leaves out other processes on a shared machine; elsewhere it is wall time after synchronization.
+    The calls take turns, so that noise affects all of them alike. A comparison
+    that takes more than 20 seconds ends before its last round.
+
+    Args:
+        calls: Calls to measure, by name.
+        rounds: Largest number of rounds.
+        device: Device that the calls use, "cpu" or "cuda". On the CPU, the
+            clock is the time of this process, which leaves out other processes
+            on a shared machine. On a GPU, it is the wall time after
+            synchronization.
+
+    Returns:
+        Time of each call in each round in milliseconds.
     """
+    timers = {key: make_timer(call, device) for key, call in calls.items()}
+    repeats = {key: repeats_for(timer) for key, timer in timers.items()}
     now = time.process_time if device == "cpu" else time.perf_counter
-    clock = {"timer": now} if device == "cpu" else {}
-    timers = {key: Timer("call()", globals={"call": call}, **clock) for key, call in calls.items()}
-    repeats = {key: max(1, round(BURST / timer.timeit(1).median)) for key, timer in timers.items()}
-    times: dict[Key, list[float]] = {key: [] for key in calls}
     start = now()
-    for past in range(rounds):
-        if past >= 3 and now() - start > LIMIT:
+    times: dict[Key, list[float]] = {key: [] for key in calls}
+    for finished_rounds in range(rounds):
+        if finished_rounds >= MIN_ROUNDS and now() - start > MAX_COMPARISON_SECONDS:
             break
         for key, timer in timers.items():
-            times[key].append(1e3 * timer.timeit(repeats[key]).median)  # warms up first
+            # Each measurement begins with calls that warm up and do not count.
+            seconds = timer.timeit(repeats[key]).median
+            times[key].append(1e3 * seconds)
     return times
 
 
-def quartiles_of_ratio(times: Sequence[float], others: Sequence[float]) -> tuple[float, float, float]:
-    """Return the first quartile, the median and the third quartile of the rounds' ratios of two calls' times."""
-    ratios = [time / other for time, other in zip(times, others, strict=True)]
+def make_timer(call: Callable[[], object], device: str) -> Timer:
+    """Return a timer of a call with the clock that suits the device."""
+    names = {"call": call}
+    if device == "cpu":
+        return Timer("call()", globals=names, timer=time.process_time)
+    # The default clock of torch's timer synchronizes with the GPU.
+    return Timer("call()", globals=names)
+
+
+def repeats_for(timer: Timer) -> int:
+    """Return how many calls take MIN_TIMED_SECONDS together, at least 1."""
+    seconds = timer.timeit(1).median
+    return max(1, round(MIN_TIMED_SECONDS / seconds))
+
+
+def quartiles_of_ratio(
+    times: Sequence[float],
+    reference_times: Sequence[float],
+) -> tuple[float, float, float]:
+    """Compute the quartiles, over the rounds, of the ratio of two calls' times.
+
+    Args:
+        times: Time of a call in each round.
+        reference_times: Time of the reference call in the same rounds.
+
+    Returns:
+        First quartile, median and third quartile of `times / reference_times`.
+    """
+    pairs = zip(times, reference_times, strict=True)
+    ratios = [time / reference for time, reference in pairs]
     if len(ratios) == 1:
         return ratios[0], ratios[0], ratios[0]
     low, middle, high = statistics.quantiles(ratios, n=4, method="inclusive")
@@ -60,50 +124,128 @@ def quartiles_of_ratio(times: Sequence[float], others: Sequence[float]) -> tuple
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:
-    """Root mean square of the difference, over the root mean square of the reference."""
-    value, reference = (tensor.cpu().double() for tensor in (value, reference))
+    """Compute the relative root mean square error of a tensor.
+
+    Args:
+        value: Tensor to check, of any shape and on any device.
+        reference: Tensor with the correct values, of the same shape.
+
+    Returns:
+        Root mean square of the difference, divided by the root mean square of
+        the reference.
+    """
+    value = value.cpu().double()
+    reference = reference.cpu().double()
     return float((value - reference).norm() / reference.norm())
 
 
 def machine(device: str = "cpu") -> str:
-    """One line: GPU, processor, threads, versions, and the load at the start."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
-    processor = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
+    """Describe the machine in one line.
+
+    Args:
+        device: Device that the benchmark uses, "cpu" or "cuda".
+
+    Returns:
+        The GPU if there is one in use, the processor, the number of threads,
+        the versions of Python, torch and NumPy, and the load of the machine.
+    """
     gpu = "" if device == "cpu" else f"{torch.cuda.get_device_name(device)}; "
-    versions = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
+    threads = f"{torch.get_num_threads()} thread(s)"
+    python = f"Python {platform.python_version()}"
+    versions = f"{python}, torch {torch.__version__}, NumPy {np.__version__}"
     load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores at the start"
-    return f"{gpu}{processor}, {torch.get_num_threads()} thread(s); {versions}; {load}"
+    return f"{gpu}{processor_name()}, {threads}; {versions}; {load}"
+
+
+def processor_name() -> str:
+    """Return the model of the processor, or its architecture if Linux does not name it."""
+    facts = Path("/proc/cpuinfo")
+    if facts.is_file():
+        for line in facts.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(": ")[2]
+    return platform.machine()
 
 
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """All rows, floats to four significant digits, nothing for None; the columns are those of all rows, in order."""
-    rows = [{name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows]
+    """Write rows of measurements to a CSV file.
+
+    The columns are those of all rows, in order of first appearance. Floats get
+    four significant digits. The cell of None, or of a column that a row lacks,
+    is empty.
+
+    Args:
+        path: File to write. Missing folders are created.
+        rows: Rows of the file.
+    """
+    formatted = [{name: format_cell(value) for name, value in row.items()} for row in rows]
+    columns: dict[str, None] = {}
+    for row in formatted:
+        columns |= dict.fromkeys(row)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(formatted)
 
 
-def record(rows: Iterable[Row], path: Path | None, device: str = "cpu") -> list[Row]:
-    """Print the machine, and each row as it is measured; with a path, write what there is every time, to a .jsonl or
-    CSV file."""
+def format_cell(value: object) -> object:
+    """Write a float with four significant digits, and return other values as they are."""
+    return f"{value:.4g}" if isinstance(value, float) else value
+
+
+def record(
+    rows: Iterable[Row],
+    path: Path | None,
+    device: str = "cpu",
+) -> list[Row]:
+    """Print the machine and each row as soon as it is measured, and write a file.
+
+    The file is written anew after every row, so that a benchmark that is
+    stopped leaves the rows that it finished.
+
+    Args:
+        rows: Rows, which are measured while they are iterated over.
+        path: A .jsonl file with a line of JSON for each row, or a CSV file.
+            None writes no file.
+        device: Device that the benchmark uses, "cpu" or "cuda".
+
+    Returns:
+        All rows.
+    """
     print(machine(device))
-    measured = []
+    measured: list[Row] = []
     for row in rows:
         print(row, flush=True)
         measured.append(row)
-        if path and path.suffix == ".jsonl":
-            path.write_text("".join(json.dumps(row) + "\n" for row in measured), encoding="utf-8")
-        elif path:
+        if path is None:
+            continue
+        if path.suffix == ".jsonl":
+            lines = [json.dumps(row) + "\n" for row in measured]
+            path.write_text("".join(lines), encoding="utf-8")
+        else:
             write_csv(path, measured)
     return measured
 
 
 def with_median(rows: Iterable[Row]) -> Iterator[Row]:
-    """The rows of the rounds, and then one of the medians of their columns but "round"."""
-    rounds = []
+    """Yield the rows of all rounds, and then a row with the median of each column.
+
+    Args:
+        rows: A row for each round, with equal columns. The column "round" has
+            the number of the round.
+
+    Yields:
+        The rows, and a last one whose "round" is "median".
+    """
+    round_rows = []
     for row in rows:
-        rounds.append(row)
+        round_rows.append(row)
         yield row
-    yield {name: statistics.median(row[name] for row in rounds) if name != "round" else "median" for name in rounds[0]}
+    median_row: Row = {}
+    for name in round_rows[0]:
+        if name == "round":
+            median_row[name] = "median"
+        else:
+            median_row[name] = statistics.median(row[name] for row in round_rows)
+    yield median_row

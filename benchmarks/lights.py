@@ -2,21 +2,26 @@
 
     python -m benchmarks.lights --mitsuba
 
-writes lights.csv in some minutes on one CPU thread. It needs the extra `shadows`, and for --mitsuba the extra `lab` and
-LLVM (apt install libllvm19). Its tables:
+writes lights.csv in some minutes on one CPU thread. It needs the extra
+`shadows`, and for --mitsuba the extra `lab` and LLVM (apt install libllvm19).
+The column "table" has the name of the table of a row:
 
-cost          building an operator of one of 20 views, and a light step (image, clamp, gradient), by light paths and
-              size; errors are against many rays and samples
-local lights  the same for lamps and projectors; errors are against 64² samples
-mitsuba       difference to a path tracer; "noise" is its standard error, "direct" our error without light paths
+cost          Building an operator of one of 20 views, and a light step (image,
+              clamp, gradient), for each kind of light paths and each size.
+              Errors are against many rays and samples.
+local lights  The same for lamps and projectors. Errors are against 64² samples.
+mitsuba       The difference to a path tracer. "noise" is the standard error of
+              the path tracer. "direct" is our error without light paths.
 
-Errors are root mean squares of the difference over the reference's.
+Errors are root mean squares of the difference, divided by the root mean square
+of the reference. In the table "mitsuba", they are divided by the brightest
+value of the image instead.
 """
 
 import argparse
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -47,147 +52,458 @@ from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.rasterizers import choose
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
-VIEWS, SEEDS = 20, 8  # SEEDS: Mitsuba's images, whose spread tells its noise
-RAYS, PATCHES, RAYS_OF_PATCH = 2**14, 2**13, 2**8  # per pixel; that light bounces between; per patch: converged
-SAMPLES = {"cost": (8, 16), "local lights": (2, 64)}  # per side of a pixel: of what is measured, and of its reference
+# Number of views over which the time of building an operator is averaged.
+VIEWS = 20
+# Number of images by Mitsuba. Their spread is Mitsuba's noise.
+MITSUBA_SEEDS = 8
+# Rows of the environment map that Mitsuba gets.
+MITSUBA_ROWS = 512
 
-Case = tuple[Basis, Mapping[str, Any]]  # the light, and settings of the image
-DIRECT: Case = (HARMONICS, {})
-LIGHT_PATHS: dict[str, Case] = {
-    "direct": DIRECT,
-    "shadows": (HARMONICS, {"shadows": True}),
-    "shadows, smooth": (HARMONICS, {"shadows": True, "normals": "smooth"}),
-    "bounces:3": (HARMONICS, {"bounces": 3}),
+# Converged operators trace so many rays per pixel, bounce light between so many
+# patches of the surface, and trace so many rays per patch.
+CONVERGED_RAYS = 2**14
+CONVERGED_PATCHES = 2**13
+CONVERGED_RAYS_PER_PATCH = 2**8
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples per side of a pixel.
+
+    Attributes:
+        measured: Samples of the operators that are measured.
+        converged: Samples of the reference of their errors.
+    """
+
+    measured: int
+    converged: int
+
+
+COST_SAMPLES = Samples(measured=8, converged=16)
+LOCAL_LIGHT_SAMPLES = Samples(measured=2, converged=64)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of light.
+
+    Attributes:
+        basis: Basis of the light.
+        image: Settings of the image that differ from the defaults.
+    """
+
+    basis: Basis = HARMONICS
+    image: Mapping[str, Any] = field(default_factory=dict)
+
+
+LIGHT_PATHS = {
+    "direct": Case(),
+    "shadows": Case(image={"shadows": True}),
+    "shadows, smooth": Case(image={"shadows": True, "normals": "smooth"}),
+    "bounces:3": Case(image={"bounces": 3}),
 }
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
-LOCAL_LIGHTS: dict[str, Case] = {"harmonics": DIRECT, "3 lamps": (LAMPS, {}), "projector of 16²": (Projector(16), {})}
+LOCAL_LIGHTS = {
+    "harmonics": Case(),
+    "3 lamps": Case(LAMPS),
+    "projector of 16²": Case(Projector(16)),
+}
 
 
-def operators(
-    mesh: Mesh, size: int, samples: int, case: Case, cameras: Sequence[Camera] = (CAMERA,)
-) -> list[TransferOperator]:
-    basis, settings = case
-    return build_operators(mesh, cameras, ImageSettings(size, samples, **settings), choose("numpy"), basis=basis)
+@dataclass(frozen=True)
+class Load:
+    """What the tables of costs render, and how often.
 
-
-def converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperator:
-    """With many more rays per pixel, patches, and rays per patch."""
-    more_patches = patch.multiple(precomputed, PATCHES=PATCHES, PATCH_DIRECTIONS=RAYS_OF_PATCH)
-    with patch.object(rays, "DIRECTIONS", RAYS), more_patches:
-        return operators(mesh, size, samples, case)[0]
-
-
-def costs(
-    table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int], rounds: int, steps_only: bool
-) -> Iterator[Row]:
-    """Yield a row per case and size. Errors are at the first size.
-
-    The columns of_direct, of_direct_low and of_direct_high hold the median and the quartiles over the rounds of the
-    light step's time over that of the first case.
+    Attributes:
+        mesh: Mesh to render.
+        sizes: Pixels per side of the images.
+        rounds: Number of rounds.
+        steps_only: Whether only the time of light steps is measured.
     """
-    samples, finest = SAMPLES[table]
-    built = {(name, size): operators(cup, size, samples, cases[name])[0] for name, size in product(cases, sizes)}
-    lights = {name: torch.rand(basis.size, 3) for name, (basis, _) in cases.items()}
-    lights |= {name: load_light("grace") for name, (basis, _) in cases.items() if basis == HARMONICS}
-    steps = {key: partial(light_step, operator, lights[key[0]].requires_grad_()) for key, operator in built.items()}
-    times = times_in_turn(steps, rounds)
-    for (name, size), operator in built.items():
-        row: Row = {"table": table, "light": name, "size": size, "step_ms": median(times[name, size])}
-        ratios = quartiles_of_ratio(times[name, size], times[next(iter(cases)), size])
-        row["of_direct_low"], row["of_direct"], row["of_direct_high"] = ratios
-        if steps_only:
-            yield row
-            continue
-        row["megabytes"] = sum(part.nbytes for part in (operator.transfer, *(operator.sparse or ()))) / 1e6
-        build = partial(operators, cup, size, samples, cases[name], orbit_cameras(VIEWS, 2.2))
-        row["build_s"] = min(repeat(build, timer=time.process_time, number=1, repeat=2)) / VIEWS
-        if size == sizes[0]:
-            light, exact = lights[name].detach(), converged(cup, size, finest, cases[name])
-            pairs = zip(image_and_gradient(operator, light), image_and_gradient(exact, light), strict=True)
-            row["image_error"], row["gradient_error"] = (relative_error(*pair) for pair in pairs)
+
+    mesh: Mesh
+    sizes: Sequence[int]
+    rounds: int
+    steps_only: bool
+
+
+# ---------------------------------------------------------------------------- costs
+
+
+def build(
+    mesh: Mesh,
+    size: int,
+    samples: int,
+    case: Case,
+    cameras: Sequence[Camera] = (CAMERA,),
+) -> list[TransferOperator]:
+    """Build operators from the light of a case to the images of cameras.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the images.
+        samples: Samples per side of a pixel.
+        case: Kind of light.
+        cameras: Cameras of the views.
+
+    Returns:
+        Operator of each camera.
+    """
+    settings = ImageSettings(size, samples, **case.image)
+    return build_operators(mesh, cameras, settings, choose("numpy"), basis=case.basis)
+
+
+def build_converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperator:
+    """Build the operator of `CAMERA` with many more rays and patches than usual.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the image.
+        samples: Samples per side of a pixel.
+        case: Kind of light.
+
+    Returns:
+        The operator.
+    """
+    more_patches = patch.multiple(
+        precomputed,
+        PATCHES=CONVERGED_PATCHES,
+        PATCH_DIRECTIONS=CONVERGED_RAYS_PER_PATCH,
+    )
+    more_rays = patch.object(rays, "DIRECTIONS", CONVERGED_RAYS)
+    with more_rays, more_patches:
+        [operator] = build(mesh, size, samples, case)
+    return operator
+
+
+def measure_costs(
+    table: str,
+    cases: Mapping[str, Case],
+    samples: Samples,
+    load: Load,
+) -> Iterator[Row]:
+    """Measure light steps, operators and errors of several kinds of light.
+
+    Args:
+        table: Name of the table.
+        cases: Kinds of light by name. The first is the one that light steps are
+            compared with.
+        samples: Samples per side of a pixel.
+        load: Mesh, sizes and number of rounds.
+
+    Yields:
+        A row for each case and size. Errors are measured at the first size. The
+        columns of_direct, of_direct_low and of_direct_high have the median and
+        the quartiles, over the rounds, of the time of the light step divided by
+        that of the first case.
+    """
+    lights = {name: make_light(case.basis) for name, case in cases.items()}
+    operators = {}
+    steps = {}
+    for name, size in product(cases, load.sizes):
+        [operator] = build(load.mesh, size, samples.measured, cases[name])
+        operators[name, size] = operator
+        steps[name, size] = partial(take_light_step, operator, lights[name].requires_grad_())
+    times = times_in_turn(steps, load.rounds)
+    first_case = next(iter(cases))
+    for (name, size), operator in operators.items():
+        seconds = times[name, size]
+        low, middle, high = quartiles_of_ratio(seconds, times[first_case, size])
+        row: Row = {
+            "table": table,
+            "light": name,
+            "size": size,
+            "step_ms": median(seconds),
+            "of_direct_low": low,
+            "of_direct": middle,
+            "of_direct_high": high,
+        }
+        if not load.steps_only:
+            row["megabytes"] = megabytes_of(operator)
+            row["build_s"] = time_build(load.mesh, size, samples.measured, cases[name])
+            if size == load.sizes[0]:
+                exact = build_converged(load.mesh, size, samples.converged, cases[name])
+                row |= measure_errors(operator, exact, lights[name].detach())
         yield row
 
 
-def light_step(operator: TransferOperator, light: Tensor) -> None:
-    """An image, clamped, and the gradient of a loss by the light, which requires it."""
+def make_light(basis: Basis) -> Tensor:
+    """Return a light probe, or random coefficients in [0, 1] for lamps and projectors."""
+    if basis == HARMONICS:
+        return load_light("grace")
+    return torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0))
+
+
+def take_light_step(operator: TransferOperator, light: Tensor) -> None:
+    """Render a clamped image, and compute the gradient of a loss by the light.
+
+    Args:
+        operator: Operator from the light to the image.
+        light: Coefficients of the light, which require a gradient.
+    """
     torch.autograd.grad(operator.image(light).square().sum(), light)
 
 
-def image_and_gradient(operator: TransferOperator, light: Tensor) -> tuple[Tensor, Tensor]:
-    """The radiance (3, size²), and the gradient of Σ radiance × normal random numbers by the light."""
-    size = operator.settings.size
-    weights = torch.randn(3, size**2, generator=torch.Generator().manual_seed(0))
-    image = light.new_zeros(3, size**2).index_copy(1, operator.pixels, operator.radiance(light))
-    return image, operator.light_gradient(weights[:, operator.pixels])
+def megabytes_of(operator: TransferOperator) -> float:
+    """Return the memory of the matrices of an operator in megabytes."""
+    matrices = [operator.transfer, *(operator.sparse or ())]
+    return sum(matrix.nbytes for matrix in matrices) / 1e6
 
 
-def hard_meshes() -> dict[str, Mesh]:
-    shell, torus = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.torus(0.45, 0.45)
-    lower, dents = shell.triangles_center[:, 2] < 0, np.random.default_rng(0).uniform(0.6, 1, (len(shell.vertices), 1))
+def time_build(mesh: Mesh, size: int, samples: int, case: Case) -> float:
+    """Return the seconds per view of building the operators of VIEWS views, the better of two."""
+    cameras = orbit_cameras(VIEWS, 2.2)
+    call = partial(build, mesh, size, samples, case, cameras)
+    seconds = repeat(call, timer=time.process_time, number=1, repeat=2)
+    return min(seconds) / VIEWS
+
+
+def measure_errors(operator: TransferOperator, exact: TransferOperator, light: Tensor) -> Row:
+    """Compute the errors of an operator.
+
+    Args:
+        operator: Operator to check.
+        exact: Operator of the same view that has converged.
+        light: Coefficients of the light.
+
+    Returns:
+        Row with the relative errors of the image and of the gradient.
+    """
+    image_error = relative_error(radiance_image(operator, light), radiance_image(exact, light))
+    gradient_error = relative_error(
+        gradient_by_light(operator, light), gradient_by_light(exact, light)
+    )
+    return {"image_error": image_error, "gradient_error": gradient_error}
+
+
+def radiance_image(operator: TransferOperator, light: Tensor) -> Tensor:
+    """Return the radiance of all pixels before a black background, shape (3, size²).
+
+    Args:
+        operator: Operator from the light to the image.
+        light: Coefficients of the light.
+    """
+    black = light.new_zeros(3, operator.settings.size**2)
+    return black.index_copy(1, operator.pixels, operator.radiance(light))
+
+
+def gradient_by_light(operator: TransferOperator, light: Tensor) -> Tensor:
+    """Return the gradient of Σ radiance × normal random numbers by the light.
+
+    The gradient does not depend on the light, because the radiance is linear.
+
+    Args:
+        operator: Operator from the light to the image.
+        light: Coefficients of the light.
+    """
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(3, operator.settings.size**2, generator=generator)
+    return operator.light_gradient(weights[:, operator.pixels])
+
+
+# ---------------------------------------------------------------------------- Mitsuba
+
+
+def make_hard_meshes() -> dict[str, Mesh]:
+    """Make meshes of various shapes, some of which are hard for light paths."""
+    shell = trimesh.creation.icosphere(subdivisions=3)
     ball = Mesh.plain(shell.vertices, shell.faces)
-    plate = Mesh.plain([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
-    box, heights = trimesh.creation.box((0.8, 0.8, 0.02)), 0.05 * np.arange(5)
-    boards = [Mesh.plain(box.vertices + np.array([0, 0, height]), box.faces, (0.9, 0.6, 0.4)) for height in heights]
+    is_lower_face = shell.triangles_center[:, 2] < 0
+    half_ball = Mesh.plain(shell.vertices, shell.faces[is_lower_face], (0.8, 0.7, 0.5))
+    dents = np.random.default_rng(0).uniform(0.6, 1, (len(shell.vertices), 1))
+    torus = trimesh.creation.torus(0.45, 0.45)
     return {
         "convex: a ball": ball,
         "concave: solid:cup": normalize(solid("cup", 0)),
         "concave: solid:table": normalize(solid("table", 0)),
         "rugged: a dented ball": replace(ball, vertices=shell.vertices * dents),
-        "open: half a ball": Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)),
-        "self-touching: a ring without a hole": Mesh.plain(torus.vertices, torus.faces, (0.3, 0.8, 0.5)),
-        "touching parts: a ball on a plate": concatenate([ball, plate]),
-        "thin: boards 0.03 apart": concatenate(boards),
+        "open: half a ball": half_ball,
+        "self-touching: a ring without a hole": Mesh.plain(
+            torus.vertices,
+            torus.faces,
+            (0.3, 0.8, 0.5),
+        ),
+        "touching parts: a ball on a plate": concatenate([ball, make_plate()]),
+        "thin: boards 0.03 apart": concatenate(make_boards()),
     }
 
 
-def beside_mitsuba(size: int) -> Iterator[Row]:
-    for (name, mesh), paths in product(hard_meshes().items(), list(LIGHT_PATHS)[1:]):
-        yield {"table": "mitsuba", "mesh": name, "light": paths, "size": size} | differences(mesh, size, paths)
+def make_plate() -> Mesh:
+    """Make a square at z = -1, which touches the unit ball."""
+    corners = [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]]
+    return Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
 
 
-def differences(mesh: Mesh, size: int, paths: str) -> Row:
-    """Of the image, over its brightest value and inside the outline."""
-    light, (samples, finest) = load_light("st_peters"), SAMPLES["cost"]  # a probe that is positive all around
-    unblocked = {**LIGHT_PATHS[paths][1], "shadows": False, "bounces": 0}
-    ours = {
-        "image_error": operators(mesh, size, samples, LIGHT_PATHS[paths])[0],
-        "image_error_converged": converged(mesh, size, finest, LIGHT_PATHS[paths]),
-        "image_error_direct": operators(mesh, size, samples, (HARMONICS, unblocked))[0],
+def make_boards() -> list[Mesh]:
+    """Make five boards of thickness 0.02, one every 0.05 along z."""
+    box = trimesh.creation.box((0.8, 0.8, 0.02))
+    boards = []
+    for height in 0.05 * np.arange(5):
+        vertices = box.vertices + np.array([0, 0, height])
+        boards.append(Mesh.plain(vertices, box.faces, (0.9, 0.6, 0.4)))
+    return boards
+
+
+def compare_with_mitsuba(size: int) -> Iterator[Row]:
+    """Compare renders of hard meshes with Mitsuba's.
+
+    Args:
+        size: Pixels per side of the images.
+
+    Yields:
+        A row for each mesh and each kind of light paths except direct light.
+    """
+    indirect = [name for name in LIGHT_PATHS if name != "direct"]
+    for (mesh_name, mesh), name in product(make_hard_meshes().items(), indirect):
+        row = {"table": "mitsuba", "mesh": mesh_name, "light": name, "size": size}
+        yield row | differences_from_mitsuba(mesh, size, LIGHT_PATHS[name])
+
+
+def differences_from_mitsuba(mesh: Mesh, size: int, case: Case) -> Row:
+    """Measure how far images are from the image by Mitsuba.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the images.
+        case: Kind of light paths.
+
+    Returns:
+        Row with the root mean square of the difference inside the outline of
+        the mesh, divided by the brightest value, for our usual image, our
+        converged image, and our image of direct light alone. "image_noise" is
+        the standard error of Mitsuba's image in the same unit.
+    """
+    # This probe is positive all around.
+    light = load_light("st_peters")
+    direct = Case(image={**case.image, "shadows": False, "bounces": 0})
+    [usual_operator] = build(mesh, size, COST_SAMPLES.measured, case)
+    [direct_operator] = build(mesh, size, COST_SAMPLES.measured, direct)
+    operators = {
+        "image_error": usual_operator,
+        "image_error_converged": build_converged(mesh, size, COST_SAMPLES.converged, case),
+        "image_error_direct": direct_operator,
     }
-    image, coverage, noise = mitsuba_image(mesh, size, paths, light)
-    inside, row = coverage > 0.999, {}
-    for name, operator in ours.items():
-        canvas = torch.zeros(3, size**2).index_copy(1, operator.pixels, operator.radiance(light))
-        row[name] = float((canvas - image)[:, inside].square().mean().sqrt() / image.max())
-    return row | {"image_noise": float(noise[:, inside].square().mean().sqrt() / image.max())}
+    expected = render_with_mitsuba(mesh, size, case, light)
+    is_inside = expected.coverage > 0.999
+    brightest = expected.image.max()
+    row: Row = {}
+    for name, operator in operators.items():
+        difference = radiance_image(operator, light) - expected.image
+        row[name] = float(root_mean_square(difference[:, is_inside]) / brightest)
+    noise = root_mean_square(expected.standard_error[:, is_inside])
+    return row | {"image_noise": float(noise / brightest)}
 
 
-def mitsuba_image(mesh: Mesh, size: int, paths: str, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The mean of SEEDS images (3, size²), the coverage (size²,), and the standard error of the mean (3, size²)."""
-    settings = ImageSettings(size, **LIGHT_PATHS[paths][1])
+def root_mean_square(values: Tensor) -> Tensor:
+    """Return the square root of the mean of the squares of all values."""
+    return values.square().mean().sqrt()
+
+
+@dataclass(frozen=True)
+class MitsubaImage:
+    """Mean of images that Mitsuba rendered with different seeds.
+
+    Attributes:
+        image: Radiance, shape (3, size²).
+        coverage: Covered fraction of each pixel, shape (size²,).
+        standard_error: Standard error of the radiance, shape (3, size²).
+    """
+
+    image: Tensor
+    coverage: Tensor
+    standard_error: Tensor
+
+
+def render_with_mitsuba(mesh: Mesh, size: int, case: Case, light: Tensor) -> MitsubaImage:
+    """Render a mesh MITSUBA_SEEDS times with Mitsuba.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the image.
+        case: Kind of light paths.
+        light: SH coefficients of the environment light, shape (K, 3).
+
+    Returns:
+        Mean and standard error of the images.
+
+    Raises:
+        InputError: If Mitsuba is not installed.
+    """
+    settings = ImageSettings(size, **case.image)
     with TemporaryDirectory() as folder, mitsuba() as module:
         write_mitsuba_scene(Path(folder), mesh, 1.0, [CAMERA], settings, "light.exr")
-        write_map(Path(folder, "light.exr"), mitsuba_map(light, 512))
+        write_map(Path(folder, "light.exr"), mitsuba_map(light, MITSUBA_ROWS))
         scene = module.load_file(str(Path(folder, SCENE)))
-        renders = np.stack([np.array(module.render(scene, seed=seed)) for seed in range(SEEDS)])
-    draws = torch.from_numpy(renders).permute(0, 3, 1, 2).flatten(2)
-    return draws.mean(0)[:3], draws.mean(0)[3], draws.std(0)[:3] / SEEDS**0.5
+        images = [np.array(module.render(scene, seed=seed)) for seed in range(MITSUBA_SEEDS)]
+    # Shape (seeds, 4, size²) with red, green, blue and coverage.
+    renders = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).flatten(2)
+    mean = renders.mean(0)
+    return MitsubaImage(
+        image=mean[:3],
+        coverage=mean[3],
+        standard_error=renders.std(0)[:3] / MITSUBA_SEEDS**0.5,
+    )
+
+
+# ---------------------------------------------------------------------------- command
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--csv", type=Path, default=Path("lights.csv"), help="file of the results")
+    add("--mitsuba", action="store_true", help="compare with Mitsuba 3, too")
+    add(
+        "--sizes",
+        type=int,
+        nargs="+",
+        default=[32, 224],
+        help="pixels per side of the images",
+    )
+    add(
+        "--vertices",
+        type=int,
+        default=4000,
+        help="smallest number of vertices of the cup",
+    )
+    add(
+        "--rounds",
+        type=int,
+        default=21,
+        help="number of rounds, in which all settings take turns",
+    )
+    add(
+        "--steps-only",
+        action="store_true",
+        help="time light steps; measure no building and no errors",
+    )
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--csv", type=Path, default=Path("lights.csv"))
-    parser.add_argument("--mitsuba", action="store_true", help="compare with Mitsuba 3, too")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[32, 224], help="of images, in pixels")
-    parser.add_argument("--vertices", type=int, default=4000, help="of the cup, at least")
-    parser.add_argument("--rounds", type=int, default=21, help="in which all settings take turns")
-    parser.add_argument("--steps-only", action="store_true", help="time light steps; measure no building and no errors")
-    options = parser.parse_args(arguments)
+    """Measure all tables, and write them to a CSV file.
+
+    Args:
+        arguments: Words of the command line. None takes those of the process.
+    """
+    options = make_parser().parse_args(arguments)
     torch.set_num_threads(1)
-    cup, sizes = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes
-    tables = [costs("cost", LIGHT_PATHS, cup, sizes, options.rounds, options.steps_only)]
-    tables += [costs("local lights", LOCAL_LIGHTS, cup, sizes, options.rounds, options.steps_only)]
-    tables += [beside_mitsuba(sizes[0])] if options.mitsuba else []
+    load = Load(
+        mesh=subdivide(normalize(solid("cup", 0)), options.vertices),
+        sizes=options.sizes,
+        rounds=options.rounds,
+        steps_only=options.steps_only,
+    )
+    tables = [
+        measure_costs("cost", LIGHT_PATHS, COST_SAMPLES, load),
+        measure_costs("local lights", LOCAL_LIGHTS, LOCAL_LIGHT_SAMPLES, load),
+    ]
+    if options.mitsuba:
+        tables.append(compare_with_mitsuba(options.sizes[0]))
     record(chain.from_iterable(tables), options.csv)
 
 

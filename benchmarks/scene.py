@@ -1,12 +1,14 @@
-"""The scene of the renderer's benchmark: an ellipsoid under a probe and a sun.
+"""Scene of the renderer's benchmark: an ellipsoid under a light probe and a sun.
 
-`Converged` is the image and the gradients that all methods converge to; `mitsuba_step` renders the scene with Mitsuba.
+`Converged` has the image and the gradients that all methods converge to.
+`MitsubaStep` renders the scene with Mitsuba.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,46 +30,137 @@ from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import Rasterizer
 
-SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel
+# Samples per side of a pixel that the renderer takes by default.
+SAMPLES = ImageSettings().samples
 ALBEDO = (0.8, 0.5, 0.3)
 CAMERA = OrthographicCamera(1.0, 0.5, 2.4)
-SUN_FROM = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
-SUN = torch.tensor([0.45, 0.4, 0.3], dtype=torch.float64)  # irradiance head on: no pixel is clamped
-PROBE = probe("grace")[:9].double() / 4
-SHIFTS, FINEST, RESOLUTION = 4, 16, 2048  # of `Converged`: rasterizations per side; samples of a pixel, of an image
-MITSUBA_SAMPLES, MITSUBA_ROWS = 4, 32  # rays per side of a pixel; rows of the map, which dims band 2 by 0.5 %
+# Gray value of the background.
+BACKGROUND = 0.5
 
-Result = tuple[Tensor, Tensor, Tensor]  # covered pixels (P,), their radiance (3, P), and the gradient
+# Unit vector toward the sun.
+TO_SUN = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
+# Irradiance of the sun on a surface that faces it. No pixel is clamped.
+SUN = torch.tensor([0.45, 0.4, 0.3], dtype=torch.float64)
+# Coefficients of the probe, up to degree 2.
+PROBE = probe("grace")[:9].double() / 4
+
+# `Converged` rasterizes SHIFTS² times, each time shifted by a fraction of a
+# sample. It takes at most CONVERGED_SAMPLES samples per side of a pixel and
+# CONVERGED_RESOLUTION per side of an image.
+SHIFTS = 4
+CONVERGED_SAMPLES = 16
+CONVERGED_RESOLUTION = 2048
+# Degree up to which `Converged` has the gradient by the light.
+CONVERGED_DEGREE = 20
+
+# Rays per side of a pixel that Mitsuba traces.
+MITSUBA_SAMPLES = 4
+# Rows of the environment map that Mitsuba gets. With so few rows, the
+# harmonics of degree 2 are 0.5% too dark.
+MITSUBA_ROWS = 32
+
+
+@dataclass(frozen=True)
+class Result:
+    """Radiance of a render, and the gradient of a loss.
+
+    Attributes:
+        pixels: Row-major indices of the covered pixels, shape (P,).
+        radiance: Radiance of the covered pixels before clamping, shape (3, P).
+        gradient: Gradient of the loss by the light, shape (K, 3), or by the
+            vertices, shape (V, 3).
+    """
+
+    pixels: Tensor
+    radiance: Tensor
+    gradient: Tensor
+
+
 Step = Callable[[], Result]
 
 
 def ellipsoid(subdivisions: int) -> Mesh:
-    """A closed mesh of 10·4^subdivisions + 2 vertices."""
+    """Make a closed mesh with 10 · 4^subdivisions + 2 vertices and a single color."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return Mesh.plain(ball.vertices * (1.0, 0.9, 0.8), ball.faces, ALBEDO)
 
 
-def coefficients(degree: int, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Tensor:
-    """The light's ((degree + 1)², 3), cut off after `degree`."""
-    light = basis(SUN_FROM, degree)[:, None] * SUN
+def coefficients(
+    degree: int,
+    dtype: torch.dtype = torch.float64,
+    device: str = "cpu",
+) -> Tensor:
+    """Return the SH coefficients of the probe and the sun up to a degree.
+
+    Args:
+        degree: Degree after which the light is cut off.
+        dtype: Type of the coefficients.
+        device: Device of the coefficients.
+
+    Returns:
+        Coefficients, shape ((degree + 1)², 3).
+    """
+    light = basis(TO_SUN, degree)[:, None] * SUN
     count = min(len(PROBE), len(light))
     light[:count] += PROBE[:count]
     return light.to(device, dtype)
 
 
 def whole_irradiance(normals: Tensor) -> Tensor:
-    """(N, 3) at unit normals (N, 3) float64: the sun's series sums to the clamped cosine."""
-    return reference.irradiance(normals, PROBE) + (normals @ SUN_FROM).clamp(min=0)[:, None] * SUN
+    """Compute the irradiance of the probe and of the whole sun, without a cutoff.
+
+    The series of the sun converges to the clamped cosine, which stands for it.
+
+    Args:
+        normals: Unit normals, float64, shape (N, 3).
+
+    Returns:
+        Irradiance, shape (N, 3).
+    """
+    of_sun = (normals @ TO_SUN).clamp(min=0)[:, None] * SUN
+    return reference.irradiance(normals, PROBE) + of_sun
 
 
 def cut_irradiance(normals: Tensor) -> Tensor:
-    """Of the light cut off after the default degree, as every renderer in a comparison is given it."""
+    """Compute the irradiance of the light that is cut off after the default degree.
+
+    All renderers that are compared with each other get this light.
+
+    Args:
+        normals: Unit normals, float64, shape (N, 3).
+
+    Returns:
+        Irradiance, shape (N, 3).
+    """
     return reference.irradiance(normals, coefficients(DEGREE))
 
 
 @dataclass(frozen=True)
+class VisibleSurface:
+    """What a camera sees of a mesh.
+
+    Attributes:
+        fragments: The S visible samples.
+        albedo: Linear albedo of the samples, shape (S, 3).
+        coverage: Covered fraction of each of the P covered pixels,
+            shape (1, P).
+    """
+
+    fragments: Fragments
+    albedo: Tensor
+    coverage: Tensor
+
+
+@dataclass(frozen=True)
 class View:
-    """One mesh from one camera at one size."""
+    """A mesh that `CAMERA` sees.
+
+    Attributes:
+        mesh: Mesh of V vertices.
+        size: Pixels per side of the image.
+        rasterizer: Rasterizer of all renders.
+        device: Device of all tensors.
+    """
 
     mesh: Mesh
     size: int
@@ -75,120 +168,282 @@ class View:
     device: str = "cpu"
 
     def operator(
-        self, samples: int = SAMPLES, degree: int = DEGREE, dtype: torch.dtype = torch.float32
+        self,
+        samples: int = SAMPLES,
+        degree: int = DEGREE,
+        dtype: torch.dtype = torch.float32,
     ) -> TransferOperator:
-        settings, light = ImageSettings(self.size, samples), Harmonics(degree)
-        [operator] = build_operators(self.mesh, [CAMERA], settings, self.rasterizer, basis=light, dtype=dtype)
+        """Build the transfer operator of the view.
+
+        Args:
+            samples: Samples per side of a pixel.
+            degree: Degree of the light's harmonics.
+            dtype: Type of the operator.
+
+        Returns:
+            Operator from the light to the image.
+        """
+        [operator] = build_operators(
+            self.mesh,
+            [CAMERA],
+            ImageSettings(self.size, samples),
+            self.rasterizer,
+            basis=Harmonics(degree),
+            dtype=dtype,
+        )
         return operator.to(self.device)
 
-    def rasterized(self, samples: int, vertices: Tensor) -> tuple[Fragments, Tensor, Tensor]:
-        """(fragments, albedo (S, 3), coverage (1, P)) of the mesh with its vertices there."""
-        positions, settings = vertices.detach().double().cpu().numpy(), ImageSettings(self.size, samples)
-        views = build_fragments(positions, self.mesh.faces, [CAMERA], settings, self.rasterizer, self.mesh.closed)
-        fragments = views[0].to(self.device)
-        albedo = surface_albedo(self.mesh, fragments, "linear").to(vertices.dtype)
-        return fragments, albedo, fragments.coverage.to(vertices.dtype)[None]
+    def visible_surface(self, samples: int, vertices: Tensor) -> VisibleSurface:
+        """Rasterize the mesh with other vertices.
+
+        Args:
+            samples: Samples per side of a pixel.
+            vertices: Vertices of the mesh, shape (V, 3).
+
+        Returns:
+            Samples of the visible surface, in the type of the vertices.
+        """
+        [fragments] = build_fragments(
+            vertices.detach().double().cpu().numpy(),
+            self.mesh.faces,
+            [CAMERA],
+            ImageSettings(self.size, samples),
+            self.rasterizer,
+            self.mesh.closed,
+        )
+        fragments = fragments.to(self.device)
+        return VisibleSurface(
+            fragments=fragments,
+            albedo=surface_albedo(self.mesh, fragments, "linear").to(vertices.dtype),
+            coverage=fragments.coverage.to(vertices.dtype)[None],
+        )
 
     def vertices(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return the vertices of the mesh, shape (V, 3)."""
         return torch.from_numpy(self.mesh.vertices).to(self.device, dtype)
 
     @cached_property
     def image_gradient(self) -> Tensor:
-        """(3, size²) float64 normal numbers: the gradient of a loss by the image."""
+        """Gradient of a loss by the image: normal random numbers, float64, shape (3, size²)."""
         generator = torch.Generator().manual_seed(0)
-        return torch.randn(3, self.size**2, dtype=torch.float64, generator=generator).to(self.device)
+        numbers = torch.randn(3, self.size**2, dtype=torch.float64, generator=generator)
+        return numbers.to(self.device)
 
-    def upstream(self, pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-        """(3, P) the image's gradient at the covered pixels."""
+    def image_gradient_at(self, pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return the gradient of the loss by some pixels.
+
+        Args:
+            pixels: Row-major indices of pixels, shape (P,).
+            dtype: Type of the result.
+
+        Returns:
+            Gradient, shape (3, P).
+        """
         return self.image_gradient[:, pixels].to(dtype)
 
 
 class Converged:
-    """Image (3, size²) and gradients that all methods converge to: float64, plain autograd, up to 64² samples.
+    """Image and gradients that all methods converge to.
 
-    Visibility is the view's. The mesh is closed, so every visible face shows its front.
+    They are computed in float64 by plain autograd, with up to 64² samples per
+    pixel. Visibility is fixed. The mesh is closed, so that every visible face
+    shows its front.
+
+    Args:
+        view: View to render.
+        irradiance: Function from unit normals (N, 3) to irradiance (N, 3).
+
+    Attributes:
+        image: Radiance of all pixels, shape (3, size²).
+        by_light: Gradient of the loss of `View.image_gradient` by the light,
+            shape ((CONVERGED_DEGREE + 1)², 3).
+        by_vertices: Gradient of the same loss by the vertices, shape (V, 3).
     """
 
-    def __init__(self, view: View, irradiance: Callable[[Tensor], Tensor] = whole_irradiance):
-        pixel, face, weight = covered_fractions(view)
-        visible, index = face.unique(return_inverse=True)
+    def __init__(
+        self,
+        view: View,
+        irradiance: Callable[[Tensor], Tensor] = whole_irradiance,
+    ):
+        fractions = CoveredFractions.measure(view)
         vertices = view.vertices(torch.float64).cpu().requires_grad_()
-        light = torch.zeros(21**2, 3, dtype=torch.float64, requires_grad=True)
-        normals = reference.face_normals(vertices[torch.from_numpy(view.mesh.faces)[visible]])
+        visible_faces = torch.from_numpy(view.mesh.faces)[fractions.visible_faces]
+        normals = reference.face_normals(vertices[visible_faces])
+        image_gradient = view.image_gradient.cpu()
 
-        def image(at_faces: Tensor) -> Tensor:
-            shade = (at_faces * torch.tensor(ALBEDO, dtype=torch.float64))[index] * weight[:, None]
-            return torch.zeros(view.size**2, 3, dtype=torch.float64).index_add(0, pixel, shade).T
+        image = fractions.draw(irradiance(normals))
+        self.image = image.detach()
+        [self.by_vertices] = torch.autograd.grad((image * image_gradient).sum(), vertices)
 
-        lit, by_any_light = image(irradiance(normals)), image(reference.irradiance(normals.detach(), light))
-        upstream, self.image = view.image_gradient.cpu(), lit.detach()
-        [self.by_light] = torch.autograd.grad((by_any_light * upstream).sum(), light)
-        [self.by_vertices] = torch.autograd.grad((lit * upstream).sum(), vertices)
+        # The image is linear in the light, so any light has the same gradient.
+        light = torch.zeros((CONVERGED_DEGREE + 1) ** 2, 3, dtype=torch.float64)
+        light.requires_grad_()
+        image = fractions.draw(reference.irradiance(normals.detach(), light))
+        [self.by_light] = torch.autograd.grad((image * image_gradient).sum(), light)
 
     def errors(self, step: Step, gradient: Tensor) -> Row:
-        """gradient: by_light, which is compared on the coefficients that the step's light has, or by_vertices."""
-        pixels, radiance, result = step()
-        image = radiance.new_zeros(self.image.shape).index_copy(1, pixels, radiance)
-        errors = relative_error(image, self.image), relative_error(result, gradient[: len(result)])
-        return dict(zip(("image_error", "gradient_error"), errors, strict=True))
+        """Compute the relative errors of a step.
+
+        Args:
+            step: Step to take once.
+            gradient: `by_light` or `by_vertices`. Rows beyond those of the
+                step's gradient are left out.
+
+        Returns:
+            Row with "image_error" and "gradient_error".
+        """
+        result = step()
+        image = result.radiance.new_zeros(self.image.shape)
+        image = image.index_copy(1, result.pixels, result.radiance)
+        same_rows = gradient[: len(result.gradient)]
+        return {
+            "image_error": relative_error(image, self.image),
+            "gradient_error": relative_error(result.gradient, same_rows),
+        }
 
 
-def covered_fractions(view: View) -> tuple[Tensor, Tensor, Tensor]:
-    """(pixel, face, the fraction of the pixel that the face covers), in several shifted rasterizations."""
-    size, faces = view.size, view.mesh.faces
-    samples = min(FINEST, max(1, RESOLUTION // size))
-    keys = []
-    for shift in product(range(SHIFTS), repeat=2):
-        points = CAMERA.project(view.mesh.vertices)
-        points[:, :2] += 2 * ((np.array(shift) + 0.5) / SHIFTS - 0.5) / (size * samples)
-        ids = view.rasterizer.rasterize(points[None], faces, size * samples, closed=view.mesh.closed)[0]
-        row, column = np.nonzero(ids >= 0)
-        keys.append((row // samples * size + column // samples) * len(faces) + ids[row, column])
-    key, count = np.unique(np.concatenate(keys), return_counts=True)
-    weight = count / (SHIFTS * samples) ** 2
-    return torch.from_numpy(key // len(faces)), torch.from_numpy(key % len(faces)), torch.from_numpy(weight)
+@dataclass(frozen=True)
+class CoveredFractions:
+    """Fractions of pixels that faces cover, for R pairs of a pixel and a face.
 
-
-def mitsuba_step(view: View, name: str) -> Step:
-    """The gradient by light.data (49, 3), or by mesh.vertex_positions (V, 3) through the shading alone, by Mitsuba 3 on
-    one thread, as its users would set it up.
-
-    Each camera ray draws one direction by the cosine and looks up an environment map there: Mitsuba's cheapest way, and
-    the least noisy for a smooth light. Automatic differentiation holds outlines fixed; moved vertices rebuild the ray
-    tracer's tree. InputError: not installed, or no LLVM library.
+    Attributes:
+        size: Pixels per side of the image.
+        pixels: Row-major index of the pixel of each pair, shape (R,).
+        visible_faces: Indices of the G visible faces in the mesh, shape (G,).
+        pair_to_visible_face: Index of each pair's face among the visible faces,
+            shape (R,).
+        fractions: Fraction of the pixel that the face covers, float64,
+            shape (R,).
     """
-    with mitsuba(DIFFERENTIABLE) as module:
-        import drjit
-    drjit.set_thread_count(1)
-    light, size = coefficients(DEGREE).requires_grad_(), view.size
-    texels = mitsuba_map(light, MITSUBA_ROWS).float()
-    repeated = torch.cat([texels[:, -1:], texels, texels[:, :1]], dim=1)  # as Mitsuba holds the map
-    surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
-    scene = {
-        "type": "scene",
-        "integrator": integrator(bounces=0),
-        "light": environment({"bitmap": texels.detach().numpy()}),
-        "sensor": sensor_of(CAMERA, size, "rgb"),
-        "mesh": shape(module, surface, view.mesh.vertices, view.mesh.faces),
-    }
-    scene = load(module, scene)
-    parameters = module.traverse(scene)
-    upstream = module.TensorXf(np.pi * view.image_gradient.T.cpu().float().unflatten(0, (size, size)).numpy())
-    by_light, vertices = name == "light.data", view.mesh.vertices.astype(np.float32).ravel()
-    start = module.TensorXf(repeated.detach().numpy()) if by_light else module.Float(vertices)
 
-    def step() -> Result:
-        value = drjit.detach(start)
+    size: int
+    pixels: Tensor
+    visible_faces: Tensor
+    pair_to_visible_face: Tensor
+    fractions: Tensor
+
+    @classmethod
+    def measure(cls, view: View) -> "CoveredFractions":
+        """Count the samples of faces in pixels, over SHIFTS² shifted rasterizations."""
+        size = view.size
+        face_count = len(view.mesh.faces)
+        samples = min(CONVERGED_SAMPLES, max(1, CONVERGED_RESOLUTION // size))
+        pairs_of_samples = []
+        for shift in product(range(SHIFTS), repeat=2):
+            # Normalized coordinates span 2 over the samples of a side.
+            fraction_of_sample = (np.array(shift) + 0.5) / SHIFTS - 0.5
+            points = CAMERA.project(view.mesh.vertices)
+            points[:, :2] += 2 * fraction_of_sample / (size * samples)
+            [face_of_sample] = view.rasterizer.rasterize(
+                points[None],
+                view.mesh.faces,
+                size * samples,
+                closed=view.mesh.closed,
+            )
+            row, column = np.nonzero(face_of_sample >= 0)
+            pixel_of_sample = row // samples * size + column // samples
+            pairs_of_samples.append(pixel_of_sample * face_count + face_of_sample[row, column])
+        pairs, counts = np.unique(np.concatenate(pairs_of_samples), return_counts=True)
+        faces = torch.from_numpy(pairs % face_count)
+        visible_faces, pair_to_visible_face = faces.unique(return_inverse=True)
+        return cls(
+            size=size,
+            pixels=torch.from_numpy(pairs // face_count),
+            visible_faces=visible_faces,
+            pair_to_visible_face=pair_to_visible_face,
+            fractions=torch.from_numpy(counts / (SHIFTS * samples) ** 2),
+        )
+
+    def draw(self, irradiance: Tensor) -> Tensor:
+        """Return the radiance of all pixels, shape (3, size²).
+
+        Args:
+            irradiance: Irradiance at the visible faces, shape (G, 3).
+        """
+        radiance_of_faces = irradiance * torch.tensor(ALBEDO, dtype=torch.float64)
+        radiance_of_pairs = radiance_of_faces[self.pair_to_visible_face] * self.fractions[:, None]
+        black = torch.zeros(self.size**2, 3, dtype=torch.float64)
+        return black.index_add(0, self.pixels, radiance_of_pairs).T
+
+
+class MitsubaStep:
+    """Render and gradient by Mitsuba 3 on one thread, as its users would set them up.
+
+    Each camera ray draws one direction in proportion to the cosine and looks up
+    an environment map there. This is Mitsuba's cheapest way, and the least
+    noisy one for a smooth light. Its automatic differentiation holds the
+    outlines fixed. Moved vertices rebuild the tree of the ray tracer.
+
+    Args:
+        view: View to render.
+        parameter: Parameter of the gradient: "light.data" for the coefficients
+            of the light, shape (49, 3), or "mesh.vertex_positions" for the
+            vertices, shape (V, 3), through the shading alone.
+
+    Raises:
+        InputError: If Mitsuba or the LLVM library is not installed.
+    """
+
+    def __init__(self, view: View, parameter: str):
+        with mitsuba(DIFFERENTIABLE) as module:
+            import drjit
+        drjit.set_thread_count(1)
+        self.drjit = drjit
+        self.module = module
+        self.view = view
+        self.parameter = parameter
+        self.light = coefficients(DEGREE).requires_grad_()
+        texels = mitsuba_map(self.light, MITSUBA_ROWS).float()
+        # Mitsuba's own map repeats the first and the last column at its ends.
+        self.texels = torch.cat([texels[:, -1:], texels, texels[:, :1]], dim=1)
+        self.scene = load(module, self._entries(texels.detach()))
+        self.parameters = module.traverse(self.scene)
+        # Our surfaces reflect π times as much as those of Mitsuba.
+        image_gradient = np.pi * view.image_gradient.T.cpu().float()
+        image_gradient = image_gradient.unflatten(0, (view.size, view.size))
+        self.image_gradient = module.TensorXf(image_gradient.numpy())
+        if parameter == "light.data":
+            self.start = module.TensorXf(self.texels.detach().numpy())
+        else:
+            self.start = module.Float(view.mesh.vertices.astype(np.float32).ravel())
+
+    def _entries(self, texels: Tensor) -> dict[str, Any]:
+        """Describe the scene with an environment map (rows, columns, 3) for Mitsuba."""
+        surface = {
+            "type": "diffuse",
+            "reflectance": {"type": "rgb", "value": list(ALBEDO)},
+        }
+        mesh = self.view.mesh
+        return {
+            "type": "scene",
+            "integrator": integrator(bounces=0),
+            "light": environment({"bitmap": texels.numpy()}),
+            "sensor": sensor_of(CAMERA, self.view.size, "rgb"),
+            "mesh": shape(self.module, surface, mesh.vertices, mesh.faces),
+        }
+
+    def __call__(self) -> Result:
+        """Render the view, and compute the gradient by the parameter."""
+        drjit = self.drjit
+        value = drjit.detach(self.start)
         drjit.enable_grad(value)
-        parameters[name] = value
-        parameters.update()
-        image = module.render(scene, parameters, spp=MITSUBA_SAMPLES**2)
-        drjit.backward(drjit.sum(image * upstream, axis=None))
-        gradient = torch.from_numpy(np.array(drjit.grad(value)))  # waits for the result
-        drjit.disable_grad(parameters[name])
-        if by_light:
-            [gradient] = torch.autograd.grad(repeated, light, gradient, retain_graph=True)
+        self.parameters[self.parameter] = value
+        self.parameters.update()
+        image = self.module.render(self.scene, self.parameters, spp=MITSUBA_SAMPLES**2)
+        drjit.backward(drjit.sum(image * self.image_gradient, axis=None))
+        # Reading the gradient waits until it is computed.
+        gradient = torch.from_numpy(np.array(drjit.grad(value)))
+        drjit.disable_grad(self.parameters[self.parameter])
+        if self.parameter == "light.data":
+            [gradient] = torch.autograd.grad(
+                self.texels,
+                self.light,
+                gradient,
+                retain_graph=True,
+            )
         radiance = np.pi * np.array(drjit.detach(image)).reshape(-1, 3).T
-        return torch.arange(size**2), torch.from_numpy(radiance), gradient.view(-1, 3)
-
-    return step
+        return Result(
+            pixels=torch.arange(self.view.size**2),
+            radiance=torch.from_numpy(radiance),
+            gradient=gradient.view(-1, 3),
+        )

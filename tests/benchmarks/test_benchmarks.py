@@ -9,78 +9,122 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import common, gpu, lights, renderer, scene, training
+from benchmarks import common, gpu, lights, renderer, scene, steps, training, whole_steps
 from renderer.transport import precomputed
 from renderer.visibility.rasterizers import choose
 
+PNG_SIGNATURE = b"\x89PNG"
+
 
 def read(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a CSV file."""
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
-    monkeypatch.setattr(common, "BURST", 0.0)
-    for name, value in {"DEGREES": (2, 6), "PER_SIDE": (1, 8), "MANY_VIEWS": (8, 9)}.items():
-        monkeypatch.setattr(renderer, name, value)
-    tiny = ["--sizes", "8", "--subdivisions", "1", "--rounds", "1", "--rasterizer", "numpy"]
-    renderer.main(["--out", str(tmp_path), *tiny, "--step-sizes", "8", "--coarse", "1"])
+    monkeypatch.setattr(common, "MIN_TIMED_SECONDS", 0.0)
+    monkeypatch.setattr(renderer, "DEGREES", (2, 6))
+    monkeypatch.setattr(renderer, "SAMPLES_PER_SIDE", (1, 8))
+    monkeypatch.setattr(whole_steps, "MANY_VIEWS_SIZE", 8)
+    monkeypatch.setattr(whole_steps, "MANY_VIEWS_COUNT", 9)
+    arguments = ["--sizes", "8", "--subdivisions", "1", "--rounds", "1"]
+    arguments += ["--rasterizer", "numpy", "--step-sizes", "8", "--coarse", "1"]
+    renderer.main(["--out", str(tmp_path), *arguments])
+
     rows = read(tmp_path / "renderer_pareto.csv")
     assert all(float(row["time_ms"]) > 0 for row in rows)
-    steps = [row for row in rows if row["ratio"]]
-    assert len(steps) == 2 * (2 * (4 + 2) + 4)  # meshes × (samples × (steps + builds) + many views)
-    assert all(0 < float(row["ratio_low"]) <= float(row["ratio"]) <= float(row["ratio_high"]) for row in steps)
-    rows = [row for row in rows if row not in steps]
-    measured = [row for row in rows if not row["panel"].startswith("skipped")]
-    assert all(math.isfinite(float(row[name])) for row in measured for name in ("image_error", "gradient_error"))
-    assert len(rows) - len(measured) == 13 and all(float(row["saved"]) > 0 for row in rows if row not in measured)
-    panels = {row["panel"] for row in measured}
+    whole_step_rows = [row for row in rows if row["ratio"]]
+    saving_rows = [row for row in rows if row["panel"].startswith("skipped")]
+    panel_rows = [row for row in rows if row not in whole_step_rows + saving_rows]
+
+    # Two meshes have, for each of two numbers of samples, four steps and two
+    # preparations, and four steps of many views.
+    assert len(whole_step_rows) == 2 * (2 * (4 + 2) + 4)
+    for row in whole_step_rows:
+        low, middle, high = (float(row[name]) for name in ("ratio_low", "ratio", "ratio_high"))
+        assert 0 < low <= middle <= high
+
+    assert len(saving_rows) == 13
+    assert all(float(row["saved"]) > 0 for row in saving_rows)
+
+    for row in panel_rows:
+        assert math.isfinite(float(row["image_error"]))
+        assert math.isfinite(float(row["gradient_error"]))
+    panels = {row["panel"] for row in panel_rows}
     assert len(panels) == 4
     for panel in panels:
-        assert any(row["front"] == "True" for row in measured if row["panel"] == panel)
-        assert sum(row["default"] == "True" for row in measured if row["panel"] == panel) == 1
-    assert (tmp_path / "renderer_pareto.png").read_bytes().startswith(b"\x89PNG")
+        in_panel = [row for row in panel_rows if row["panel"] == panel]
+        assert any(row["front"] == "True" for row in in_panel)
+        assert sum(row["default"] == "True" for row in in_panel) == 1
+    assert (tmp_path / "renderer_pareto.png").read_bytes().startswith(PNG_SIGNATURE)
 
 
-def test_the_benchmarks_reference_is_what_more_samples_converge_to():
-    """By Monte Carlo's rate at least: a factor of 4 in samples per side, 4 in the error."""
-    view = scene.View(scene.ellipsoid(2), 8, choose("numpy"))
-    exact, light = scene.Converged(view), scene.coefficients(6).float()
-    steps = [renderer.light_step(view, view.operator(samples), light) for samples in (2, 8, 32)]
-    coarse, middle, fine = (exact.errors(step, exact.by_light)["gradient_error"] for step in steps)
-    assert middle < coarse / 4 and fine < middle / 4
+@pytest.fixture
+def view() -> scene.View:
+    """An ellipsoid of 162 vertices in 8 × 8 pixels."""
+    return scene.View(scene.ellipsoid(2), 8, choose("numpy"))
 
 
-def test_the_benchmarks_plain_autograd_is_the_analytic_gradient():
-    view, light = scene.View(scene.ellipsoid(2), 8, choose("numpy")), scene.coefficients(6)
-    analytic, plain = (renderer.vertex_step(view, 3, light, shade)()[2] for shade in renderer.SHADINGS.values())
-    torch.testing.assert_close(plain, analytic, rtol=0, atol=1e3 * 2.2e-16 * float(analytic.abs().max()))
+def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
+    """Four times as many samples per side reduce the error to less than a quarter.
+
+    Even random samples would reduce the error to a quarter.
+    """
+    exact = scene.Converged(view)
+    light = scene.coefficients(6).float()
+    gradient_errors = []
+    for samples in (2, 8, 32):
+        step = steps.LightStep(view, view.operator(samples), light)
+        gradient_errors.append(exact.errors(step, exact.by_light)["gradient_error"])
+    coarse, middle, fine = gradient_errors
+    assert middle < coarse / 4
+    assert fine < middle / 4
 
 
-def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples():
-    """Whatever plain autograd keeps from step to step; to float32's rounding of sums over all pixels."""
-    contenders = list(renderer.light_gradients(scene.View(scene.ellipsoid(2), 16, choose("numpy"))))
-    for samples in (1, scene.SAMPLES):
-        (pixels, *first), *others = [step() for _, count, _, step, _ in contenders if count == samples]
-        assert len(others) == 3 + (samples == 1)
-        for others_pixels, *values in others:
-            assert torch.equal(others_pixels, pixels)
-            for value, expected in zip(values, first, strict=True):
-                torch.testing.assert_close(value, expected, rtol=0, atol=2e-5 * float(expected.abs().max()))
+def test_the_benchmarks_plain_autograd_is_the_analytic_gradient(view):
+    light = scene.coefficients(6)
+    analytic = steps.VertexStep(view, 3, light, steps.SHADINGS[steps.ANALYTIC])().gradient
+    plain = steps.VertexStep(view, 3, light, steps.SHADINGS[steps.AUTOGRAD])().gradient
+    tolerance = 1e3 * torch.finfo(torch.float64).eps * float(analytic.abs().max())
+    torch.testing.assert_close(plain, analytic, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("samples", "count"), [(1, 5), (scene.SAMPLES, 4)])
+def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, count):
+    """Radiance and gradient are equal up to the rounding of float32 sums over all pixels."""
+    view = scene.View(scene.ellipsoid(2), 16, choose("numpy"))
+    results = [
+        contender.step()
+        for contender in renderer.light_gradients(view)
+        if contender.samples == samples
+    ]
+    first, *others = results
+    assert len(results) == count
+    for other in others:
+        assert torch.equal(other.pixels, first.pixels)
+        whole_steps.require_close(
+            [other.radiance, other.gradient],
+            [first.radiance, first.gradient],
+        )
 
 
 def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     cases = {name: lights.LOCAL_LIGHTS[name] for name in ("harmonics", "3 lamps")}
-    few = {"VIEWS": 1, "RAYS": 2**10, "PATCHES": 64, "RAYS_OF_PATCH": 64, "LOCAL_LIGHTS": cases}
-    for name, value in few.items():
-        monkeypatch.setattr(lights, name, value)
+    monkeypatch.setattr(lights, "LOCAL_LIGHTS", cases)
+    monkeypatch.setattr(lights, "VIEWS", 1)
+    monkeypatch.setattr(lights, "CONVERGED_RAYS", 2**10)
+    monkeypatch.setattr(lights, "CONVERGED_PATCHES", 64)
+    monkeypatch.setattr(lights, "CONVERGED_RAYS_PER_PATCH", 64)
     monkeypatch.setattr(precomputed, "PATCHES", 64)
     path = tmp_path / "lights.csv"
     lights.main(["--csv", str(path), "--sizes", "12", "--vertices", "0", "--rounds", "1"])
+
     rows = read(path)
     assert [row["light"] for row in rows] == [*lights.LIGHT_PATHS, *cases]
-    assert all(float(row[name]) > 0 for row in rows for name in ("step_ms", "build_s", "megabytes"))
-    assert all(0 < float(row[name]) < 0.4 for row in rows for name in ("image_error", "gradient_error"))
+    for row in rows:
+        assert all(float(row[name]) > 0 for name in ("step_ms", "build_s", "megabytes"))
+        assert all(0 < float(row[name]) < 0.4 for name in ("image_error", "gradient_error"))
 
 
 @pytest.mark.slow
