@@ -5,8 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -33,11 +34,24 @@ from augment.random_streams import generator
 from augment.scene.conditions import Conditions
 from augment.scene.degree import NOTICED, with_needed_degree
 from augment.scene.scene import Scene
-from renderer.errors import InputError, is_whole
+from renderer.errors import InputError, is_whole, require_range
 from renderer.light.harmonics import irradiance_error
-from renderer.validation import as_list, require_flag, require_kind, require_seed
+from renderer.rendering import light_sphere
+from renderer.validation import (
+    as_list,
+    require_flag,
+    require_kind,
+    require_seed,
+    require_whole,
+)
 
-LEAST_LIKELY = "least_likely"  # in place of a target class
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# In place of a target class.
+LEAST_LIKELY = "least_likely"
+# Pixels per side of the ball that shows the light.
+BALL_SIZE = 96
 
 
 @dataclass(frozen=True)
@@ -124,6 +138,52 @@ class AttackResult:
     def conditions(self) -> Conditions:
         """Light, shape, colors and other conditions of the E examples after the attack."""
         return self.problem.conditions(self.descent.values, self.problem.everything)
+
+    def plot(self, example: int = 0, view: int = 0) -> Figure:
+        """Draw one view: before, the light after the attack, after, and the probabilities.
+
+        The light is shown as a white ball in it.
+
+        Args:
+            example: Index of the example.
+            view: Index of the view.
+
+        Returns:
+            Figure of matplotlib. `figure.savefig(path)` writes it.
+
+        Raises:
+            InputError: If there is no such example or view.
+        """
+        # To import matplotlib takes half a second.
+        from augment.attacks.plots import draw_attack
+
+        example_count, view_count = self.images.shape[:2]
+        _require_index("example", example, example_count)
+        _require_index("view", view, view_count)
+        conditions = self.conditions
+        basis = self.problem.scene.basis_under(conditions, example)
+        before = self.logits_before[example, view].softmax(0)
+        after = self.logits[example, view].softmax(0)
+        return draw_attack(
+            self.images_before[example, view].cpu(),
+            light_sphere(conditions.light[example], BALL_SIZE, basis=basis),
+            self.images[example, view].cpu(),
+            before.cpu(),
+            after.cpu(),
+            self.classifier.classes,
+        )
+
+    def _repr_png_(self) -> bytes:
+        """Draw the first view of the first example, which notebooks show."""
+        content = BytesIO()
+        self.plot().savefig(content, format="png")
+        return content.getvalue()
+
+
+def _require_index(name: str, index: int, count: int) -> None:
+    """Raise InputError if an index is no whole number from 0 to count - 1."""
+    require_whole(name, index)
+    require_range(name, index, 0, count - 1)
 
 
 def require_result(result: object) -> None:
@@ -361,7 +421,10 @@ def require_clean_correct(
 
 
 def target_labels(
-    target: str | int | Sequence[str | int] | None, source: Tensor, logits: Tensor, classifier: Classifier
+    target: str | int | Sequence[str | int] | None,
+    source: Tensor,
+    logits: Tensor,
+    classifier: Classifier,
 ) -> Tensor | None:
     """Return the class that an attack leads each view to.
 

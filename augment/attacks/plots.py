@@ -1,0 +1,79 @@
+"""Draws an attack as a figure: the image before, the light, the image after, and probabilities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Classes whose probabilities are shown.
+SHOWN_CLASSES = 5
+BEFORE_COLOR = "#4c78a8"
+AFTER_COLOR = "#e45756"
+
+
+def draw_attack(
+    before: Tensor,
+    ball: Tensor,
+    after: Tensor,
+    probabilities_before: Tensor,
+    probabilities_after: Tensor,
+    classes: Sequence[str],
+) -> Figure:
+    """Draw one view of an attack.
+
+    Args:
+        before: Image before the attack, in [0, 1], shape (3, size, size).
+        ball: White ball in the light after the attack, shape (3, size, size).
+        after: Image after the attack, in [0, 1], shape (3, size, size).
+        probabilities_before: Probability of each class before, shape (C,).
+        probabilities_after: Probability of each class after, shape (C,).
+        classes: Names of the C classes.
+
+    Returns:
+        The figure. It belongs to no window: `figure.savefig(path)` writes it.
+    """
+    figure = Figure(figsize=(10, 2.6), layout="constrained")
+    axes_before, axes_light, axes_after, axes_bars = figure.subplots(
+        1, 4, width_ratios=[1, 1, 1, 1.2]
+    )
+    _show(axes_before, before, f"before: {_most_probable(probabilities_before, classes)}")
+    _show(axes_light, ball, "light after the attack")
+    _show(axes_after, after, f"after: {_most_probable(probabilities_after, classes)}")
+    _draw_probabilities(axes_bars, probabilities_before, probabilities_after, classes)
+    return figure
+
+
+def _show(axes: Axes, image: Tensor, title: str) -> None:
+    """Draw an image (3, size, size) below a title."""
+    pixels = image.permute(1, 2, 0).clamp(0, 1).numpy()
+    axes.imshow(pixels, interpolation="nearest")
+    axes.set_title(title, fontsize=9)
+    axes.axis("off")
+
+
+def _most_probable(probabilities: Tensor, classes: Sequence[str]) -> str:
+    """Name the most probable class and its probability."""
+    probability, index = probabilities.max(0)
+    return f"{classes[int(index)]} {float(probability):.0%}"
+
+
+def _draw_probabilities(axes: Axes, before: Tensor, after: Tensor, classes: Sequence[str]) -> None:
+    """Draw the probabilities of the most probable classes as bars."""
+    shown_count = min(SHOWN_CLASSES, len(classes))
+    # The larger of the two probabilities ranks a class. Bars start at the bottom.
+    ranked = before.maximum(after).topk(shown_count).indices.flip(0)
+    names = [classes[index] for index in ranked.tolist()]
+    above = [row + 0.2 for row in range(shown_count)]
+    below = [row - 0.2 for row in range(shown_count)]
+    axes.barh(above, before[ranked].numpy(), 0.4, color=BEFORE_COLOR, label="before")
+    axes.barh(below, after[ranked].numpy(), 0.4, color=AFTER_COLOR, label="after")
+    axes.set_yticks(range(shown_count), names, fontsize=8)
+    axes.set_xlim(0, 1)
+    axes.set_xlabel("probability", fontsize=8)
+    axes.legend(fontsize=8, loc="lower right")

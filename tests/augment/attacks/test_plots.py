@@ -1,0 +1,62 @@
+"""The figure of an attack shows its images, its light and its probabilities."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor
+
+import augment
+import renderer
+
+SIZE = 8
+
+
+def bright_or_dark(images: Tensor) -> Tensor:
+    """Return logits that compare the mean of an image with 0.3."""
+    mean = images.mean((1, 2, 3))
+    return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+
+
+@pytest.fixture(scope="module")
+def result() -> augment.AttackResult:
+    classifier = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
+    scene = augment.build_scene([("solid:orange", "orange")], SIZE, views=2)
+    settings = augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=2)
+    return augment.attack(classifier, scene, settings=settings, force=True)
+
+
+def test_a_plot_shows_the_images_and_the_light_of_its_example(result):
+    figure = result.plot(example=1)
+    before, light, after, _ = (axes for axes in figure.axes)
+    ball = renderer.light_sphere(result.conditions.light[1], 96)
+    for axes, expected in (
+        (before, result.images_before[1, 0]),
+        (light, ball),
+        (after, result.images[1, 0]),
+    ):
+        shown = axes.images[0].get_array()
+        np.testing.assert_allclose(shown, expected.permute(1, 2, 0).clamp(0, 1), atol=1e-6)
+
+
+def test_the_bars_are_the_probabilities_before_and_after(result):
+    bars = result.plot(example=0).axes[3]
+    names = [label.get_text() for label in bars.get_yticklabels()]
+    expected = [result.logits_before[0, 0].softmax(0), result.logits[0, 0].softmax(0)]
+    for container, probabilities in zip(bars.containers, expected, strict=True):
+        widths = [bar.get_width() for bar in container]
+        rows = [result.classifier.label(name) for name in names]
+        np.testing.assert_allclose(widths, probabilities[rows], atol=1e-6)
+
+
+def test_a_notebook_shows_a_result_as_a_picture(result):
+    picture = Image.open(io.BytesIO(result._repr_png_()))
+    assert picture.format == "PNG" and picture.width > picture.height
+
+
+@pytest.mark.parametrize(("example", "view"), [(2, 0), (-1, 0), (0, 1), (0.5, 0)])
+def test_an_index_that_does_not_exist_is_refused(result, example, view):
+    with pytest.raises(renderer.InputError):
+        result.plot(example, view)
