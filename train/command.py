@@ -63,6 +63,8 @@ NOUNS = {
 # Hydra and OmegaConf let these pass for some mistakes, without saying where.
 INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
 MAX_DIGITS = 300  # of a whole number that a float can hold
+# Hydra reads text between these as it is.
+QUOTES = "'\""
 Kind = TypeVar("Kind")
 
 
@@ -296,8 +298,8 @@ def _read_node(node: DictConfig, key: str) -> Any:
 def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     """Put a word of the command line into Hydra's form.
 
-    Names and paths are quoted if Hydra would read 1.10 as 1.1, or refuse an umlaut. A + before a
-    key is dropped, since every setting has a key.
+    Names and paths are quoted if Hydra would read 1.10 as 1.1, or refuse an umlaut. A single value
+    for a list becomes a list of one. A + before a key is dropped, since every setting has a key.
 
     Args:
         argument: The word.
@@ -317,7 +319,10 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
         argument = f"{key}{equals}{value}"
     if keys.get(key.rpartition(".")[0]) is Any:  # a part of a mapping, such as scene.projector
         return f"++{argument}"
-    if without_none(keys.get(key)) is not str:
+    kind = without_none(keys.get(key))
+    if get_origin(kind) is list:
+        return _as_list(key, value, is_text=get_args(kind) == (str,))
+    if kind is not str:
         return argument
     if not value or value[0] in "'\"~":  # quoted already, or a home folder, which Hydra refuses
         return argument
@@ -328,6 +333,24 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     except HydraException:
         is_kept = False
     return argument if is_kept else f"{key}={quoted(value)}"
+
+
+def _as_list(key: str, value: str, is_text: bool) -> str:
+    """Write the override of a list, whose one member is the value unless this is a list."""
+    try:
+        parsed = OverridesParser.create().parse_override(f"{key}={value}").value()
+    except HydraException:
+        # Hydra refuses some paths. It explains what is wrong with a list.
+        is_list = value.startswith("[")
+        return f"{key}={value}" if is_list else f"{key}=[{quoted(value)}]"
+    if isinstance(parsed, str) or (is_text and isinstance(parsed, int | float)):
+        # A name in quotes keeps them.
+        if not value:
+            return f"{key}="
+        member = value if value[0] in QUOTES else quoted(value)
+        return f"{key}=[{member}]"
+    is_member = isinstance(parsed, dict | int | float)
+    return f"{key}=[{value}]" if is_member else f"{key}={value}"
 
 
 def quoted(text: str) -> str:

@@ -73,7 +73,6 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["train.epochs=abc"], "train.epochs=abc must be a whole number"),
         (["train.epochs=null"], "train.epochs=null must be a whole number"),
         (["train.schedule=stepp"], "train.schedule=stepp: choose one of step, cosine, one_cycle"),
-        (["scene.meshes=solid:orange"], "scene.meshes=solid:orange must be a list"),
         (["scene.ground=[a]"], "scene.ground[0]"),
         (["compare=[[none]]"], "compare is"),
         ([f"scene.exposure={10**400}"], "scene.exposure is too large"),
@@ -97,6 +96,12 @@ def test_a_wrong_setting_is_one_sentence_that_begins_with_its_key(overrides, key
     with pytest.raises(InputError) as refusal:
         train_command.read(overrides)
     assert str(refusal.value).startswith(key) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("path", ["solid:orange", "/a folder/örange.glb", "'a, b'"])
+def test_a_single_value_for_a_list_is_a_list_of_one(path):
+    meshes = train_command.read([f"scene.hard_negatives={path}"]).scene.hard_negatives
+    assert [str(mesh) for mesh in meshes] == [path.strip("'")]
 
 
 def test_a_part_of_a_projector_is_set_alone_or_in_a_mapping():
