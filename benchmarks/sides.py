@@ -1,6 +1,8 @@
-"""Three sides that share nothing: training, choosing and reporting.
+"""Two sides of renders and photographs, for choosing settings and for reporting results.
 
-Settings are chosen on the second. The third is looked at once per table, and docs/reporting.csv says when.
+The sides share no image, object or light with each other or with training.
+Settings are chosen on the choosing side. The reporting side is looked at once
+per table, and docs/reporting.csv records when.
 
 pip download --no-deps -d packages robosuite genesis-world pybullet scikit-image scikit-learn
 npm pack --pack-destination packages @pmndrs/assets
@@ -8,8 +10,10 @@ python -m benchmarks.sides make --data DATA --sides SIDES --packages packages
 python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides SIDES
 python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
 
-DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is an arm: of several seeds, the table has the mean,
-the lowest and the highest. A network may also be efficientnet_lite0 or another classifier, for images of --size pixels.
+DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is an arm:
+the table has the mean, the lowest and the highest score of its seeds. A network
+may also be efficientnet_lite0 or another classifier, for images of --size
+pixels.
 """
 
 import argparse
@@ -19,7 +23,8 @@ import hashlib
 import subprocess
 import tarfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from statistics import fmean
@@ -34,10 +39,15 @@ from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
-from train.data.sets import held_out_rows, load_npz
+from train.data.sets import Split, held_out_rows, load_npz
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import METRICS, Pooled, metric_title
-from train.evaluation.scores.predictions import PREDICTIONS, Prediction, Predictor, write_predictions
+from train.evaluation.scores.predictions import (
+    PREDICTIONS,
+    Prediction,
+    Predictor,
+    write_predictions,
+)
 from train.evaluation.tables import Estimate, Table, format_interval
 from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary, summarize
@@ -46,101 +56,272 @@ from train.system.device import MixedPrecision, choose_precision
 from train.system.hashing import content_hash
 from train.training.loop import evaluate
 
-LOG = Path(__file__).parent.parent / "docs" / "reporting.csv"
-LABEL, VALIDATION = "orange", 0.02
-LEFT_OUT = ("turntable", "studio")  # photographs of few objects, whose two halves would show the same ones
-TRAINED = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}  # meshes of training, with their albedo_scale
-OUTSIDE = {  # meshes from no generator of ours and in no training, in DATA or in packages
-    "orange_scan.glb": "orange", "orange_leaf.glb": "orange", "apple_scan.glb": "apple", "banana.glb": "other_banana",
-    "golf_ball.glb": "other_golf_ball", "racquetball.glb": "other_racquetball", "lemon.obj": "other_lemon",
-    "soccerball.obj": "other_soccer_ball", "wooden_sphere.obj": "other_wooden_ball",
-}  # fmt: skip
-TEXTURES = ("lemon.mtl", "lemon.png", "wood_Mat_Diffuse.png", "wooden_sphere.mtl", "soccerball.mtl", "/colors16.png")
-PICTURES = ("astronaut", "chelsea", "coffee", "hubble_deep_field", "rocket", "motorcycle_left", "china", "flower")
-CHOSEN = ("city", "studio")
-OTHERS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "lemon", "peach")
-UNSEEN = {  # directions, surroundings and materials that no training has
-    "azimuth": [-180, 180], "elevation": [5, 85], "ambient": [0.03, 0.2], "albedo": [0.04, 0.5], "walls": 0.5,
-    "roughness": [0.1, 0.9], "brightness": [0.5, 4.0],
-}  # fmt: skip
+ROOT = Path(__file__).parent.parent
+LOG = ROOT / "docs" / "reporting.csv"
+CHOOSING = "choosing"
+REPORTING = "reporting"
+# Side that a command scores.
+SIDE_OF_COMMAND = {"choose": CHOOSING, "report": REPORTING}
+
+LABEL = "orange"
+# Fraction of the training images of CIFAR-100 on the choosing side.
+VALIDATION = 0.02
+# Sources of photographs that show few objects. Both halves of such a source
+# would show the same objects.
+EXCLUDED_SOURCES = ("turntable", "studio")
+
+# Meshes of training, with their albedo_scale.
+TRAINED = {"orange_studio.glb": 1.0, "orange_sketchfab.glb": 3.0}
+# Meshes with their labels. They are from no generator of ours and in no
+# training. They lie in DATA/meshes or in the packages.
+OUTSIDE = {
+    "orange_scan.glb": "orange",
+    "orange_leaf.glb": "orange",
+    "apple_scan.glb": "apple",
+    "banana.glb": "other_banana",
+    "golf_ball.glb": "other_golf_ball",
+    "racquetball.glb": "other_racquetball",
+    "lemon.obj": "other_lemon",
+    "soccerball.obj": "other_soccer_ball",
+    "wooden_sphere.obj": "other_wooden_ball",
+}
+# Materials and textures of the meshes in the packages.
+TEXTURES = (
+    "lemon.mtl",
+    "lemon.png",
+    "wood_Mat_Diffuse.png",
+    "wooden_sphere.mtl",
+    "soccerball.mtl",
+    "/colors16.png",
+)
+# Pictures in the packages that the projector shows as slides.
+PICTURES = (
+    "astronaut",
+    "chelsea",
+    "coffee",
+    "hubble_deep_field",
+    "rocket",
+    "motorcycle_left",
+    "china",
+    "flower",
+)
+# Environment maps of the choosing side. The reporting side has all others.
+CHOOSING_MAPS = ("city", "studio")
+# Solids of the generator that are not oranges.
+OTHER_SOLIDS = (
+    "lemon",
+    "peach",
+    "ball",
+    "apple",
+    "pear",
+    "sweet_pepper",
+    "lemon",
+    "peach",
+)
+# Number of different kinds in OTHER_SOLIDS. Repeated kinds get another seed.
+OTHER_KINDS = 6
+ORANGES = 8
+# Directions, surroundings and materials that no training has.
+UNSEEN = {
+    "azimuth": [-180, 180],
+    "elevation": [5, 85],
+    "ambient": [0.03, 0.2],
+    "albedo": [0.04, 0.5],
+    "walls": 0.5,
+    "roughness": [0.1, 0.9],
+    "brightness": [0.5, 4.0],
+}
+UNSEEN_PATTERNS = ["window", "leaves", "text", "slides", "window+text"]
+
+
+# ---------------------------------------------------------------------------- make
 
 
 def solids(seed: int) -> list[str]:
-    """Eight oranges and as many others of the generator, of this seed on."""
-    others = [f"solid:{name}:{seed + n // 6}" for n, name in enumerate(OTHERS)]
-    return [f"solid:{LABEL}:{seed + n}" for n in range(8)] + others
+    """Return eight oranges and eight other solids of the generator.
+
+    Args:
+        seed: First of the seeds.
+
+    Returns:
+        Names such as "solid:orange:2001".
+    """
+    oranges = [f"solid:{LABEL}:{seed + number}" for number in range(ORANGES)]
+    others = [
+        f"solid:{name}:{seed + number // OTHER_KINDS}" for number, name in enumerate(OTHER_SOLIDS)
+    ]
+    return oranges + others
 
 
 def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
-    """The settings of pnb-lab of each part; those ending in _seen_objects repeat another with objects of training."""
-    maps = {path.stem: str(path) for path in [*(extra / "hdri").glob("*.npy"), *(data / "hdri").glob("*.npy")]}
-    files = {path.name: str(path) for path in [*(data / "meshes").iterdir(), *extra.rglob("*.obj")]}
-    outside = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
-    trained = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in TRAINED.items()]
-    slides = sorted(str(path) for path in (extra / "slides").iterdir())
-    unseen = {**UNSEEN, "patterns": ["window", "leaves", "text", "slides", "window+text"], "slides": slides, "seed": 3}
-    reported, roughness = [maps[name] for name in sorted(set(maps).difference(CHOSEN))], UNSEEN["roughness"]
-    skies = {"environments": reported, "patterns": [], "setups": 5 * len(reported), "seed": 4, "roughness": roughness}
-    chosen, seen = {"meshes": solids(2001)}, {"meshes": [*trained, *solids(0)]}
+    """Return the settings of pnb-lab of each part that is rendered.
+
+    Parts whose names end in _seen_objects repeat another part with objects of
+    training.
+
+    Args:
+        data: Folder with meshes/ and hdri/.
+        extra: Folder of the unpacked packages.
+
+    Returns:
+        Settings by the name of a part, such as "choosing/hdri".
+    """
+    maps = {path.stem: str(path) for path in (extra / "hdri").glob("*.npy")}
+    maps |= {path.stem: str(path) for path in (data / "hdri").glob("*.npy")}
+    files = {path.name: str(path) for path in (data / "meshes").iterdir()}
+    files |= {path.name: str(path) for path in extra.rglob("*.obj")}
+    reporting_maps = [maps[name] for name in sorted(maps) if name not in CHOOSING_MAPS]
+
+    new_objects = {
+        "meshes": [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
+    }
+    trained = [
+        {"mesh": files[name], "label": LABEL, "albedo_scale": scale}
+        for name, scale in TRAINED.items()
+    ]
+    seen_objects = {"meshes": [*trained, *solids(0)]}
+    choosing_objects = {"meshes": solids(2001)}
+    patterns = {
+        **UNSEEN,
+        "patterns": UNSEEN_PATTERNS,
+        "slides": sorted(str(path) for path in (extra / "slides").iterdir()),
+        "seed": 3,
+    }
+    skies = {
+        "environments": reporting_maps,
+        "patterns": [],
+        "setups": 5 * len(reporting_maps),
+        "seed": 4,
+        "roughness": UNSEEN["roughness"],
+    }
     return {
-        "choosing/laboratory": {**chosen, "patterns": ["gradient", "rings", "colors"], "setups": 240, "seed": 1},
-        "choosing/hdri": {**chosen, "environments": [maps[x] for x in CHOSEN], "patterns": [], "setups": 80, "seed": 2},
-        "reporting/laboratory": {"meshes": outside, **unseen, "setups": 200},
-        "reporting/hdri": {"meshes": outside, **skies},
-        "reporting/laboratory_seen_objects": {**seen, **unseen, "setups": 100},
-        "reporting/hdri_seen_objects": {**seen, **skies},
-    }  # fmt: skip
+        "choosing/laboratory": {
+            **choosing_objects,
+            "patterns": ["gradient", "rings", "colors"],
+            "setups": 240,
+            "seed": 1,
+        },
+        "choosing/hdri": {
+            **choosing_objects,
+            "environments": [maps[name] for name in CHOOSING_MAPS],
+            "patterns": [],
+            "setups": 80,
+            "seed": 2,
+        },
+        "reporting/laboratory": {**new_objects, **patterns, "setups": 200},
+        "reporting/hdri": {**new_objects, **skies},
+        "reporting/laboratory_seen_objects": {**seen_objects, **patterns, "setups": 100},
+        "reporting/hdri_seen_objects": {**seen_objects, **skies},
+    }
 
 
 def unpack(packages: Path, extra: Path) -> None:
-    """What the wheels and the npm package bring: meshes with their textures, pictures, environment maps."""
+    """Unpack meshes with their textures, pictures, and environment maps.
+
+    Args:
+        packages: Folder of the wheels and of the npm package.
+        extra: Folder to write, which does not exist yet.
+    """
     for folder in (extra / "slides", extra / "hdri"):
         folder.mkdir(parents=True)
-    for archive in map(zipfile.ZipFile, packages.glob("*.whl")):
-        for name in archive.namelist():
-            if name.endswith((*OUTSIDE, *TEXTURES)):
-                path = Path(archive.extract(name, extra))
-                if path.suffix == ".png":
-                    Image.open(path).convert("RGB").resize((1024, 1024)).save(path)
-                elif path.suffix == ".mtl":  # a gray factor of a texture, which would be painted anew for it
-                    path.write_text(path.read_text().replace("0.800000", "1.000000"))
-            elif Path(name).stem in PICTURES and Path(name).suffix in (".png", ".jpg"):
-                (extra / "slides" / Path(name).name).write_bytes(archive.read(name))
-    for package in map(tarfile.open, packages.glob("*.tgz")):
-        for name in package.getnames():
-            if name.endswith(".exr.js"):
-                path = extra / "hdri" / Path(name).stem
-                path.write_bytes(base64.b64decode(package.extractfile(name).read().split(b"base64,")[1].split(b"'")[0]))
-                np.save(path.with_suffix(".npy"), read_map(path).clamp(min=0).numpy())  # resampled with ringing
+    for path in packages.glob("*.whl"):
+        with zipfile.ZipFile(path) as wheel:
+            unpack_wheel(wheel, extra)
+    for path in packages.glob("*.tgz"):
+        with tarfile.open(path) as package:
+            unpack_maps(package, extra / "hdri")
+
+
+def unpack_wheel(archive: zipfile.ZipFile, extra: Path) -> None:
+    """Unpack the meshes, textures and pictures of a wheel."""
+    for name in archive.namelist():
+        file_name = Path(name)
+        if name.endswith((*OUTSIDE, *TEXTURES)):
+            adapt_texture(Path(archive.extract(name, extra)))
+        elif file_name.stem in PICTURES and file_name.suffix in (".png", ".jpg"):
+            (extra / "slides" / file_name.name).write_bytes(archive.read(name))
+
+
+def adapt_texture(path: Path) -> None:
+    """Resize a texture to 1024 × 1024 pixels, and remove the gray factor of a material.
+
+    The loader of meshes would paint a texture anew for a gray factor.
+    """
+    if path.suffix == ".png":
+        Image.open(path).convert("RGB").resize((1024, 1024)).save(path)
+    elif path.suffix == ".mtl":
+        path.write_text(path.read_text().replace("0.800000", "1.000000"))
+
+
+def unpack_maps(package: tarfile.TarFile, folder: Path) -> None:
+    """Write the environment maps of an npm package as .exr and as .npy.
+
+    A module of the package has a map as base64 text in single quotes.
+    """
+    for name in package.getnames():
+        if not name.endswith(".exr.js"):
+            continue
+        module = package.extractfile(name).read()
+        text = module.split(b"base64,")[1].split(b"'")[0]
+        path = folder / Path(name).stem
+        path.write_bytes(base64.b64decode(text))
+        # The maps were resampled with ringing, which made some texels negative.
+        texels = read_map(path).clamp(min=0)
+        np.save(path.with_suffix(".npy"), texels.numpy())
 
 
 def divide_photographs(photos: Path, sides: Path) -> None:
-    """Links to every other photograph of a class and source, by name, on either side."""
-    rows = [
-        row for row in csv.DictReader((photos / TABLE).read_text().splitlines()) if row["source_tag"] not in LEFT_OUT
-    ]
-    ordered = sorted(rows, key=lambda row: (row["class"], row["source_tag"], row["path"]))
-    for offset, side in enumerate(("choosing", "reporting")):
-        write_csv(sides / side / "photographs" / TABLE, ordered[offset::2])
-        for row in ordered[offset::2]:
-            link = sides / side / "photographs" / row["path"]
+    """Divide the photographs of each class and source between the sides.
+
+    The photographs are sorted by name. Every other one goes to the choosing
+    side, as a link, and the rest to the reporting side.
+
+    Args:
+        photos: Folder of photographs with their table.
+        sides: Folder of both sides.
+    """
+    with (photos / TABLE).open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["source_tag"] not in EXCLUDED_SOURCES]
+    rows.sort(key=lambda row: (row["class"], row["source_tag"], row["path"]))
+    for offset, side in enumerate((CHOOSING, REPORTING)):
+        side_rows = rows[offset::2]
+        folder = sides / side / "photographs"
+        write_csv(folder / TABLE, side_rows)
+        for row in side_rows:
+            link = folder / row["path"]
             link.parent.mkdir(exist_ok=True)
             link.symlink_to((photos / row["path"]).resolve())
 
 
-def make(args: argparse.Namespace) -> None:
-    extra = args.sides.resolve() / "packages"
+def make(options: argparse.Namespace) -> None:
+    """Unpack the packages, divide the photographs, and render all parts.
+
+    Args:
+        options: Parsed command line.
+    """
+    extra = options.sides.resolve() / "packages"
     if not extra.exists():
-        unpack(args.packages, extra)
-        divide_photographs(args.data / "photos", args.sides)
-    for name, settings in parts(args.data.resolve(), extra).items():
-        if not args.part or name in args.part:
-            lab = LabSettings(out=str(args.sides / name), size=args.size, **settings)
+        unpack(options.packages, extra)
+        divide_photographs(options.data / "photos", options.sides)
+    for name, settings in parts(options.data.resolve(), extra).items():
+        if not options.part or name in options.part:
+            lab = LabSettings(out=str(options.sides / name), size=options.size, **settings)
             print(name, write_laboratory(lab), "renders")
 
 
+# ---------------------------------------------------------------------------- score
+
+
 def load(name: str, size: int) -> Classifier:
-    """A run's network, or a classifier of others for images of a size."""
+    """Load the network of a run, or a classifier that was trained elsewhere.
+
+    Args:
+        name: Folder of a run, or name of a classifier.
+        size: Pixels per side of the images of a classifier. A run has its own.
+
+    Returns:
+        The network.
+    """
     if not is_classifier(name):
         return load_run(name)
     classifier = build_classifier(name, size)
@@ -148,97 +329,330 @@ def load(name: str, size: int) -> Classifier:
     return classifier
 
 
-def log_looks(args: argparse.Namespace, networks: dict[str, Classifier], folders: list[Path]) -> None:
-    """A row per network in LOG, before anything is scored, and a word where the table has one of it already."""
-    weights = {name: content_hash(network.state_dict())[:12] for name, network in networks.items()}
-    looks, images = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines())), hashlib.sha256()
-    for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
-        images.update(path.relative_to(args.sides).as_posix().encode() + path.read_bytes())
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for name in networks:
-        if days := [look["date"] for look in looks if (look["table"], look["weights"]) == (args.table, weights[name])]:
-            print(f"{name} was looked at for {args.table!r} before, on {', '.join(days)}")
-        with LOG.open("a", encoding="utf-8", newline="") as file:
-            shown = " ".join(folder.name for folder in folders)
-            row = date.today(), commit.strip(), args.table, name, weights[name], shown, images.hexdigest()[:12]
-            csv.writer(file, lineterminator="\n").writerow(row)
+@dataclass(frozen=True)
+class Arm:
+    """Networks of one training configuration, which differ in their seeds.
+
+    Attributes:
+        name: Folder or name on the command line.
+        networks: Network of each seed, by the folder of its run.
+    """
+
+    name: str
+    networks: Mapping[str, Classifier]
+
+    @classmethod
+    def load(cls, name: str, size: int) -> "Arm":
+        """Load the networks of a folder of runs, of one run, or of a classifier."""
+        folders = sorted(path.parent for path in Path(name).glob("*/best.pt"))
+        runs = [str(folder) for folder in folders] or [name]
+        return cls(name, {run: load(run, size) for run in runs})
+
+    def models(self) -> list[MixedPrecision]:
+        """Return the networks in the precision that suits the CPU."""
+        precision = choose_precision("auto", torch.device("cpu"))
+        return [MixedPrecision(network, precision) for network in self.networks.values()]
 
 
-def score(args: argparse.Namespace) -> None:
-    """A table of the side's folders, sources and objects, with DATA of CIFAR-100, and differences from the first."""
-    side = {"choose": "choosing", "report": "reporting"}[args.command]
-    folders = sorted(path.parent for path in (args.sides / side).glob(f"*/{TABLE}"))
-    folders = [folder for folder in folders if not args.part or folder.name in args.part]
-    if len(folders) < len(args.part or [1]):
-        raise SystemExit(f"{args.sides / side} lacks a part: --part takes its folders with {TABLE}")
-    arms = {name: sorted(str(path.parent) for path in Path(name).glob("*/best.pt")) or [name] for name in args.networks}
-    networks = {run: load(run, args.size) for runs in arms.values() for run in runs}
-    if side == "reporting":
-        log_looks(args, networks, folders)
-    if args.data:
-        data = load_npz(str(args.data / "cifar100.npz"))
-        split = data.test if side == "reporting" else data.train[held_out_rows(data.train, VALIDATION, seed=0)]
-    lines, scored, answers, blank = [], {}, {}, [""] * (len(METRICS) - 1)
-    for arm, runs in arms.items():
-        models = [MixedPrecision(networks[run], choose_precision("auto", torch.device("cpu"))) for run in runs]
+@dataclass(frozen=True)
+class Scores:
+    """What the networks of an arm predict for the images of a folder.
+
+    Attributes:
+        evaluations: Evaluation of each seed.
+        predictions: Predictions of each seed, for each image.
+    """
+
+    evaluations: Sequence[Evaluation]
+    predictions: Sequence[Sequence[Prediction]]
+
+
+def score(options: argparse.Namespace) -> None:
+    """Print a table of the scores of arms on one side.
+
+    The rows are the parts of the side with their sources and objects, the
+    accuracy on CIFAR-100, and the differences from the first arm.
+
+    Args:
+        options: Parsed command line.
+
+    Raises:
+        SystemExit: If the side lacks a part.
+    """
+    side = SIDE_OF_COMMAND[options.command]
+    folders = find_folders(options.sides / side, options.part)
+    arms = [Arm.load(name, options.size) for name in dict.fromkeys(options.networks)]
+    if side == REPORTING:
+        log_looks(arms, folders, options.sides, options.table)
+    rows: list[list[str]] = []
+    scores: dict[tuple[str, str], Scores] = {}
+    for arm in arms:
         for folder in folders:
-            pairs = [evaluated(*pair, folder, side) for pair in zip(runs, models, strict=True)]
-            group, answers[arm, folder] = zip(*pairs, strict=True)
-            scored[arm, folder] = group
-            for part in group[0].pools:
-                cells = (format_interval(mean_metric(group, part, metric)) for metric in METRICS)
-                lines.append([arm, folder.name, Path(part.title()).stem, *cells])
-        if args.data:
-            values = [evaluate(model, split)["accuracy"] for model in models]
-            lines.append([arm, "CIFAR-100", "accuracy", mean_and_range(values), *blank])
+            scores[arm.name, folder.name] = evaluate_arm(arm, folder, side)
+            rows += score_rows(arm, folder.name, scores[arm.name, folder.name])
+        if options.data:
+            rows.append(accuracy_row(arm, options.data / "cifar100.npz", side))
     first, *others = arms
     for folder in folders:
         for arm in others:
-            pair = scored[arm, folder], scored[first, folder]
-            cells = (format_interval(difference(*pair, ALL, metric), "+") for metric in METRICS)
-            lines.append([f"{arm} - {first}", folder.name, "all", *cells])
-            for group, positive in (("same class", True), ("same class, other things", False)):
-                pairs = (zip(own, answers[first, folder][0], strict=True) for own in answers[arm, folder])
-                same = [fmean(a.predicted == b.predicted for a, b in x if positive or not b.positive) for x in pairs]
-                lines.append([f"{arm} - {first}", folder.name, group, mean_and_range(same), *blank])
-    print(Table("", ["network", "images", "group", *map(metric_title, METRICS)], lines))
+            rows += difference_rows(
+                f"{arm.name} - {first.name}",
+                folder.name,
+                scores[arm.name, folder.name],
+                scores[first.name, folder.name],
+            )
+    header = ["network", "images", "group", *map(metric_title, METRICS)]
+    print(Table("", header, rows))
 
 
-def mean_and_range(values: Sequence[float]) -> str:
-    """Of a number for each seed."""
-    if len(values) == 1:
-        return format_interval(Estimate(values[0]))
-    return format_interval(Estimate(fmean(values), min(values), max(values)))
+def find_folders(side: Path, chosen: Sequence[str] | None) -> list[Path]:
+    """Return the folders of a side that have a table of images.
+
+    Args:
+        side: Folder of the side.
+        chosen: Names of the folders to return. None returns all.
+
+    Raises:
+        SystemExit: If the side has no folder, or not all chosen ones.
+    """
+    folders = sorted(path.parent for path in side.glob(f"*/{TABLE}"))
+    if chosen:
+        folders = [folder for folder in folders if folder.name in chosen]
+    if len(folders) < len(chosen or [1]):
+        raise SystemExit(f"{side} lacks a part: --part takes its folders with {TABLE}")
+    return folders
 
 
-def evaluated(run: str, model: MixedPrecision, folder: Path, side: str) -> tuple[Evaluation, list[Prediction]]:
-    """A run's predictions on a folder, pooled by source, which is a pattern, a map or where photographs come from, and
-    by object; and each."""
+def log_looks(arms: Sequence[Arm], folders: Sequence[Path], sides: Path, table: str) -> None:
+    """Append a row per network to LOG before anything is scored.
+
+    A network that the table has scored before is reported.
+
+    Args:
+        arms: Arms that will be scored.
+        folders: Folders of images that will be shown.
+        sides: Folder of both sides.
+        table: Name of the table that the scores are for.
+    """
+    looks = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines()))
+    images = hash_files(folders, sides)
+    commit = current_commit()
+    # A run that is in several arms is logged once.
+    networks = {run: network for arm in arms for run, network in arm.networks.items()}
+    for run, network in networks.items():
+        weights = content_hash(network.state_dict())[:12]
+        days = [
+            look["date"] for look in looks if look["table"] == table and look["weights"] == weights
+        ]
+        if days:
+            print(f"{run} was looked at for {table!r} before, on {', '.join(days)}")
+        shown = " ".join(folder.name for folder in folders)
+        row = [date.today(), commit, table, run, weights, shown, images]
+        with LOG.open("a", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+
+
+def hash_files(folders: Sequence[Path], root: Path) -> str:
+    """Hash the names and the contents of all images of some folders.
+
+    Args:
+        folders: Folders with a folder for each class.
+        root: Folder to which the hashed names are relative.
+
+    Returns:
+        First 12 digits of the SHA-256 hash.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
+        digest.update(path.relative_to(root).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def current_commit() -> str:
+    """Return the short name of the commit that is checked out."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def evaluate_arm(arm: Arm, folder: Path, side: str) -> Scores:
+    """Predict the images of a folder with each network of an arm.
+
+    Args:
+        arm: Arm to evaluate.
+        folder: Folder of images.
+        side: Name of the side, below which the predictions are written.
+
+    Returns:
+        Evaluations and predictions of all seeds.
+    """
+    evaluations = []
+    predictions = []
+    for run, model in zip(arm.networks, arm.models(), strict=True):
+        run_predictions = predict(model, folder)
+        out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
+        out.mkdir(parents=True, exist_ok=True)
+        write_predictions(out / PREDICTIONS, run_predictions)
+        predictions.append(run_predictions)
+        evaluations.append(pool(run, model.network, run_predictions))
+    return Scores(evaluations, predictions)
+
+
+def predict(model: MixedPrecision, folder: Path) -> list[Prediction]:
+    """Return the predictions of a network for all images of a folder."""
     network = model.network
-    predictions = Predictor(model, network.classes, network.size).predict(folder, LABEL).predictions
-    out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
-    out.mkdir(parents=True, exist_ok=True)
-    write_predictions(out / PREDICTIONS, predictions)
+    predictor = Predictor(model, network.classes, network.size)
+    return predictor.predict(folder, LABEL).predictions
+
+
+def pool(run: str, network: Classifier, predictions: list[Prediction]) -> Evaluation:
+    """Pool predictions by source and by object.
+
+    A source is a pattern, an environment map, or where photographs come from.
+
+    Args:
+        run: Folder of the run, or name of a classifier.
+        network: Network that made the predictions.
+        predictions: Prediction of each image.
+
+    Returns:
+        Evaluation of the run.
+    """
     thresholds = {point.label: point.threshold for point in network.operating_points}
     pooled = Pooled(predictions, thresholds=thresholds)
-    summary = RunSummary(Path(run), run, {}, {}, None) if is_classifier(run) else summarize(Path(run))
-    return Evaluation(summary, pools_of(pooled, "source", "mesh")), predictions
+    return Evaluation(summarize_network(run), pools_of(pooled, "source", "mesh"))
+
+
+def summarize_network(run: str) -> RunSummary:
+    """Return the summary of a run, or an empty one for a classifier."""
+    if is_classifier(run):
+        return RunSummary(Path(run), run, {}, {}, None)
+    return summarize(Path(run))
+
+
+def score_rows(arm: Arm, images: str, scores: Scores) -> Iterator[list[str]]:
+    """Yield a row of metrics for all images of a folder, and for each source and object."""
+    for part in scores.evaluations[0].pools:
+        estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
+        cells = [format_interval(estimate) for estimate in estimates]
+        yield [arm.name, images, Path(part.title()).stem, *cells]
+
+
+def accuracy_row(arm: Arm, path: Path, side: str) -> list[str]:
+    """Return the row of an arm's accuracy on the images of CIFAR-100 that belong to a side."""
+    images = load_cifar(path, side)
+    accuracies = [evaluate(model, images)["accuracy"] for model in arm.models()]
+    return one_number_row(arm.name, "CIFAR-100", "accuracy", accuracies)
+
+
+def load_cifar(path: Path, side: str) -> Split:
+    """Load the test images for the reporting side, and held-out training images for the other."""
+    data = load_npz(str(path))
+    if side == REPORTING:
+        return data.test
+    return data.train[held_out_rows(data.train, VALIDATION, seed=0)]
+
+
+def difference_rows(
+    title: str,
+    images: str,
+    scores: Scores,
+    reference: Scores,
+) -> Iterator[list[str]]:
+    """Yield the differences of an arm from a reference on a folder.
+
+    Args:
+        title: Name of the comparison.
+        images: Name of the folder.
+        scores: Scores of the arm.
+        reference: Scores of the arm that it is compared with.
+
+    Yields:
+        A row of the differences of metrics, and two rows of the fraction of
+        images with the same predicted class as by the first network of the
+        reference: of all images, and of the negatives.
+    """
+    differences = [
+        difference(scores.evaluations, reference.evaluations, ALL, metric) for metric in METRICS
+    ]
+    yield [title, images, "all", *(format_interval(value, "+") for value in differences)]
+    first_predictions = reference.predictions[0]
+    same_class = []
+    same_class_of_negatives = []
+    for predictions in scores.predictions:
+        pairs = list(zip(predictions, first_predictions, strict=True))
+        negatives = [pair for pair in pairs if not pair[1].positive]
+        same_class.append(agreement(pairs))
+        same_class_of_negatives.append(agreement(negatives))
+    yield one_number_row(title, images, "same class", same_class)
+    yield one_number_row(title, images, "same class, other things", same_class_of_negatives)
+
+
+def agreement(pairs: Sequence[tuple[Prediction, Prediction]]) -> float:
+    """Return the fraction of pairs of predictions with the same predicted class."""
+    return fmean(first.predicted == second.predicted for first, second in pairs)
+
+
+def one_number_row(
+    network: str,
+    images: str,
+    group: str,
+    values: Sequence[float],
+) -> list[str]:
+    """Return a row of one number per seed, whose cells after the first are empty.
+
+    Args:
+        network: Text of the column "network".
+        images: Text of the column "images".
+        group: Text of the column "group".
+        values: Number of each seed. Several are shown as mean, lowest and
+            highest.
+    """
+    empty_cells = [""] * (len(METRICS) - 1)
+    return [network, images, group, format_interval(mean_and_range(values)), *empty_cells]
+
+
+def mean_and_range(values: Sequence[float]) -> Estimate:
+    """Return the mean with the lowest and the highest value, or a single value alone."""
+    if len(values) == 1:
+        return Estimate(values[0])
+    return Estimate(fmean(values), min(values), max(values))
+
+
+# ---------------------------------------------------------------------------- command
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["make", "choose", "report"])
-    parser.add_argument("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
-    for option in ("--data", "--sides", "--packages"):
-        parser.add_argument(option, type=Path, required=option == "--sides")
-    parser.add_argument("--size", type=int, default=64, help="of a render, in pixels per side")
-    parser.add_argument("--part", nargs="+", help="these folders alone, as reporting/hdri in make and hdri in report")
-    parser.add_argument("--table", default="", help="of report: the name of the table that the scores are for")
-    arguments = parser.parse_args(argv)
-    if arguments.command == "report" and not arguments.table:
+    """Make the sides, or score networks on one of them.
+
+    Args:
+        argv: Words of the command line. None takes those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("command", choices=["make", "choose", "report"])
+    add("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
+    add("--data", type=Path)
+    add("--sides", type=Path, required=True)
+    add("--packages", type=Path)
+    add("--size", type=int, default=64, help="pixels per side of a render")
+    add(
+        "--part",
+        nargs="+",
+        help="these folders alone, such as reporting/hdri in make and hdri in report",
+    )
+    add("--table", default="", help="report: name of the table that the scores are for")
+    options = parser.parse_args(argv)
+    if options.command == "report" and not options.table:
         parser.error("report takes --table NAME, under which docs/reporting.csv records the look")
-    make(arguments) if arguments.command == "make" else score(arguments)
+    if options.command == "make":
+        make(options)
+    else:
+        score(options)
 
 
 if __name__ == "__main__":

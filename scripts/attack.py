@@ -9,6 +9,12 @@ def list_parameters(words: list[str]) -> list[str]:
     """Write attack=lighting+geometry as attack=[lighting,geometry].
 
     A reloaded adversary is not attacked, unless attack= asks for it.
+
+    Args:
+        words: Words of the command line.
+
+    Returns:
+        Words in which the attack is a list.
     """
     keys = {word.partition("=")[0] for word in words}
     listed = []

@@ -8,15 +8,31 @@ from train.help import HelpText
 
 
 def name_folders(words: list[str]) -> list[str]:
-    """Write folders without a key as runs=[...]."""
-    folders: list[str] = []
-    rest: list[str] = []
-    for word in words:
-        is_setting = word.startswith("-") or not word or ("=" in word and not os.path.exists(word))
-        (rest if is_setting else folders).append(word)
+    """Write folders that are given without a key as runs=[...].
+
+    Args:
+        words: Words of the command line.
+
+    Returns:
+        Settings and options, and then runs=[...] if there are folders.
+    """
+    folders = [word for word in words if names_folder(word)]
+    others = [word for word in words if not names_folder(word)]
     if not folders:
-        return rest
-    return [*rest, f"runs=[{','.join(map(quoted, folders))}]"]
+        return others
+    quoted_folders = ",".join(quoted(folder) for folder in folders)
+    return [*others, f"runs=[{quoted_folders}]"]
+
+
+def names_folder(word: str) -> bool:
+    """Return whether a word of the command line names a folder.
+
+    Other words are options, such as --help, and settings, such as out=page. The
+    path of a folder may contain "=" if the folder exists.
+    """
+    if not word or word.startswith("-"):
+        return False
+    return "=" not in word or os.path.exists(word)
 
 
 main = Command(

@@ -1,14 +1,18 @@
-"""What the paper's benchmarks share: options, networks, meshes, clean-correct views, and JSON lines.
+"""Code that the paper's benchmarks share.
 
-docs/results.md has the commands, which run in the root of the clone. A mesh is a file, solid:NAME:SEED, or a
-YAML mapping such as '{mesh: banana.glb, label: banana, albedo_scale: 2}'.
+These are options, networks, meshes, views that a network classifies correctly
+before an attack ("clean-correct"), and files of JSON lines.
+
+docs/results.md has the commands, which run in the root of the clone. A mesh is a
+file, solid:NAME:SEED, or a YAML mapping such as
+'{mesh: banana.glb, label: banana, albedo_scale: 2}'.
 """
 
 import argparse
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,89 +30,252 @@ from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.visibility.rasterizers import choose
 from train.runs.saved_networks import load_network
 
-VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
-WIDTHS = (2.0, 3.0)  # of the image in world units (the paper's appendix on rendering quality)
+# Meshes whose shape is attacked are subdivided until they have more vertices
+# (the paper's Section 4).
+VERTICES = 10_000
+# Polar angle of all cameras in radians (the paper's appendix C).
+POLAR = math.pi / 3
+# Widths of the image in world units (the paper's appendix "Evaluate Rendering
+# Quality").
+WIDTHS = (2.0, 3.0)
+# Gray values of the backgrounds.
 GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
-BATCH = 10  # examples that are rendered or attacked at once: a shape's gradient keeps all samples of its images
-LEAST_CORRECT = 0.02  # a fraction; below it the search for clean-correct views is given up
-STEPS = {  # the paper's appendix C
+# Number of examples that are rendered or attacked at once. The gradient of a
+# shape keeps all samples of its images, which limits this number.
+BATCH_SIZE = 10
+# The search for clean-correct views stops with an error when a smaller fraction
+# of the drawn views is correct.
+MIN_CORRECT_FRACTION = 0.02
+# Steps of the paper's attacks (its appendix C).
+STEPS = {
     "lighting": StepSettings("linf", None, "unit", 0.05),
     "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
 }
 
-View = tuple[OrthographicCamera, float]  # and the gray of the background
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the background of its image.
+
+    Attributes:
+        camera: The camera.
+        gray: Gray value of the background in [0, 1].
+    """
+
+    camera: OrthographicCamera
+    gray: float
 
 
-def parser(study: str | None, description: str | None) -> argparse.ArgumentParser:
-    """The options of every benchmark. study: the name of its table, None where it is an option."""
-    options = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+@dataclass(frozen=True)
+class Setup:
+    """What a benchmark works on.
+
+    Attributes:
+        options: Parsed command line.
+        classifier: Network that is attacked.
+        subjects: Objects that are rendered.
+    """
+
+    options: argparse.Namespace
+    classifier: Classifier
+    subjects: list[SceneObject]
+
+
+# ---------------------------------------------------------------------------- command line
+
+
+def make_parser(study: str | None, description: str | None) -> argparse.ArgumentParser:
+    """Make a parser with the options that every benchmark of the paper has.
+
+    Args:
+        study: Name of the benchmark's table in `benchmarks.paper.table`. None
+            if the command line has an argument for it.
+        description: Text of --help.
+
+    Returns:
+        The parser.
+    """
+    parser = argparse.ArgumentParser(
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     if study is not None:
-        options.set_defaults(study=study)
-    mesh = "files, solid:NAME:SEED or {mesh, label, albedo_scale}"
-    options.add_argument("--out", type=Path, required=True, help="JSON lines are appended to this file")
-    options.add_argument("--meshes", nargs="+", required=True, help=mesh)
-    options.add_argument("--classifier", default="efficientnet_lite0", help="attacked: NAME[=WEIGHTS] or run:FOLDER")
-    options.add_argument("--seed", type=int, default=0)
-    options.add_argument("--threads", type=int, default=1, help="of the CPU")
-    return options
+        parser.set_defaults(study=study)
+    add = parser.add_argument
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        help="JSON lines are appended to this file",
+    )
+    add(
+        "--meshes",
+        nargs="+",
+        required=True,
+        help="files, solid:NAME:SEED or {mesh, label, albedo_scale}",
+    )
+    add(
+        "--classifier",
+        default="efficientnet_lite0",
+        help="network that is attacked: NAME[=WEIGHTS] or run:FOLDER",
+    )
+    add("--seed", type=int, default=0)
+    add("--threads", type=int, default=1, help="number of threads on the CPU")
+    return parser
 
 
 def prepare(
-    options: argparse.ArgumentParser, argv: Sequence[str] | None, vertices: int = 0
-) -> tuple[argparse.Namespace, Classifier, list[SceneObject]]:
-    """Parse the arguments, load network and meshes, and begin a run in the file of JSON lines.
+    parser: argparse.ArgumentParser,
+    argv: Sequence[str] | None,
+    vertices: int = 0,
+) -> Setup:
+    """Parse the command line, load the network and the meshes, and begin a run in the file.
 
-    vertices: subdivide meshes until they have more.
+    Args:
+        parser: Parser of the benchmark.
+        argv: Words of the command line. None takes those of the process.
+        vertices: Meshes are subdivided until they have more vertices.
+
+    Returns:
+        Options, network and objects.
+
+    Raises:
+        InputError: If the network or a mesh cannot be loaded.
     """
-    arguments = options.parse_args(argv)
-    torch.set_num_threads(arguments.threads)
-    classifier = load_network(*arguments.classifier.split("=", 1))
-    items = [read_item(mesh) for mesh in arguments.meshes]
-    subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
-    begin(arguments)
-    return arguments, classifier, subjects
+    options = parser.parse_args(argv)
+    torch.set_num_threads(options.threads)
+    classifier = load_named_network(options.classifier)
+    subjects = []
+    for mesh in options.meshes:
+        settings = read_mesh(mesh)
+        subject = load_object(settings, vertices)
+        subjects.append(replace(subject, name=Path(settings.mesh).stem))
+    begin_run(options)
+    return Setup(options, classifier, subjects)
 
 
-def read_item(mesh: str) -> ObjectSettings:
-    """A value of --meshes; an orange where it has no label."""
+def load_named_network(name: str) -> Classifier:
+    """Load a network whose name may end in =WEIGHTS, a file of its weights.
+
+    Args:
+        name: NAME, NAME=WEIGHTS or run:FOLDER.
+
+    Returns:
+        The network.
+    """
+    name, _, weights = name.partition("=")
+    return load_network(name, weights or None)
+
+
+def read_mesh(mesh: str) -> ObjectSettings:
+    """Read a value of --meshes, whose label is "orange" by default.
+
+    Args:
+        mesh: Name of a mesh, or a YAML mapping.
+
+    Returns:
+        Settings of the object.
+    """
     given = yaml.safe_load(mesh)
-    return ObjectSettings(**({"label": "orange"} | (given if isinstance(given, dict) else {"mesh": mesh})))
+    if not isinstance(given, dict):
+        given = {"mesh": mesh}
+    return ObjectSettings(**({"label": "orange"} | given))
 
 
-def begin(arguments: argparse.Namespace) -> None:
-    """Append the line that begins a run: its settings, and the machine."""
-    settings = {name: value for name, value in vars(arguments).items() if name != "out"}
-    append(arguments.out, {"run": settings | {"machine": machine()}})
+# ---------------------------------------------------------------------------- JSON lines
+
+
+def begin_run(options: argparse.Namespace) -> None:
+    """Append the line that begins a run to the file: its settings, and the machine.
+
+    Args:
+        options: Parsed command line.
+    """
+    settings = {name: value for name, value in vars(options).items() if name != "out"}
+    append(options.out, {"run": settings | {"machine": machine()}})
 
 
 def append(path: Path, row: Mapping[str, Any]) -> None:
-    """One line of JSON at the end of a file."""
+    """Append a line of JSON to a file.
+
+    Args:
+        path: File, which is created if it is missing.
+        row: Content of the line.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
 
 def last_run(path: Path) -> tuple[Row, list[Row]]:
-    """(settings, records) of the last run in a file of JSON lines."""
+    """Read the last run in a file of JSON lines.
+
+    Args:
+        path: File that `begin_run` and `append` wrote.
+
+    Returns:
+        Settings of the run, and its records.
+    """
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    last = max(index for index, row in enumerate(rows) if "run" in row)
-    return rows[last]["run"], rows[last + 1 :]
+    begin = max(index for index, row in enumerate(rows) if "run" in row)
+    return rows[begin]["run"], rows[begin + 1 :]
 
 
-def attack_settings(kind: str, max_steps: int = 30, step: StepSettings | None = None, **more: Any) -> AttackSettings:
-    """The paper's attack (its appendix C): any light, an end where the network errs. step: another than the paper's."""
-    settings = {kind: step or STEPS[kind], "max_steps": max_steps, "allow_negative": True, "margin": 0.0}
-    shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
-    as_they_are = {"rounded": False, "sensor_noise": 0.0}
-    return AttackSettings(**{**settings, **as_they_are, "shorten": shorten, **more})
+# ---------------------------------------------------------------------------- attacks and views
 
 
-def scene_of(subject: SceneObject, size: int, views: Sequence[View]) -> Scene:
-    """An example per view, under the light where attacks begin."""
+def attack_settings(
+    kind: str,
+    max_steps: int = 30,
+    step: StepSettings | None = None,
+    **overrides: Any,
+) -> AttackSettings:
+    """Return the settings of the paper's attack (its appendix C).
+
+    Any light is allowed, and an attack ends when the network misclassifies.
+
+    Args:
+        kind: Attacked parameter, such as "lighting".
+        max_steps: Largest number of steps.
+        step: Settings of the steps. None takes those of the paper.
+        **overrides: Further fields of `AttackSettings`.
+
+    Returns:
+        The settings.
+    """
+    # The gradient of a shape holds visibility fixed, so that a whole step may
+    # raise the cost.
+    is_backtracking = kind == "geometry"
+    settings: dict[str, Any] = {
+        kind: step or STEPS[kind],
+        "max_steps": max_steps,
+        "allow_negative": True,
+        "margin": 0.0,
+        "rounded": False,
+        "sensor_noise": 0.0,
+        "shorten": is_backtracking,
+    }
+    return AttackSettings(**(settings | overrides))
+
+
+def make_scene(subject: SceneObject, size: int, views: Sequence[View]) -> Scene:
+    """Make a scene of one object under the light at which attacks start.
+
+    Args:
+        subject: Object to render.
+        size: Pixels per side of the images.
+        views: View of each example.
+
+    Returns:
+        Scene with an example for each view.
+    """
+    examples = [Example(0, (view.camera,), index) for index, view in enumerate(views)]
+    grays = torch.tensor([view.gray for view in views])
+    backgrounds = grays.view(-1, 1, 1, 1).expand(-1, 3, size, size)
     return Scene(
         [subject],
-        [Example(0, (camera,), index) for index, (camera, _) in enumerate(views)],
-        torch.tensor([gray for _, gray in views]).view(-1, 1, 1, 1).expand(-1, 3, size, size),
+        examples,
+        backgrounds,
         load_light("grace"),
         ImageSettings(size, samples=2, normals="smooth"),
         choose(),
@@ -116,42 +283,100 @@ def scene_of(subject: SceneObject, size: int, views: Sequence[View]) -> Scene:
 
 
 def random_views(count: int, draws: torch.Generator) -> list[View]:
-    """Views from π/3 off the zenith (the paper's) and any azimuth, of width 2 or 3, on a gray."""
+    """Draw views with random azimuths, widths and grays, at the paper's polar angle.
+
+    Args:
+        count: Number of views.
+        draws: Generator of the random numbers.
+
+    Returns:
+        The views.
+    """
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
     widths = torch.randint(len(WIDTHS), (count,), generator=draws).tolist()
     grays = torch.randint(len(GRAYS), (count,), generator=draws).tolist()
-    return [
-        (OrthographicCamera(math.pi / 3, azimuth, WIDTHS[width]), GRAYS[gray])
-        for azimuth, width, gray in zip(azimuths, widths, grays, strict=True)
-    ]
+    views = []
+    for azimuth, width, gray in zip(azimuths, widths, grays, strict=True):
+        camera = OrthographicCamera(POLAR, azimuth, WIDTHS[width])
+        views.append(View(camera, GRAYS[gray]))
+    return views
 
 
-def clean_correct_views(subject: SceneObject, classifier: Classifier, count: int, draws: torch.Generator) -> list[View]:
-    """As many random views that the classifier gets right. InputError: hardly any is."""
+def clean_correct_views(
+    subject: SceneObject,
+    classifier: Classifier,
+    count: int,
+    draws: torch.Generator,
+) -> list[View]:
+    """Draw random views until the classifier is correct in enough of them.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier of the images.
+        count: Number of views to return.
+        draws: Generator of the random numbers.
+
+    Returns:
+        Views that are classified correctly.
+
+    Raises:
+        InputError: If hardly any view is classified correctly.
+    """
     correct: list[View] = []
-    drawn = 0
+    drawn_count = 0
     while len(correct) < count:
-        views = random_views(BATCH, draws)
-        predicted = predictions(classifier, images_of(scene_of(subject, classifier.size, views)))
-        correct += [view for view, name in zip(views, predicted, strict=True) if name == subject.label]
-        drawn += len(views)
-        if len(correct) < LEAST_CORRECT * drawn - BATCH:
-            raise InputError(f"{classifier.name} gets only {len(correct)} of {drawn} images of {subject.name} right")
+        views = random_views(BATCH_SIZE, draws)
+        images = render_all(make_scene(subject, classifier.size, views))
+        predicted = predict(classifier, images)
+        for view, name in zip(views, predicted, strict=True):
+            if name == subject.label:
+                correct.append(view)
+        drawn_count += len(views)
+        # The first batch may have no correct view.
+        if len(correct) < MIN_CORRECT_FRACTION * drawn_count - BATCH_SIZE:
+            images_text = f"{len(correct)} of {drawn_count} images of {subject.name}"
+            raise InputError(
+                f"{classifier.name} classifies only {images_text} correctly. "
+                "Choose another mesh, label or classifier."
+            )
     return correct[:count]
 
 
 def batches(views: Sequence[View]) -> Iterator[Sequence[View]]:
-    for first in range(0, len(views), BATCH):
-        yield views[first : first + BATCH]
+    """Divide views into batches of at most BATCH_SIZE.
+
+    Args:
+        views: Views to divide.
+
+    Yields:
+        The views of a batch.
+    """
+    for first in range(0, len(views), BATCH_SIZE):
+        yield views[first : first + BATCH_SIZE]
 
 
 @torch.no_grad()
-def images_of(scene: Scene) -> Tensor:
-    """(E, 1, 3, size, size) of all examples under the scene's own light."""
+def render_all(scene: Scene) -> Tensor:
+    """Render all E examples under the scene's own light, shape (E, 1, 3, size, size).
+
+    Args:
+        scene: Scene with one view per example.
+    """
     examples = torch.arange(len(scene))
     return scene.render(scene.conditions(examples), examples)
 
 
-def predictions(classifier: Classifier, images: Tensor) -> list[str]:
-    """The predicted class of the one view of each of E examples (E, 1, 3, size, size)."""
-    return [classifier.classes[index] for index in logits_of(classifier, images, BATCH)[:, 0].argmax(1).tolist()]
+def predict(classifier: Classifier, images: Tensor) -> list[str]:
+    """Predict the class of each of E examples.
+
+    Args:
+        classifier: Classifier of the images.
+        images: Image of the only view of each example, shape
+            (E, 1, 3, size, size).
+
+    Returns:
+        Names of the predicted classes.
+    """
+    logits = logits_of(classifier, images, BATCH_SIZE)
+    best = logits[:, 0].argmax(1).tolist()
+    return [classifier.classes[index] for index in best]

@@ -1,6 +1,8 @@
-"""How surely a classifier recognizes the renders (the paper's appendix "Evaluate Rendering Quality").
+"""Measure how confidently a classifier recognizes the renders.
 
-Cameras are random, and each sees the mesh on five grays. Intervals resample cameras, whose renders resemble each other.
+This is the paper's appendix "Evaluate Rendering Quality". Cameras are random, and
+each sees the mesh before five grays. Intervals resample cameras, because the
+renders of a camera resemble each other.
 """
 
 import math
@@ -17,50 +19,138 @@ from benchmarks.common import Row
 from benchmarks.paper import common
 from renderer import InputError, OrthographicCamera
 
+# Number of bootstrap resamples.
 RESAMPLES = 1000
-STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {  # of confidences (cameras, grays), NaN where it errs
-    "clean-correct": lambda views: float(np.isfinite(views).mean()),
-    "median confidence": lambda views: float(np.nanmedian(views)),
+# Statistics of confidences, shape (cameras, grays), with NaN for renders that
+# are misclassified.
+STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {
+    "clean-correct": lambda confidences: float(np.isfinite(confidences).mean()),
+    "median confidence": lambda confidences: float(np.nanmedian(confidences)),
 }
 
 
-def confidences(subject: SceneObject, classifier: Classifier, renders: int, seed: int) -> np.ndarray:
-    """(cameras, grays) with so many clean-correct renders: the confidence in the label, NaN where another class is
-    predicted. InputError: hardly any is clean-correct."""
-    draws, label = generator(seed, subject.name, "quality"), classifier.label(subject.label)
+def measure_confidences(
+    subject: SceneObject,
+    classifier: Classifier,
+    renders: int,
+    seed: int,
+) -> np.ndarray:
+    """Render an object from random cameras until enough renders are classified correctly.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier of the renders.
+        renders: Number of renders that must be classified correctly.
+        seed: Seed of the cameras.
+
+    Returns:
+        Confidence in the label, shape (cameras, grays). A render that is
+        misclassified has NaN.
+
+    Raises:
+        InputError: If hardly any render is classified correctly.
+    """
+    draws = generator(seed, subject.name, "quality")
     rows: list[np.ndarray] = []
-    while (correct := int(np.isfinite(rows).sum())) < renders:
-        made = len(rows) * len(common.GRAYS)
-        if made > max(100, renders) / common.LEAST_CORRECT:
-            raise InputError(f"{subject.name}: only {correct} of {made} renders are clean-correct")
+    correct_count = 0
+    while correct_count < renders:
+        made_count = len(rows) * len(common.GRAYS)
+        if made_count > max(100, renders) / common.MIN_CORRECT_FRACTION:
+            counts = f"{correct_count} of {made_count} renders of {subject.name}"
+            raise InputError(
+                f"{classifier.name} classifies only {counts} correctly. "
+                "Choose another mesh, label or classifier."
+            )
         azimuth = 2 * math.pi * float(torch.rand((), generator=draws))
-        camera = OrthographicCamera(math.pi / 3, azimuth, common.WIDTHS[len(rows) % len(common.WIDTHS)])
-        scene = common.scene_of(subject, classifier.size, [(camera, gray) for gray in common.GRAYS])
-        probabilities = logits_of(classifier, common.images_of(scene), len(common.GRAYS))[:, 0].softmax(1)
-        confidence = torch.where(probabilities.argmax(1) == label, probabilities[:, label], torch.nan)
-        rows.append(confidence.double().numpy())
+        width = common.WIDTHS[len(rows) % len(common.WIDTHS)]
+        camera = OrthographicCamera(common.POLAR, azimuth, width)
+        rows.append(confidences_of_camera(subject, classifier, camera))
+        correct_count += int(np.isfinite(rows[-1]).sum())
     return np.stack(rows)
 
 
-def summary(views: np.ndarray, seed: int) -> Row:
-    """Counts, and each statistic with its 95 % bootstrap interval over cameras."""
+def confidences_of_camera(
+    subject: SceneObject,
+    classifier: Classifier,
+    camera: OrthographicCamera,
+) -> np.ndarray:
+    """Render an object before each gray, and measure the confidence in the label.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier of the renders.
+        camera: Camera of all renders.
+
+    Returns:
+        Confidence for each gray, shape (grays,). A render that is misclassified
+        has NaN.
+    """
+    views = [common.View(camera, gray) for gray in common.GRAYS]
+    scene = common.make_scene(subject, classifier.size, views)
+    logits = logits_of(classifier, common.render_all(scene), len(views))
+    probabilities = logits[:, 0].softmax(1)
+    label = classifier.label(subject.label)
+    is_correct = probabilities.argmax(1) == label
+    confidences = torch.where(is_correct, probabilities[:, label], torch.nan)
+    return confidences.double().numpy()
+
+
+def summarize(confidences: np.ndarray, seed: int) -> Row:
+    """Compute each statistic with its 95% bootstrap interval over cameras.
+
+    Args:
+        confidences: Confidence in the label, shape (cameras, grays), with NaN
+            for renders that are misclassified.
+        seed: Seed of the resamples.
+
+    Returns:
+        Numbers of cameras and renders, and for each statistic its value and
+        the ends of its interval.
+    """
     draws = np.random.default_rng(seed)
-    resampled = [views[draws.integers(len(views), size=len(views))] for _ in range(RESAMPLES)]
-    row: Row = {"cameras": len(views), "rendered": views.size}
+    camera_count = len(confidences)
+    resamples = []
+    for _ in range(RESAMPLES):
+        cameras = draws.integers(camera_count, size=camera_count)
+        resamples.append(confidences[cameras])
+    row: Row = {"cameras": camera_count, "rendered": confidences.size}
     for name, statistic in STATISTICS.items():
-        interval = np.quantile([statistic(sample) for sample in resampled], [0.025, 0.975])
-        row[name] = [statistic(views), *interval.tolist()]
+        values = [statistic(resample) for resample in resamples]
+        low, high = np.quantile(values, [0.025, 0.975]).tolist()
+        row[name] = [statistic(confidences), low, high]
     return row
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    options = common.parser("rendering_quality", __doc__)
-    options.add_argument("--renders", type=int, default=10_000, help="clean-correct ones, of all meshes together")
-    args, classifier, subjects = common.prepare(options, argv)
-    count = -(-args.renders // len(subjects))
-    views = {subject.name: confidences(subject, classifier, count, args.seed) for subject in subjects}
-    for name, values in {**views, "all": np.concatenate(list(views.values()))}.items():
-        common.append(args.out, {"mesh": name, **summary(values, args.seed)})
+    """Measure the confidence in renders of each mesh, and append a record for each.
+
+    The last record is of the renders of all meshes together.
+
+    Args:
+        argv: Words of the command line. None takes those of the process.
+    """
+    parser = common.make_parser("rendering_quality", __doc__)
+    parser.add_argument(
+        "--renders",
+        type=int,
+        default=10_000,
+        help="number of clean-correct renders of all meshes together",
+    )
+    setup = common.prepare(parser, argv)
+    options = setup.options
+    renders_per_mesh = math.ceil(options.renders / len(setup.subjects))
+    confidences = {
+        subject.name: measure_confidences(
+            subject,
+            setup.classifier,
+            renders_per_mesh,
+            options.seed,
+        )
+        for subject in setup.subjects
+    }
+    confidences["all"] = np.concatenate(list(confidences.values()))
+    for name, values in confidences.items():
+        common.append(options.out, {"mesh": name, **summarize(values, options.seed)})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""How long an attack on the light takes until it succeeds (the paper's Section 4.2, "Runtime").
+"""Measure how long an attack on the light takes until it succeeds.
 
-Times are of the processor, which leaves out other processes, and hold what is precomputed of the view.
+This is the paper's Section 4.2, "Runtime". Times are those of the process, which
+leave out other processes. They include what is precomputed of the view.
 """
 
 import time
@@ -8,26 +9,69 @@ from collections.abc import Sequence
 
 import torch
 
+from augment import AttackSettings, Classifier
 from augment.attacks.descent import Goal, descend
 from augment.attacks.problem import build_problem
 from augment.random_streams import generator
+from augment.scene.objects import SceneObject
+from benchmarks.common import Row
 from benchmarks.paper import common
 
 
+def measure_attack(
+    subject: SceneObject,
+    classifier: Classifier,
+    view: common.View,
+    settings: AttackSettings,
+) -> Row:
+    """Attack a view, and measure the seconds.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier to attack.
+        view: View that is classified correctly before.
+        settings: Settings of the attack.
+
+    Returns:
+        Record of the attack.
+    """
+    scene = common.make_scene(subject, classifier.size, [view])
+    goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
+    start = time.process_time()
+    problem = build_problem(settings, scene)
+    result = descend(classifier, problem, goal, settings)
+    seconds = time.process_time() - start
+    return {
+        "mesh": subject.name,
+        "success": bool(result.success[0]),
+        "steps": int(result.steps[0]),
+        "seconds": seconds,
+    }
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    options = common.parser("run_time", __doc__)
-    options.add_argument("--examples", type=int, default=20, help="of each mesh")
-    options.add_argument("--steps", type=int, default=30, help="of an attack at most (the paper's appendix C)")
-    args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
-    settings = common.attack_settings("lighting", args.steps)
-    for subject in subjects:
-        draws, goal = generator(args.seed, subject.name), Goal(torch.tensor([[classifier.label(subject.label)]]))
-        for view in common.clean_correct_views(subject, classifier, args.examples, draws):
-            scene = common.scene_of(subject, classifier.size, [view])
-            start = time.process_time()
-            result = descend(classifier, build_problem(settings, scene), goal, settings)
-            row = {"success": bool(result.success[0]), "steps": int(result.steps[0])}
-            common.append(args.out, {"mesh": subject.name, **row, "seconds": time.process_time() - start})
+    """Attack views of each mesh, and append a record for each.
+
+    Args:
+        argv: Words of the command line. None takes those of the process.
+    """
+    parser = common.make_parser("run_time", __doc__)
+    parser.add_argument("--examples", type=int, default=20, help="number of views of each mesh")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=30,
+        help="largest number of steps of an attack (the paper's appendix C)",
+    )
+    setup = common.prepare(parser, argv, common.VERTICES)
+    options = setup.options
+    settings = common.attack_settings("lighting", options.steps)
+    for subject in setup.subjects:
+        draws = generator(options.seed, subject.name)
+        views = common.clean_correct_views(subject, setup.classifier, options.examples, draws)
+        for view in views:
+            record = measure_attack(subject, setup.classifier, view, settings)
+            common.append(options.out, record)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,20 @@
-"""Markdown tables of what the paper's benchmarks measured: the last run in a file of JSON lines.
+"""Print Markdown tables of the last run in a file that a benchmark of the paper wrote.
 
 python -m benchmarks.paper.table docs/paper/norm_balls.jsonl --figure norm_balls.png
 
-Brackets hold 95 % intervals: Wilson's, and of views, which share lights, a bootstrap over those of each mesh. A figure
-is drawn of norm_balls alone.
+Brackets hold 95% intervals. Those of counts are Wilson's. Those of views are from
+a bootstrap over the lights of each mesh, because the views share lights. A
+figure is drawn of norm_balls alone.
 """
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import bootstrap
 
@@ -19,150 +22,350 @@ from benchmarks.common import Row
 from benchmarks.paper.common import last_run
 from train.evaluation import tables
 
-Rows = Sequence[Row]
-Table = Iterator[Sequence[object]]  # the header first
-
-
-def fraction(outcomes: Iterable[bool]) -> str:
-    outcomes = list(outcomes)
-    return percentages(sum(outcomes), len(outcomes))
-
-
-def percentages(hits: int, n: int) -> str:
-    if n == 0:
-        return "none of 0"
-    rate = tables.fraction(hits, n)
-    return f"{100 * rate.value:.0f} % [{100 * rate.low:.0f}, {100 * rate.high:.0f}] of {n}"
-
-
-def groups(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows by their values under some names."""
-    result: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        result.setdefault(tuple(row.get(name) for name in names), []).append(row)
-    return result
-
-
-COUNTS = {"adversarial": "adversarial", "random": "one random draw", "search": "any of the draws"}
-COUNTS |= {"clipped": "adversarial, negative radiance left out"}
-
-
-def norm_balls(rows: Rows) -> Table:
-    yield ["space", "radius", *COUNTS.values()]
-    for ball in pooled(rows):
-        cells = [percentages(ball[name], ball["n"]) if name in ball else None for name in COUNTS]
-        yield [ball["space"], ball["radius"] or "none", *cells]
-
-
-def pooled(rows: Rows) -> Rows:
-    """A row per space and radius, with the sums of counts over all meshes."""
-    return [
-        group[0] | {name: sum(row[name] for row in group) for name in ("n", *COUNTS) if name in group[0]}
-        for group in groups(rows, "space", "radius").values()
-    ]
-
-
-def networks(rows: Rows) -> Table:
-    states = {"first": "as found", "first_random": "random, as large"}
-    states |= {"further": "10 steps on", "further_random": "random, as large"}
-    yield ["attack", "network", *states.values()]
-    for (kind,), group in groups(rows, "kind").items():
-        for name in group[0]["predictions"]:
-            yield [kind, name, *(fraction(transferred(group, name, state)) for state in states)]
-
-
-def transferred(group: Rows, network: str, state: str) -> Iterator[bool]:
-    """Whether a network errs where it was right before: the attacked one, whose predictions come first, or another by
-    what succeeds against the attacked one at that strength."""
-    for row in group:
-        source, predicted, label = next(iter(row["predictions"])), row["predictions"][network], row["label"]
-        by_source = row["predictions"][source][state.removesuffix("_random")]
-        for before, after, attacked in zip(predicted["before"], predicted[state], by_source, strict=True):
-            if before == label and (network == source or attacked != label):
-                yield after != label
-
-
-def views(rows: Rows) -> Table:
-    states = {"first": "as found", "further": "10 steps on", "random": "random, as large"}
-    yield ["attack", "views attacked", *states.values()]
-    for (kind, count), group in groups(rows, "kind", "attacked").items():
-        yield [kind, count, *(by_set(group, state) for state in states)]
-
-
-def by_set(group: Rows, state: str) -> str:
-    """The fraction of views that fail, of lights that were found on several sets of views of each mesh."""
-    meshes = [
-        [np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets]
-        for sets in groups(group, "mesh").values()
-    ]
-    low, high = bootstrap(meshes, pooled_mean, method="percentile", rng=0).confidence_interval
-    return f"{100 * pooled_mean(*meshes):.0f} % [{100 * low:.0f}, {100 * high:.0f}] of {len(meshes)} × {len(meshes[0])}"
-
-
-def pooled_mean(*samples: Sequence[float], axis: int = -1) -> np.ndarray:
-    return np.mean([np.mean(sample, axis=axis) for sample in samples], axis=0)
-
-
-def run_time(rows: Rows) -> Table:
-    steps, times = ([row[name] for row in rows if row["success"]] or [np.nan] for name in ("steps", "seconds"))
-    yield ["success", "median of these; 90 % quantile", "of these in fewer than 10 steps"]
-    medians = f"{np.median(steps):.0f} steps, {np.median(times):.2f} s; 90 % within {np.quantile(times, 0.9):.2f} s"
-    yield [fraction(row["success"] for row in rows), medians, fraction(number < 10 for number in steps)]
-
-
-def rendering_quality(rows: Rows) -> Table:
-    statistics = [name for name, value in rows[0].items() if isinstance(value, list)]
-    yield ["mesh", "cameras", "renders", *statistics]
-    for row in rows:
-        cells = ("{:.3f} [{:.3f}, {:.3f}]".format(*row[name]) for name in statistics)
-        yield [row["mesh"], row["cameras"], row["rendered"], *cells]
-
-
-def survival(rows: Rows) -> Table:
-    versions = list(dict.fromkeys(name for row in rows for name in row.get("versions", {})))
-    yield ["attack", "refused", "success", *versions]
-    for (attack,), group in groups(rows, "attack").items():
-        made = [row for row in group if "versions" in row]
-        successes = [row["versions"] for row in made if row["success"]]
-        cells = [fraction(row[name]["success"] for row in successes) for name in versions]
-        yield [attack, len(group) - len(made), fraction(row["success"] for row in made), *cells]
-
-
-TABLES: dict[str, Callable[[Rows], Table]] = {
-    function.__name__: function for function in (norm_balls, networks, views, run_time, rendering_quality, survival)
+# Titles of the columns of norm_balls, by the counts in its records.
+COUNTS = {
+    "adversarial": "adversarial",
+    "random": "one random draw",
+    "search": "any of the draws",
+    "clipped": "adversarial, negative radiance left out",
+}
+# Titles of the columns of networks, by the states in its records.
+NETWORK_STATES = {
+    "first": "as found",
+    "first_random": "random, as large",
+    "further": "10 steps on",
+    "further_random": "random, as large",
+}
+# Titles of the columns of views, by the states in its records.
+VIEW_STATES = {
+    "first": "as found",
+    "further": "10 steps on",
+    "random": "random, as large",
 }
 
 
-def draw_norm_balls(rows: Rows, path: Path) -> None:
-    """Success against the radius with intervals, a set of axes per space."""
-    spaces = groups((ball for ball in pooled(rows) if ball["radius"]), "space")
+@dataclass(frozen=True)
+class Cells:
+    """Cells of a table.
+
+    Attributes:
+        header: Titles of the columns.
+        rows: Cells of each row.
+    """
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+
+# ---------------------------------------------------------------------------- cells
+
+
+def format_rate(outcomes: Iterable[bool]) -> str:
+    """Write the fraction of outcomes that are true, as `format_counts` does."""
+    outcomes = list(outcomes)
+    return format_counts(sum(outcomes), len(outcomes))
+
+
+def format_counts(hits: int, n: int) -> str:
+    """Write a fraction as text, such as "89 % [81, 94] of 100".
+
+    Args:
+        hits: Number of outcomes that are true.
+        n: Number of all outcomes.
+
+    Returns:
+        Percentage with its Wilson interval and the number of outcomes.
+    """
+    if n == 0:
+        return "none of 0"
+    rate = tables.fraction(hits, n)
+    return f"{format_percentages(rate.value, rate.low, rate.high)} of {n}"
+
+
+def format_percentages(value: float, low: float, high: float) -> str:
+    """Write a fraction and the ends of its interval in percent."""
+    return f"{100 * value:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def group_by(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Group rows by their values in some columns.
+
+    Args:
+        rows: Rows to group.
+        *names: Names of the columns.
+
+    Returns:
+        Rows by the tuple of their values, in order of first appearance. A row
+        that lacks a column has the value None.
+    """
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        key = tuple(row.get(name) for name in names)
+        groups.setdefault(key, []).append(row)
+    return groups
+
+
+# ---------------------------------------------------------------------------- tables
+
+
+def norm_balls(records: Sequence[Row]) -> Cells:
+    """Make the table of successes in norm-balls.
+
+    Args:
+        records: Records of `benchmarks.paper.norm_balls`.
+    """
+    rows = []
+    for ball in pool_meshes(records):
+        cells = [format_counts(ball[name], ball["n"]) if name in ball else None for name in COUNTS]
+        rows.append([ball["space"], ball["radius"] or "none", *cells])
+    return Cells(["space", "radius", *COUNTS.values()], rows)
+
+
+def pool_meshes(records: Sequence[Row]) -> list[Row]:
+    """Sum the counts of all meshes for each space and radius.
+
+    Args:
+        records: Records of `benchmarks.paper.norm_balls`.
+
+    Returns:
+        A row for each space and radius.
+    """
+    pooled = []
+    for group in group_by(records, "space", "radius").values():
+        first = group[0]
+        sums = {name: sum(row[name] for row in group) for name in ("n", *COUNTS) if name in first}
+        pooled.append(first | sums)
+    return pooled
+
+
+def networks(records: Sequence[Row]) -> Cells:
+    """Make the table of successes against other networks.
+
+    Args:
+        records: Records of `benchmarks.paper.transfer networks`.
+    """
+    rows = []
+    for (kind,), group in group_by(records, "kind").items():
+        for network in group[0]["predictions"]:
+            cells = [
+                format_rate(transfer_outcomes(group, network, state)) for state in NETWORK_STATES
+            ]
+            rows.append([kind, network, *cells])
+    return Cells(["attack", "network", *NETWORK_STATES.values()], rows)
+
+
+def transfer_outcomes(group: Sequence[Row], network: str, state: str) -> Iterator[bool]:
+    """Check whether a network misclassifies images that it classified correctly before.
+
+    The first network of a record was attacked. For another network, images
+    count only if the attack deceived the attacked network. A random state
+    counts the images that the attack of the same strength deceived.
+
+    Args:
+        group: Records of one kind of attack.
+        network: Name of the network.
+        state: Key of NETWORK_STATES.
+
+    Yields:
+        Whether the network misclassifies an image.
+    """
+    attacked_state = state.removesuffix("_random")
+    for row in group:
+        label = row["label"]
+        attacked_network = next(iter(row["predictions"]))
+        predicted = row["predictions"][network]
+        by_attacked_network = row["predictions"][attacked_network][attacked_state]
+        images = zip(predicted["before"], predicted[state], by_attacked_network, strict=True)
+        for before, after, of_attacked_network in images:
+            is_deceived = network == attacked_network or of_attacked_network != label
+            if before == label and is_deceived:
+                yield after != label
+
+
+def views(records: Sequence[Row]) -> Cells:
+    """Make the table of successes in views that were not attacked.
+
+    Args:
+        records: Records of `benchmarks.paper.transfer views`.
+    """
+    rows = []
+    for (kind, attacked), group in group_by(records, "kind", "attacked").items():
+        cells = [format_failures(group, state) for state in VIEW_STATES]
+        rows.append([kind, attacked, *cells])
+    return Cells(["attack", "views attacked", *VIEW_STATES.values()], rows)
+
+
+def format_failures(group: Sequence[Row], state: str) -> str:
+    """Write the fraction of views that are misclassified, with its bootstrap interval.
+
+    The bootstrap resamples the sets of views of each mesh, because the views of
+    a set share a light.
+
+    Args:
+        group: Records of one kind of attack and one number of attacked views.
+        state: Key of VIEW_STATES.
+
+    Returns:
+        Text such as "27 % [21, 34] of 2 × 10" for 2 meshes with 10 sets each.
+    """
+    failures_of_meshes = []
+    for sets in group_by(group, "mesh").values():
+        failures = [
+            np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets
+        ]
+        failures_of_meshes.append(failures)
+    interval = bootstrap(
+        failures_of_meshes,
+        mean_of_means,
+        method="percentile",
+        rng=0,
+    ).confidence_interval
+    value = mean_of_means(*failures_of_meshes)
+    percentages = format_percentages(value, interval.low, interval.high)
+    return f"{percentages} of {len(failures_of_meshes)} × {len(failures_of_meshes[0])}"
+
+
+def mean_of_means(*samples: Sequence[float], axis: int = -1) -> np.ndarray:
+    """Return the mean of the means of samples.
+
+    Args:
+        *samples: Samples. A bootstrap gives them a first axis of replicates.
+        axis: Axis of the values in each sample.
+    """
+    means = [np.mean(sample, axis=axis) for sample in samples]
+    return np.mean(means, axis=0)
+
+
+def run_time(records: Sequence[Row]) -> Cells:
+    """Make the table of the steps and seconds of successful attacks.
+
+    Args:
+        records: Records of `benchmarks.paper.run_time`.
+    """
+    successes = [row for row in records if row["success"]]
+    # Without successes, the table has NaN.
+    steps = [row["steps"] for row in successes] or [np.nan]
+    seconds = [row["seconds"] for row in successes] or [np.nan]
+    medians = f"{np.median(steps):.0f} steps, {np.median(seconds):.2f} s"
+    quantile = f"90 % within {np.quantile(seconds, 0.9):.2f} s"
+    header = ["success", "median of these; 90 % quantile", "of these in fewer than 10 steps"]
+    row = [
+        format_rate(row["success"] for row in records),
+        f"{medians}; {quantile}",
+        format_rate(number < 10 for number in steps),
+    ]
+    return Cells(header, [row])
+
+
+def rendering_quality(records: Sequence[Row]) -> Cells:
+    """Make the table of the statistics of renders.
+
+    Args:
+        records: Records of `benchmarks.paper.rendering_quality`.
+    """
+    statistics = [name for name, value in records[0].items() if isinstance(value, list)]
+    rows = []
+    for record in records:
+        cells = ["{:.3f} [{:.3f}, {:.3f}]".format(*record[name]) for name in statistics]
+        rows.append([record["mesh"], record["cameras"], record["rendered"], *cells])
+    return Cells(["mesh", "cameras", "renders", *statistics], rows)
+
+
+def survival(records: Sequence[Row]) -> Cells:
+    """Make the table of adversaries that survive conversions.
+
+    Args:
+        records: Records of `benchmarks.paper.survival`.
+    """
+    versions: dict[str, None] = {}
+    for record in records:
+        versions |= dict.fromkeys(record.get("versions", {}))
+    rows = []
+    for (attack,), group in group_by(records, "attack").items():
+        attacked = [record for record in group if "versions" in record]
+        successes = [record["versions"] for record in attacked if record["success"]]
+        cells = [
+            format_rate(success[version]["success"] for success in successes)
+            for version in versions
+        ]
+        refused = len(group) - len(attacked)
+        rows.append(
+            [attack, refused, format_rate(record["success"] for record in attacked), *cells]
+        )
+    return Cells(["attack", "refused", "success", *versions], rows)
+
+
+TABLES: dict[str, Callable[[Sequence[Row]], Cells]] = {
+    "norm_balls": norm_balls,
+    "networks": networks,
+    "views": views,
+    "run_time": run_time,
+    "rendering_quality": rendering_quality,
+    "survival": survival,
+}
+
+
+# ---------------------------------------------------------------------------- figure
+
+
+def draw_norm_balls(records: Sequence[Row], path: Path) -> None:
+    """Draw the success in norm-balls against the radius, with axes for each space.
+
+    Args:
+        records: Records of `benchmarks.paper.norm_balls`.
+        path: File to write.
+    """
+    balls_with_radius = [ball for ball in pool_meshes(records) if ball["radius"]]
+    spaces = group_by(balls_with_radius, "space")
     figure = Figure(figsize=(3.7 * len(spaces), 3.4), layout="tight")
-    axes = figure.subplots(1, len(spaces), squeeze=False)[0]
-    for ax, ((space,), balls) in zip(axes, spaces.items(), strict=True):
-        for method in ("adversarial", "random", "search"):
-            results = [tables.fraction(ball[method], ball["n"]) for ball in balls]
-            value = np.array([result.value for result in results])
-            low = np.array([result.low for result in results])
-            high = np.array([result.high for result in results])
-            error = np.maximum([value - low, high - value], 0)  # below 0 by rounding alone
-            ax.errorbar([ball["radius"] for ball in balls], value, error, label=method, marker="o", capsize=3)
-        ax.set(title=space, xscale="log", xlabel="L∞ radius", ylabel="success", ylim=(-0.03, 1.03))
-    axes[0].legend(fontsize=8)
+    all_axes = figure.subplots(1, len(spaces), squeeze=False)[0]
+    for axes, ((space,), balls) in zip(all_axes, spaces.items(), strict=True):
+        draw_space(axes, space, balls)
+    all_axes[0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
 
 
+def draw_space(axes: Axes, space: str, balls: Sequence[Row]) -> None:
+    """Draw the fraction of successes in the balls of a space with Wilson intervals."""
+    radii = [ball["radius"] for ball in balls]
+    for method in ("adversarial", "random", "search"):
+        rates = [tables.fraction(ball[method], ball["n"]) for ball in balls]
+        values = np.array([rate.value for rate in rates])
+        lows = np.array([rate.low for rate in rates])
+        highs = np.array([rate.high for rate in rates])
+        # Rounding alone can make a length negative.
+        lengths = np.maximum([values - lows, highs - values], 0)
+        axes.errorbar(radii, values, lengths, label=method, marker="o", capsize=3)
+    axes.set(
+        title=space,
+        xscale="log",
+        xlabel="L∞ radius",
+        ylabel="success",
+        ylim=(-0.03, 1.03),
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("records", type=Path, help="file of JSON lines")
-    options.add_argument("--figure", type=Path, help="also draw norm_balls here")
-    args = options.parse_args(argv)
-    settings, rows = last_run(args.records)
-    if args.figure is not None and settings["study"] != "norm_balls":
-        options.error(f"--figure draws norm_balls, and {args.records} holds {settings['study']}")
-    header, *cells = TABLES[settings["study"]](rows)
-    print(tables.Table("", header, cells))
-    if args.figure is not None:
-        draw_norm_balls(rows, args.figure)
+    """Print the table of a file of records, and draw its figure if asked to.
+
+    Args:
+        argv: Words of the command line. None takes those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("records", type=Path, help="file of JSON lines")
+    parser.add_argument("--figure", type=Path, help="also draw norm_balls here")
+    options = parser.parse_args(argv)
+    settings, records = last_run(options.records)
+    study = settings["study"]
+    if options.figure is not None and study != "norm_balls":
+        parser.error(f"--figure draws norm_balls, and {options.records} holds {study}")
+    cells = TABLES[study](records)
+    print(tables.Table("", cells.header, cells.rows))
+    if options.figure is not None:
+        draw_norm_balls(records, options.figure)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Do lights and shapes that deceive one network, from one side, deceive others, or from other sides (Tables 3 and 4)?
+"""Check whether lights and shapes that deceive one network from some views deceive more.
 
-An adversary is recorded at the first step that succeeds, and after ten further steps, beside random changes that are as
+`networks` shows them to other networks (the paper's Table 3), and `views` from
+other views (Table 4). An adversary is recorded at the first step that succeeds,
+and after ten further steps. Both are compared with random changes that are as
 large in every coefficient or coordinate.
 """
 
-from argparse import Namespace
+import argparse
 from collections.abc import Sequence
-from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,98 +20,281 @@ from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.paper import common
 from renderer.errors import FACTOR
-from train.runs.saved_networks import load_network
 
-FURTHER = 10  # steps that an adversary goes on for
-ATTACKED = (1, 5)  # views that share one light or shape
-
-
-def as_one_example(problem: AttackProblem) -> Any:
-    """All examples of a problem, of one view each, as the views of a single one that share one light or shape."""
-    everything = problem.everything
-
-    def render(values: Tensor, examples: Tensor) -> Tensor:
-        return problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
-
-    same = {"take_step": problem.take_step, "project": problem.project, "at_once": problem.at_once}
-    return SimpleNamespace(start=problem.start[:1], render=render, **same)
+# Number of steps after the first success.
+FURTHER_STEPS = 10
+# No logit reaches this margin, so that a descent takes all its steps.
+ENDLESS_MARGIN = FACTOR
+# Numbers of views that share an attacked light or shape.
+ATTACKED_VIEW_COUNTS = (1, 5)
 
 
-def adversaries(
-    classifier: Classifier, problem: AttackProblem, settings: AttackSettings, label: str, views: int
-) -> tuple[Tensor, Tensor]:
-    """(E, D) values where a descent first succeeds or ends, and the best of `FURTHER` steps on. views: of each."""
-    goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
-    first = descend(classifier, problem, goal, settings)
-    longer = replace(settings, max_steps=FURTHER, margin=FACTOR)  # which no logit reaches: all steps are taken
-    return first.values, descend(classifier, problem, goal, longer, start=first.values).values
+class SharedProblem:
+    """An attack problem whose V examples become the V views of a single example.
+
+    The views share one vector of D values, such as a light or a shape. Unlike
+    the views of a scene's example, they may have different backgrounds.
+
+    Args:
+        problem: Problem of V examples with one view each, whose values start
+            equal.
+
+    Attributes:
+        start: Values at which the attack starts, shape (1, D).
+        at_once: Largest number of examples that are rendered at once.
+    """
+
+    def __init__(self, problem: AttackProblem):
+        self._problem = problem
+        self.start = problem.start[:1]
+        self.at_once = problem.at_once
+        # The steps and the norm-ball are those of the first example.
+        self.take_step = problem.take_step
+        self.project = problem.project
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Render all views with the same values.
+
+        Args:
+            values: Values of the single example, shape (1, D).
+            examples: Not used, because there is one example.
+
+        Returns:
+            Images, shape (1, V, 3, size, size).
+        """
+        all_views = self._problem.everything
+        images = self._problem.render(values.expand(len(all_views), -1), all_views)
+        return images.transpose(0, 1)
+
+
+@dataclass(frozen=True)
+class Adversaries:
+    """Values of E examples that a descent found, each of shape (E, D).
+
+    Attributes:
+        start: Values at which the descent started.
+        first: Values at the first success, or at the end if there was none.
+        further: Best values after FURTHER_STEPS more steps.
+    """
+
+    start: Tensor
+    first: Tensor
+    further: Tensor
+
+    def first_random(self, draws: torch.Generator) -> Tensor:
+        """Return random changes that are as large as those of the first success."""
+        return with_random_signs(self.first, self.start, draws)
+
+    def further_random(self, draws: torch.Generator) -> Tensor:
+        """Return random changes that are as large as those of the further steps."""
+        return with_random_signs(self.further, self.start, draws)
+
+
+def find_adversaries(
+    classifier: Classifier,
+    problem: AttackProblem | SharedProblem,
+    settings: AttackSettings,
+    label: str,
+    view_count: int,
+) -> Adversaries:
+    """Attack all examples of a problem until they succeed, and then for more steps.
+
+    Args:
+        classifier: Classifier to attack.
+        problem: Problem of E examples.
+        settings: Settings of the attack.
+        label: Class of all examples.
+        view_count: Number of views of each example.
+
+    Returns:
+        Values of all examples.
+    """
+    labels = torch.full((len(problem.start), view_count), classifier.label(label))
+    goal = Goal(labels)
+    first = descend(classifier, problem, goal, settings).values
+    further_settings = replace(settings, max_steps=FURTHER_STEPS, margin=ENDLESS_MARGIN)
+    further = descend(classifier, problem, goal, further_settings, start=first).values
+    return Adversaries(problem.start, first, further)
 
 
 def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> Tensor:
-    """The start (E, D) with each entry changed by as much as in values (E, D), but up or down at random.
+    """Change each value by as much as an attack did, but up or down at random.
 
-    It is as far in any norm, and changes nothing that could not reach a pixel.
+    The result is as far from the start in every norm. It does not change values
+    that the attack left unchanged, for example because they reach no pixel.
+
+    Args:
+        values: Values after the attack, shape (E, D).
+        start: Values before the attack, shape (E, D).
+        draws: Generator of the random numbers.
+
+    Returns:
+        Values with random signs of the changes, shape (E, D).
     """
     signs = 2 * torch.randint(2, values.shape, generator=draws) - 1
     return start + (values - start) * signs.to(values)
 
 
-def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[Classifier], args: Namespace) -> None:
-    """A record per batch of views and kind of attack: the predictions of all networks, each at its own size."""
-    draws = generator(args.seed, subject.name, "transfer")
-    for views in common.batches(common.clean_correct_views(subject, classifier, args.examples, draws)):
-        scenes = [common.scene_of(subject, network.size, views) for network in (classifier, *others)]
+def measure_networks(
+    subject: SceneObject,
+    networks: Sequence[Classifier],
+    options: argparse.Namespace,
+) -> None:
+    """Attack the first network, and append the predictions of all networks.
+
+    There is a record for each batch of views and each kind of attack. Each
+    network gets images of its own size.
+
+    Args:
+        subject: Object to render.
+        networks: Networks. The first is attacked.
+        options: Parsed command line.
+    """
+    draws = generator(options.seed, subject.name, "transfer")
+    all_views = common.clean_correct_views(subject, networks[0], options.examples, draws)
+    for views in common.batches(all_views):
+        scenes = [common.make_scene(subject, network.size, views) for network in networks]
         for kind in common.STEPS:
-            settings = common.attack_settings(kind, args.steps)
+            settings = common.attack_settings(kind, options.steps)
             problems = [build_problem(settings, scene) for scene in scenes]
-            start = problems[0].start
-            first, further = adversaries(classifier, problems[0], settings, subject.label, views=1)
-            states = {"before": start, "first": first, "first_random": with_random_signs(first, start, draws)}
-            states |= {"further": further, "further_random": with_random_signs(further, start, draws)}
-            predicted = {
-                network.name: {name: common.predictions(network, problem.images(states[name])) for name in states}
-                for network, problem in zip((classifier, *others), problems, strict=True)
+            found = find_adversaries(
+                networks[0],
+                problems[0],
+                settings,
+                subject.label,
+                view_count=1,
+            )
+            states = {
+                "before": found.start,
+                "first": found.first,
+                "first_random": found.first_random(draws),
+                "further": found.further,
+                "further_random": found.further_random(draws),
             }
-            record = {"kind": kind, "mesh": subject.name, "label": subject.label}
-            common.append(args.out, record | {"predictions": predicted})
+            predictions = {}
+            for network, problem in zip(networks, problems, strict=True):
+                predictions[network.name] = {
+                    state: common.predict(network, problem.images(values))
+                    for state, values in states.items()
+                }
+            record = {
+                "kind": kind,
+                "mesh": subject.name,
+                "label": subject.label,
+                "predictions": predictions,
+            }
+            common.append(options.out, record)
 
 
-def to_views(subject: SceneObject, classifier: Classifier, index: int, args: Namespace) -> None:
-    """A record per number of attacked views and kind of attack: the predictions in views that were not attacked."""
-    draws = generator(args.seed, subject.name, "unseen views", index)
-    unseen = common.clean_correct_views(subject, classifier, args.examples, draws)
-    for count in ATTACKED:
-        attacked = common.clean_correct_views(subject, classifier, count, draws)
+def measure_views(
+    subject: SceneObject,
+    classifier: Classifier,
+    set_index: int,
+    options: argparse.Namespace,
+) -> None:
+    """Attack some views, and append the predictions in views that were not attacked.
+
+    There is a record for each number of attacked views and each kind of attack.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier to attack.
+        set_index: Number of the set of views, which seeds the draws.
+        options: Parsed command line.
+    """
+    draws = generator(options.seed, subject.name, "unseen views", set_index)
+    unseen_views = common.clean_correct_views(subject, classifier, options.examples, draws)
+    for view_count in ATTACKED_VIEW_COUNTS:
+        views = common.clean_correct_views(subject, classifier, view_count, draws)
+        scene = common.make_scene(subject, classifier.size, views)
         for kind in common.STEPS:
-            settings = common.attack_settings(kind, args.steps)
-            problem = as_one_example(build_problem(settings, common.scene_of(subject, classifier.size, attacked)))
-            first, further = adversaries(classifier, problem, settings, subject.label, count)
-            random = with_random_signs(further, problem.start, draws)
-            states = {"first": first, "further": further, "random": random}
-            predicted: dict[str, list[str]] = {name: [] for name in states}
-            for part in common.batches(unseen):
-                elsewhere = build_problem(settings, common.scene_of(subject, classifier.size, part))
-                for name, values in states.items():
-                    predicted[name] += common.predictions(classifier, elsewhere.images(values.expand(len(part), -1)))
-            record = {"mesh": subject.name, "label": subject.label, "set": index, "kind": kind, "attacked": count}
-            common.append(args.out, record | {"predictions": predicted})
+            settings = common.attack_settings(kind, options.steps)
+            problem = SharedProblem(build_problem(settings, scene))
+            found = find_adversaries(classifier, problem, settings, subject.label, view_count)
+            states = {
+                "first": found.first,
+                "further": found.further,
+                "random": found.further_random(draws),
+            }
+            record = {
+                "mesh": subject.name,
+                "label": subject.label,
+                "set": set_index,
+                "kind": kind,
+                "attacked": view_count,
+                "predictions": predict_in_views(
+                    subject, classifier, settings, states, unseen_views
+                ),
+            }
+            common.append(options.out, record)
+
+
+def predict_in_views(
+    subject: SceneObject,
+    classifier: Classifier,
+    settings: AttackSettings,
+    states: dict[str, Tensor],
+    views: Sequence[common.View],
+) -> dict[str, list[str]]:
+    """Predict the class of an object in several views for each state.
+
+    Args:
+        subject: Object to render.
+        classifier: Classifier of the images.
+        settings: Settings of the attack, which say what the values mean.
+        states: Values of each state, shape (1, D).
+        views: Views of the object.
+
+    Returns:
+        Predicted class in each view, by state.
+    """
+    predictions: dict[str, list[str]] = {state: [] for state in states}
+    for batch in common.batches(views):
+        problem = build_problem(settings, common.make_scene(subject, classifier.size, batch))
+        for state, values in states.items():
+            images = problem.images(values.expand(len(batch), -1))
+            predictions[state] += common.predict(classifier, images)
+    return predictions
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    options = common.parser(None, __doc__)
-    options.add_argument("study", choices=("networks", "views"))
-    options.add_argument("--examples", type=int, default=20, help="views of each mesh, or unseen ones of each set")
-    options.add_argument("--sets", type=int, default=3, help="of attacked views, of each mesh")
-    options.add_argument("--steps", type=int, default=30, help="of a descent at most (the paper's appendix C)")
-    options.add_argument("--targets", nargs="*", default=[], help="networks that are not attacked, NAME[=WEIGHTS]")
-    args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
-    others = [load_network(*target.split("=", 1)) for target in args.targets] if args.study == "networks" else []
-    for subject in subjects:
-        if args.study == "networks":
-            to_networks(subject, classifier, others, args)
-        else:
-            for index in range(args.sets):
-                to_views(subject, classifier, index, args)
+    """Attack each mesh, and append the predictions of other networks or in other views.
+
+    Args:
+        argv: Words of the command line. None takes those of the process.
+    """
+    parser = common.make_parser(None, __doc__)
+    add = parser.add_argument
+    add("study", choices=("networks", "views"))
+    add(
+        "--examples",
+        type=int,
+        default=20,
+        help="number of views of each mesh, or of unseen views of each set",
+    )
+    add("--sets", type=int, default=3, help="number of sets of attacked views of each mesh")
+    add(
+        "--steps",
+        type=int,
+        default=30,
+        help="largest number of steps of a descent (the paper's appendix C)",
+    )
+    add(
+        "--targets",
+        nargs="*",
+        default=[],
+        help="networks that are not attacked, NAME[=WEIGHTS]",
+    )
+    setup = common.prepare(parser, argv, common.VERTICES)
+    options = setup.options
+    if options.study == "networks":
+        targets = [common.load_named_network(target) for target in options.targets]
+        for subject in setup.subjects:
+            measure_networks(subject, [setup.classifier, *targets], options)
+    else:
+        for subject in setup.subjects:
+            for set_index in range(options.sets):
+                measure_views(subject, setup.classifier, set_index, options)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def data(tmp_path, monkeypatch) -> None:
     for folder in ("meshes", "hdri", "photos/orange", "photos/apple", "packages"):
         Path(folder).mkdir(parents=True)
     rows = [[f"{('orange', 'apple')[n % 2]}/{n}.png", ("orange", "apple")[n % 2], f"tag{n // 8}"] for n in range(16)]
-    rows[-1][2] = sides.LEFT_OUT[0]
+    rows[-1][2] = sides.EXCLUDED_SOURCES[0]
     for path in (*(f"photos/{row[0]}" for row in rows), "packages/astronaut.png"):
         Image.fromarray(rng.integers(0, 256, (8, 8, 3), np.uint8)).save(path)
     with open("photos/photos.csv", "w", newline="") as file:
@@ -36,7 +36,7 @@ def data(tmp_path, monkeypatch) -> None:
     with zipfile.ZipFile("packages/objects.whl", "w") as archive:
         for path in Path("packages").glob("*.[op]*"):
             archive.write(path)
-    for name in (*sides.CHOSEN, "night"):
+    for name in (*sides.CHOOSING_MAPS, "night"):
         np.save(f"hdri/{name}.npy", rng.random((8, 16, 3), np.float32))
 
 

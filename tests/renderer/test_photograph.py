@@ -41,7 +41,14 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
         width=side * distance / focal_length,
         distance=distance,
     )
-    expected = renderer.render(mesh, turned, renderer.load_light("grace").double(), size, 0.0, samples=8)[0]
+    expected = renderer.render(
+        mesh,
+        turned,
+        renderer.load_light("grace").double(),
+        size,
+        0.0,
+        samples=8,
+    )[0]
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
     assert error(window.cut(pixels, size), expected) < 0.04
     assert error(straight, expected) > 0.1
@@ -50,10 +57,16 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
 def test_a_window_without_perspective_is_what_the_moved_camera_renders():
     mesh = renderer.solid("pear")
     pixels = photographed(mesh, OrthographicCamera(1.0, 0.7, 6.0, 1.25, -0.9375))
-    origin = np.array([1.25, 0.9375]) / 6 * SIZE + SIZE / 2  # At corners of pixels.
+    # The center of the window is at a corner of pixels.
+    origin = np.array([1.25, 0.9375]) / 6 * SIZE + SIZE / 2
     window = Photograph(pixels, None).window(origin, SIZE / 2, np.array([0.0, 1.0, 0.0]))
     expected = renderer.render(
-        mesh, OrthographicCamera(1.0, 0.7, 3.0), renderer.load_light("grace").double(), 48, 0.0, samples=8
+        mesh,
+        OrthographicCamera(1.0, 0.7, 3.0),
+        renderer.load_light("grace").double(),
+        48,
+        0.0,
+        samples=8,
     )[0]
     assert error(window.cut(pixels, 48), expected) < 0.02
 

@@ -1,4 +1,4 @@
-"""Files are replaced as a whole: a write that fails leaves the old file, and nothing beside it."""
+"""Files are replaced as a whole: a write that fails leaves the old file, and no other file."""
 
 import json
 import os
@@ -15,19 +15,29 @@ from PIL import Image
 
 import renderer
 from renderer.errors import InputError
-from renderer.io.files import TEMPORARY, remove_unfinished, replacing, write_whole
+from renderer.io.files import (
+    TEMPORARY,
+    remove_unfinished,
+    replacing,
+    write_whole,
+)
 from renderer.io.images import write_image, write_numbers
 from renderer.light.environment import write_map
 from renderer.light.projector import Projector
 from train.runs import checkpoint
 
-LIGHT = 0.1 * torch.rand(49, 3, generator=torch.Generator().manual_seed(0))
-PATTERN = torch.rand(64 * 64, 3, generator=torch.Generator().manual_seed(0))
+DRAWS = torch.Generator().manual_seed(0)
+LIGHT = 0.1 * torch.rand(49, 3, generator=DRAWS)
+PATTERN = torch.rand(64 * 64, 3, generator=DRAWS)
+RADIANCE = torch.rand(64, 128, 3, generator=DRAWS)
 PIXELS = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
-WRITERS: dict[str, Callable[[Path], object]] = {  # each writes more than a full disk takes
+# Functions that write more bytes than `full_disk` allows.
+WRITERS: dict[str, Callable[[Path], object]] = {
     "light.json": lambda path: renderer.save_light(path, LIGHT),
     "projector.json": lambda path: renderer.save_light(path, PATTERN, Projector(64)),
-    **dict.fromkeys(("a.npy", "a.hdr", "a.exr"), lambda path: write_map(path, torch.rand(64, 128, 3))),
+    "map.npy": lambda path: write_map(path, RADIANCE),
+    "map.hdr": lambda path: write_map(path, RADIANCE),
+    "map.exr": lambda path: write_map(path, RADIANCE),
     "mesh.glb": lambda path: renderer.export_mesh(renderer.solid("orange"), path),
     "image.png": lambda path: write_image(path, Image.fromarray(PIXELS)),
     "numbers.npy": lambda path: write_numbers(path, np.ones(4096)),
@@ -36,77 +46,116 @@ WRITERS: dict[str, Callable[[Path], object]] = {  # each writes more than a full
 
 
 @contextmanager
-def full_disk(most: int = 1024) -> Iterator[None]:
-    """No file grows beyond a number of bytes: the system refuses to write more, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+def full_disk(max_bytes: int = 1024) -> Iterator[None]:
+    """Let the system refuse to write files beyond a size, as on a full disk."""
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, hard_limit))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft_limit, hard_limit))
 
 
-@pytest.mark.parametrize("existing", [True, False])
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files in a folder by name."""
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def permissions(path: Path) -> int:
+    """Return the permission bits of a file."""
+    return stat.S_IMODE(path.stat().st_mode)
+
+
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_write_that_fails_leaves_the_old_file_whole_and_no_other(tmp_path, name, existing):
-    path, old = tmp_path / name, b"the old file, which was whole"
-    if existing:
-        path.write_bytes(old)
-    with full_disk(), pytest.raises((OSError, InputError), match=name.replace(".", r"\.")):
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"the old file")
+    with full_disk(), pytest.raises((OSError, InputError), match=name):
         WRITERS[name](path)
-    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == ({name: old} if existing else {})
-    WRITERS[name](path)
-    assert path.read_bytes() != old
+    assert contents(tmp_path) == {name: b"the old file"}
 
 
-def test_an_error_while_a_file_is_made_leaves_the_old_one(tmp_path):
-    write_whole(tmp_path / "a.json", "old")
-    with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "a.json") as temporary:
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_new_file_that_cannot_be_written_is_not_there(tmp_path, name):
+    with full_disk(), pytest.raises((OSError, InputError), match=name):
+        WRITERS[name](tmp_path / name)
+    assert contents(tmp_path) == {}
+    WRITERS[name](tmp_path / name)
+    assert name in contents(tmp_path)
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.json"
+    write_whole(path, "old")
+    with pytest.raises(KeyboardInterrupt), replacing(path) as temporary:
         temporary.write_text("half of the n")
         raise KeyboardInterrupt
-    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+    assert contents(tmp_path) == {"a.json": b"old"}
 
 
-def test_a_file_keeps_its_permissions_and_a_link_its_target(tmp_path):
-    write_whole(tmp_path / "a.json", "old")
-    new = stat.S_IMODE((tmp_path / "a.json").stat().st_mode)
+def test_a_new_file_has_the_permissions_of_any_new_file(tmp_path):
+    write_whole(tmp_path / "a.json", "new")
     (tmp_path / "plain").touch()
-    assert new == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
-    (tmp_path / "a.json").chmod(0o640)
-    (tmp_path / "link.json").symlink_to("a.json")
-    write_whole(tmp_path / "link.json", "new")
-    assert (tmp_path / "link.json").is_symlink() and (tmp_path / "a.json").read_text() == "new"
-    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
+    assert permissions(tmp_path / "a.json") == permissions(tmp_path / "plain")
+
+
+def test_a_replaced_file_keeps_its_permissions(tmp_path):
+    path = tmp_path / "a.json"
+    write_whole(path, "old")
+    path.chmod(0o640)
+    write_whole(path, "new")
+    assert path.read_text() == "new"
+    assert permissions(path) == 0o640
+
+
+def test_a_write_through_a_link_replaces_its_target(tmp_path):
+    target = tmp_path / "a.json"
+    link = tmp_path / "link.json"
+    write_whole(target, "old")
+    link.symlink_to("a.json")
+    write_whole(link, "new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write to every file")
-def test_a_file_that_may_not_be_written_is_not_replaced(tmp_path):
-    write_whole(tmp_path / "a.json", "old")
-    (tmp_path / "a.json").chmod(0o440)
+def test_a_file_without_permission_to_write_is_not_replaced(tmp_path):
+    path = tmp_path / "a.json"
+    write_whole(path, "old")
+    path.chmod(0o440)
     with pytest.raises(PermissionError, match=r"a\.json"):
-        write_whole(tmp_path / "a.json", "new")
-    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+        write_whole(path, "new")
+    assert contents(tmp_path) == {"a.json": b"old"}
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])
-def test_only_a_file_is_replaced(tmp_path, make):
-    make(tmp_path / "a.json")
+def test_folders_and_pipes_are_not_replaced(tmp_path, make):
+    path = tmp_path / "a.json"
+    make(path)
     with pytest.raises(OSError, match=r"a\.json"):
-        write_whole(tmp_path / "a.json", "new")
-    assert not (tmp_path / "a.json").is_file() and len(list(tmp_path.iterdir())) == 1
+        write_whole(path, "new")
+    assert not path.is_file()
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_left_is_removed(tmp_path):
+def test_the_temporary_files_of_a_killed_process_are_removed(tmp_path):
     (tmp_path / TEMPORARY.replace("*", "0")).touch()
     (tmp_path / "own.tmp").touch()
     remove_unfinished(tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["own.tmp"]
+    assert list(contents(tmp_path)) == ["own.tmp"]
 
 
-@pytest.mark.parametrize("kind", [str, Path])
-def test_functions_take_paths_as_text_and_as_path(tmp_path, kind):
-    renderer.save_light(kind(tmp_path / "light.json"), LIGHT)
-    assert torch.equal(renderer.load_light(kind(tmp_path / "light.json")), LIGHT)
-    assert json.loads((tmp_path / "light.json").read_text())["basis"] == "harmonics"
-    renderer.export_mesh(renderer.solid("orange"), kind(tmp_path / "orange.glb"))
-    assert len(renderer.load_mesh(kind(tmp_path / "orange.glb")).faces)
+@pytest.mark.parametrize("path_type", [str, Path])
+def test_a_light_is_saved_and_loaded_by_either_type_of_path(tmp_path, path_type):
+    path = path_type(tmp_path / "light.json")
+    renderer.save_light(path, LIGHT)
+    assert torch.equal(renderer.load_light(path), LIGHT)
+    assert json.loads(Path(path).read_text())["basis"] == "harmonics"
+
+
+@pytest.mark.parametrize("path_type", [str, Path])
+def test_a_mesh_is_exported_and_loaded_by_either_type_of_path(tmp_path, path_type):
+    path = path_type(tmp_path / "orange.glb")
+    mesh = renderer.solid("orange")
+    renderer.export_mesh(mesh, path)
+    assert len(renderer.load_mesh(path).faces) == len(mesh.faces)

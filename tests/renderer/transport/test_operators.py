@@ -1,185 +1,287 @@
+"""Operators of single views, compared with plain operations and central differences."""
+
 import math
-import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 from oracles import draw, mesh_of, patchwork
+from torch import Tensor
 
-from renderer.camera import OrthographicCamera, orbit_cameras
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.settings import ENCODINGS, ImageSettings
-from renderer.transport.operators import build_operators
+from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.rasterizers import choose
 
 EPS = torch.finfo(torch.float64).eps
-RASTERIZER = choose("numpy")
-ABOVE = OrthographicCamera(0, 0, 2.0)  # right is +y, up is -x
+# The image of this camera has +y to the right and -x up, from -1 to 1.
+ABOVE = OrthographicCamera(0, 0, 2.0)
+[IN_FRONT] = orbit_cameras(1, 2.2)
+SIZE = 6
 
 
-def square(half: float, center=(0.0, 0.0, 0.0)) -> Mesh:
-    """Facing up."""
+def operator_of(
+    mesh: Mesh,
+    camera: Camera,
+    settings: ImageSettings,
+    dtype: torch.dtype = torch.float32,
+) -> TransferOperator:
+    """Build the operator of one view."""
+    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
+    return operator
+
+
+def square(half: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
+    """Return a square that faces up, with a given half of its width."""
     corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]])
 
 
-def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
-    """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the center."""
-    (operator,) = build_operators(square(0.625), [ABOVE], ImageSettings(size=8, samples=4), RASTERIZER)
+def test_the_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
+    """The half-width of 5/8 is that of two pixels and a half."""
+    operator = operator_of(square(5 / 8), ABOVE, ImageSettings(size=8, samples=4))
     along = [0, 0.5, 1, 1, 1, 1, 0.5, 0]
-    coverage = torch.zeros(64).index_copy(0, operator.pixels, operator.coverage)
+    coverage = torch.zeros(64)
+    coverage[operator.pixels] = operator.coverage
     np.testing.assert_array_equal(coverage.view(8, 8), np.outer(along, along))
 
 
-def test_the_image_is_upright():
-    """From θ = π/2 on the +x side, up is up and right is +y."""
+def test_a_mesh_at_the_upper_right_is_in_the_last_pixel_of_the_first_row():
+    """From the +x side at the polar angle π/2, z is up and y is to the right."""
     corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
     mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], ImageSettings(4, 2), RASTERIZER)
-    assert operator.pixels.tolist() == [3]
+    camera = OrthographicCamera(math.pi / 2, 0, 2.0)
+    assert operator_of(mesh, camera, ImageSettings(4, 2)).pixels.tolist() == [3]
 
 
-BALL, FINE = (trimesh.creation.icosphere(subdivisions=count) for count in (1, 2))
-DENTED = patchwork(FINE.vertices, FINE.faces)
-LAYOUTS = {  # mesh, samples, channels of the transfer
-    "one color": (mesh_of(BALL, (0.8, 0.4, 0.1)), 3, 1),
-    "one sample per pixel": (DENTED, 1, 1),
-    "mixed albedos": (DENTED, 3, 3),
-    "empty": (square(0.1, center=(20, 0, 0)), 2, 1),
+@dataclass(frozen=True)
+class Layout:
+    """A mesh whose operator has one or three channels."""
+
+    mesh: Mesh
+    samples: int
+    channels: int
+
+    def operator(self, encoding: str = "linear") -> TransferOperator:
+        settings = ImageSettings(SIZE, self.samples, encoding)
+        return operator_of(self.mesh, IN_FRONT, settings, torch.float64)
+
+
+COARSE_BALL = trimesh.creation.icosphere(subdivisions=1)
+FINE_BALL = trimesh.creation.icosphere(subdivisions=2)
+DENTED = patchwork(FINE_BALL.vertices, FINE_BALL.faces)
+LAYOUTS = {
+    "one color": Layout(mesh_of(COARSE_BALL, (0.8, 0.4, 0.1)), 3, 1),
+    "one sample per pixel": Layout(DENTED, 1, 1),
+    "mixed albedos": Layout(DENTED, 3, 3),
+    "outside of the image": Layout(square(0.1, center=(20, 0, 0)), 2, 1),
 }
+all_layouts = pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_radiance_is_linear_in_the_light_with_the_gradient_of_central_differences(layout):
-    """In batches of any shape; bands 3 and 5, 18 coefficients, have a gradient of exactly zero."""
-    mesh, samples, channels = LAYOUTS[layout]
-    settings = ImageSettings(6, samples)
-    [operator] = build_operators(mesh, orbit_cameras(1, 2.2), settings, RASTERIZER, dtype=torch.float64)
-    assert operator.transfer.shape == (channels, 31, len(operator.pixels)) and operator.transfer.dtype == torch.float64
-    for batch in ((0,), (1,), (2, 3)):
-        lights = draw(*batch, 49, 3)
-        expected = [operator.radiance(light) for light in lights.flatten(0, -3)]
-        found = operator.radiance(lights)
-        assert found.shape == (*batch, 3, len(operator.pixels))
-        for single, values in zip(expected, found.flatten(0, -3), strict=True):
-            torch.testing.assert_close(values, single, rtol=0, atol=64 * EPS)
+@all_layouts
+def test_the_transfer_has_one_channel_if_each_pixel_has_one_albedo(layout):
+    operator = layout.operator()
+    assert operator.transfer.shape == (
+        layout.channels,
+        31,
+        len(operator.pixels),
+    )
+    assert operator.transfer.dtype == torch.float64
 
-    light, step = draw(49, 3).requires_grad_(True), draw(49, 3, seed=2)
+
+@all_layouts
+@pytest.mark.parametrize("batch", [(0,), (1,), (2, 3)], ids=str)
+def test_the_radiance_of_a_batch_is_that_of_its_lights(layout, batch):
+    operator = layout.operator()
+    lights = draw(*batch, 49, 3)
+    found = operator.radiance(lights)
+    assert found.shape == (*batch, 3, len(operator.pixels))
+    pairs = zip(lights.flatten(0, -3), found.flatten(0, -3), strict=True)
+    for light, radiance in pairs:
+        torch.testing.assert_close(radiance, operator.radiance(light), rtol=0, atol=64 * EPS)
+
+
+@all_layouts
+def test_the_gradient_by_the_light_is_a_central_difference(layout):
+    """Radiance is linear, so a step of any length gives the derivative up to rounding."""
+    operator = layout.operator()
+    light = draw(49, 3).requires_grad_()
+    step = draw(49, 3, seed=2)
     upstream = draw(3, len(operator.pixels), seed=1)
-    (gradient,) = torch.autograd.grad(operator.radiance(light), light, upstream)
+    [gradient] = torch.autograd.grad(operator.radiance(light), light, upstream)
     assert torch.equal(operator.light_gradient(upstream), gradient)
-    # A step of any length gives the derivative, to the rounding of 31 terms of some 1.
-    change = (operator.radiance(light + step) - operator.radiance(light - step)) / 2
-    assert (gradient * step).sum().item() == pytest.approx((change * upstream).sum().item(), abs=1e-11)
-    unlit = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
-    assert unlit.sum() == 18 and not gradient[unlit].any()
-    assert gradient[~unlit].all() == (len(operator.pixels) > 0)
+    with torch.no_grad():
+        change = (operator.radiance(light + step) - operator.radiance(light - step)) / 2
+    expected = float((change * upstream).sum())
+    assert float((gradient * step).sum()) == pytest.approx(expected, abs=1e-11)
+
+
+@all_layouts
+def test_the_bands_that_no_diffuse_surface_reflects_have_no_gradient(layout):
+    """These are the bands 3 and 5, with 18 coefficients."""
+    operator = layout.operator()
+    gradient = operator.light_gradient(draw(3, len(operator.pixels)))
+    is_reflected = torch.zeros(49, dtype=torch.bool)
+    is_reflected[nonzero_coefficients(6)] = True
+    assert (~is_reflected).sum() == 18
+    assert not gradient[~is_reflected].any()
+    is_visible = len(operator.pixels) > 0
+    assert bool(gradient[is_reflected].all()) == is_visible
 
 
 @pytest.mark.parametrize("shape", [(36, 3), (49, 1), (49,), (2, 31, 3), (0, 3)])
-def test_lights_of_another_degree_are_refused(shape):
-    [operator] = build_operators(square(0.5), [ABOVE], ImageSettings(4, 1), RASTERIZER)
-    with pytest.raises(InputError, match=rf"lights of shape {re.escape(str(shape))} .* degree 6"):
+def test_lights_of_another_shape_are_refused(shape):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 1))
+    with pytest.raises(InputError, match=r"^lights"):
         operator.radiance(torch.zeros(shape))
 
 
-def backgrounds_of(kind: str, *lights: int) -> float | torch.Tensor:
-    images = draw(*lights, 3, 6, 6, seed=3).abs().clamp(max=1)
-    return {"gray": 0.3, "color": torch.tensor([0.1, 0.5, 0.9]), "image": images[(0,) * len(lights)], "images": images}[
-        kind
-    ]
+def background_of(kind: str, batch: tuple[int, ...]) -> float | Tensor:
+    """Return a background for a batch of lights."""
+    images = draw(*batch, 3, SIZE, SIZE, seed=3).abs().clamp(max=1)
+    if kind == "gray":
+        return 0.3
+    if kind == "color":
+        return torch.tensor([0.1, 0.5, 0.9])
+    if kind == "image":
+        return images.flatten(0, -4)[0] if batch else images
+    return images
 
 
-def composed(operator, lights, background):
-    """The image by plain operations, which autograd differentiates."""
-    size, encoding = operator.settings.size, operator.settings.encoding
+def compose(operator: TransferOperator, lights: Tensor, background: float | Tensor) -> Tensor:
+    """Compute images (..., 3, size, size) by plain operations that autograd differentiates."""
+    size = operator.settings.size
+    encoding = operator.settings.encoding
     behind = torch.as_tensor(background).to(lights)
-    behind = behind if behind.ndim > 1 else behind.view(-1, 1, 1)
+    if behind.ndim < 2:
+        behind = behind.view(-1, 1, 1)
     behind = behind.expand(*lights.shape[:-2], 3, size, size).flatten(-2)
-    added = (1 - operator.coverage.to(lights)) * decode(behind[..., operator.pixels], encoding)
-    values = (operator.radiance(lights) + added).clamp(0, 1)
+    uncovered = 1 - operator.coverage.to(lights)
+    background_radiance = uncovered * decode(behind[..., operator.pixels], encoding)
+    values = operator.radiance(lights) + background_radiance
     images = behind.clone()
-    images[..., operator.pixels] = encode(values, encoding)
+    images[..., operator.pixels] = encode(values.clamp(0, 1), encoding)
     return images.unflatten(-1, (size, size))
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("background", ["gray", "color", "image", "images"])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_an_image_and_its_gradients_are_those_of_plain_operations(layout, background, encoding):
-    """Of one light and of batches, with and without autograd. A tenth of the values or more is clamped."""
-    mesh, samples, _ = LAYOUTS[layout]
-    settings = ImageSettings(6, samples, encoding)
-    [operator] = build_operators(mesh, orbit_cameras(1, 2.2), settings, RASTERIZER, dtype=torch.float64)
-    for batch in ((), (2, 3)):
-        lights = draw(*batch, 49, 3).requires_grad_()
-        upstream = draw(*batch, 3, 6, 6, seed=1)
-        behind = backgrounds_of(background, *batch)
-        expected = composed(operator, lights, behind)
-        image = operator.image(lights, behind)
-        assert ((expected == 0) | (expected == 1)).float().mean() > 0.1 or not len(operator.pixels)
-        torch.testing.assert_close(image, expected, rtol=0, atol=8 * EPS)
-        [by_plain_operations] = torch.autograd.grad(expected, lights, upstream)
-        [gradient] = torch.autograd.grad(image, lights, upstream)
-        torch.testing.assert_close(gradient, by_plain_operations, rtol=1e-12, atol=1e-12)
-        direct = operator.image_and_gradient(lights, lambda shown, upstream=upstream: upstream, behind)
-        assert torch.equal(direct[0], image) and torch.equal(direct[1], gradient)
+@pytest.mark.parametrize("kind", ["gray", "color", "image", "images"])
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
+@all_layouts
+def test_an_image_and_its_gradient_are_those_of_plain_operations(layout, batch, kind, encoding):
+    """At least a tenth of the values of visible meshes is clamped."""
+    operator = layout.operator(encoding)
+    lights = draw(*batch, 49, 3).requires_grad_()
+    upstream = draw(*batch, 3, SIZE, SIZE, seed=1)
+    background = background_of(kind, batch)
+    expected = compose(operator, lights, background)
+    is_clamped = (expected == 0) | (expected == 1)
+    assert is_clamped.float().mean() > 0.1 or not len(operator.pixels)
+    image = operator.image(lights, background)
+    torch.testing.assert_close(image, expected, rtol=0, atol=8 * EPS)
+    [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
+    [gradient] = torch.autograd.grad(image, lights, upstream)
+    torch.testing.assert_close(gradient, expected_gradient, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
+@all_layouts
+def test_the_gradient_without_autograd_is_that_of_autograd(layout, batch):
+    operator = layout.operator("srgb")
+    lights = draw(*batch, 49, 3).requires_grad_()
+    upstream = draw(*batch, 3, SIZE, SIZE, seed=1)
+    expected = operator.image(lights, 0.3)
+    [expected_gradient] = torch.autograd.grad(expected, lights, upstream)
+    image, gradient = operator.image_and_gradient(lights, lambda _: upstream, 0.3)
+    assert torch.equal(image, expected)
+    assert torch.equal(gradient, expected_gradient)
+    assert not gradient.requires_grad
 
 
 def test_an_image_is_differentiable_in_its_background():
-    [operator] = build_operators(DENTED, orbit_cameras(1, 2.2), ImageSettings(6, 3, "srgb"), RASTERIZER)
-    light, behind = draw(49, 3).requires_grad_(), backgrounds_of("image").requires_grad_()
-    found, expected = operator.image(light, behind), composed(operator, light, behind)
-    for value, other in zip(
-        (found, *torch.autograd.grad(found.sum(), (light, behind))),
-        (expected, *torch.autograd.grad(expected.sum(), (light, behind))),
-        strict=True,
-    ):
-        torch.testing.assert_close(value, other, rtol=1e-6, atol=1e-6)
+    operator = operator_of(DENTED, IN_FRONT, ImageSettings(SIZE, 3, "srgb"))
+    light = draw(49, 3).requires_grad_()
+    background = background_of("image", ()).requires_grad_()
+    found = operator.image(light, background)
+    expected = compose(operator, light, background)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    inputs = (light, background)
+    gradients = torch.autograd.grad(found.sum(), inputs)
+    expected_gradients = torch.autograd.grad(expected.sum(), inputs)
+    torch.testing.assert_close(gradients, expected_gradients, rtol=1e-6, atol=1e-6)
 
 
-def test_an_image_shows_the_background_as_it_is_now():
-    """Also where the same tensor, or the memory behind it, holds other values than in the call before."""
-    [operator] = build_operators(square(0.5), [ABOVE], ImageSettings(6, 2), RASTERIZER)
-    memory = np.full((3, 6, 6), 0.2, dtype=np.float32)
-    behind, light = torch.from_numpy(memory), torch.zeros(49, 3)
-    for gray in (0.2, 0.7):
-        memory[...] = gray
-        assert operator.image(light, behind)[0, 0, 0] == memory[0, 0, 0]
-        assert operator.image(light, gray)[0, 0, 0] == memory[0, 0, 0]
-    assert operator.image(light.double(), 0.75)[0, 0, 0] == 0.75
-    before = operator.image(light, 0.2)
-    before.zero_()
-    assert operator.image(light, 0.2)[0, 0, 0] == np.float32(0.2)
+DARK = torch.zeros(49, 3)
 
 
-def test_a_step_without_autograd_takes_any_loss_and_refuses_a_gradient_of_another_shape_or_nan():
-    [operator] = build_operators(square(0.5), [ABOVE], ImageSettings(4, 2), RASTERIZER)
-    light, target = 0.1 * draw(49, 3).float(), torch.full((3, 4, 4), 0.4)
-
-    def loss(image):
-        return (image - target).square().sum()
-
-    variable = light.clone().requires_grad_()
-    image = operator.image(variable)
-    [expected] = torch.autograd.grad(loss(image), variable)
-    shown, gradient = operator.image_and_gradient(variable, lambda image: 2 * (image - target))
-    assert torch.equal(shown, image) and torch.equal(gradient, expected) and not gradient.requires_grad
-    with pytest.raises(InputError, match=r"loss_gradient returned \(4, 4\): .* \(3, 4, 4\)"):
-        operator.image_and_gradient(light, lambda image: image[0])
-    with pytest.raises(InputError, match="image_gradient holds NaN"):
-        operator.image_and_gradient(light, lambda image: image * torch.nan)
-    with pytest.raises(InputError, match="image_gradient holds NaN"):
-        torch.autograd.grad(operator.image(variable), variable, torch.full_like(image, torch.inf))
+@pytest.mark.parametrize("gray", [0.2, 0.7])
+def test_an_image_shows_the_current_values_of_a_background(gray):
+    """The memory of the tensor holds other values than in the call before."""
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    memory = np.full((3, SIZE, SIZE), 0.5, dtype=np.float32)
+    background = torch.from_numpy(memory)
+    operator.image(DARK, background)
+    memory[...] = gray
+    assert operator.image(DARK, background)[0, 0, 0] == np.float32(gray)
 
 
-def test_the_gradient_of_an_image_is_differentiated_once():
-    [operator] = build_operators(square(0.5), [ABOVE], ImageSettings(4, 2), RASTERIZER)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_image_has_the_number_type_of_the_light(dtype):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    image = operator.image(DARK.to(dtype), 0.75)
+    assert image.dtype == dtype
+    assert image[0, 0, 0] == 0.75
+
+
+def test_a_change_of_an_image_does_not_change_the_next_one():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(SIZE, 2))
+    operator.image(DARK, 0.25).zero_()
+    assert operator.image(DARK, 0.25)[0, 0, 0] == 0.25
+
+
+def test_the_gradient_of_a_loss_without_autograd_is_that_of_autograd():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    light = (0.1 * draw(49, 3).float()).requires_grad_()
+    target = torch.full((3, 4, 4), 0.4)
+    image = operator.image(light)
+    [expected] = torch.autograd.grad((image - target).square().sum(), light)
+    _, gradient = operator.image_and_gradient(light, lambda shown: 2 * (shown - target))
+    assert torch.equal(gradient, expected)
+
+
+@pytest.mark.parametrize(
+    ("loss_gradient", "argument"),
+    [
+        (lambda image: image[0], "loss_gradient"),
+        (lambda image: image * torch.nan, "image_gradient"),
+    ],
+    ids=["another shape", "NaN"],
+)
+def test_an_invalid_gradient_of_a_loss_is_refused(loss_gradient, argument):
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    with pytest.raises(InputError, match=f"^{argument}"):
+        operator.image_and_gradient(0.1 * draw(49, 3).float(), loss_gradient)
+
+
+def test_an_infinite_gradient_of_an_image_is_refused():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
+    light = (0.1 * draw(49, 3).float()).requires_grad_()
+    image = operator.image(light)
+    with pytest.raises(InputError, match=r"^image_gradient"):
+        torch.autograd.grad(image, light, torch.full_like(image, torch.inf))
+
+
+def test_second_derivatives_are_refused_instead_of_wrong():
+    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
     light = (0.1 * draw(49, 3)).requires_grad_()
-    [gradient] = torch.autograd.grad(operator.image(light).square().sum(), light, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    loss = operator.image(light).square().sum()
+    [gradient] = torch.autograd.grad(loss, light, create_graph=True)
+    with pytest.raises(RuntimeError):
         gradient.sum().backward()
