@@ -573,6 +573,6 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
     derived, rest = divmod(examples or 0, objects * backgrounds)
     if rest or derived < 1 or views not in (None, derived):
         product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        remedy = "change one of them, or derive one from the other by views=null or examples=null"
+        remedy = "change one of them, or derive one from the other, with None for views or for examples"
         raise InputError(f"examples={examples} is not {product}: {remedy}", "examples")
     return derived

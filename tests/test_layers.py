@@ -1,6 +1,8 @@
 """Imports go one way: train → augment → renderer."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -77,6 +79,33 @@ def folder_of(module: str) -> str:
     """The folder below a package, or the module itself if it lies in no such folder."""
     parts = module.split(".")
     return ".".join(parts[:2])
+
+
+def test_only_commands_and_what_gets_all_their_settings_name_keys():
+    """Other modules name their Python arguments, and `renamed` and `keyed` say which setting gave the value."""
+    main = importlib.import_module("train.__main__").main
+    parts = {key.rpartition(".")[0] for key in main.keys}  # such as augment.attack, which is a function, too
+    keys = {key for key in main.keys if "." in key} - parts
+    assert "train.precision" in keys
+    told = re.compile("ExperimentSettings|DictConfig")
+    command_layer = ("train.command", "train.help", "train.__main__", "train.report", "train.system.user_errors")
+    checked = 0
+    for name, path in modules().items():
+        has_help = name.endswith("settings")
+        if has_help or name.startswith(command_layer) or told.search(path.read_text()):
+            continue
+        checked += 1
+        for text in texts(path):
+            assert keys.isdisjoint(re.findall(r"[a-z_]+\.[a-z_.]+", text)), f"{path}: {text}"
+    assert checked > 100
+
+
+def texts(path: Path) -> list[str]:
+    """The strings of a module but for its docstrings."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    constants = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings]
+    return [node.value for node in constants if isinstance(node.value, str)]
 
 
 def test_settings_need_neither_torch_nor_numpy():

@@ -119,15 +119,15 @@ class WideResNet(nn.Module):
 
 def _require_shape(depth: int, width: int, dropout: float) -> None:
     """Raise InputError if a WideResNet cannot have the depth, the width or the dropout."""
-    given = f"model.depth={depth}, model.width={width}"
+    given = f"depth={depth}, width={width}"
     # The weights of the 3 × 3 convolutions, which are most of the parameters.
     parameter_count = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
     if depth < 10 or (depth - 4) % 6 or width < 1:
-        raise InputError(f"{given}: depth is 10, 16, 22, ... and width at least 1")
+        raise InputError(f"{given}: depth is 10, 16, 22, ... and width at least 1", "depth")
     if depth > MAX_DEPTH or parameter_count > MAX_PARAMETER_COUNT:
-        raise InputError(f"{given}: {parameter_count:.1g} parameters are too many")
+        raise InputError(f"{given}: {parameter_count:.1g} parameters are too many", "depth")
     if not 0 <= dropout < 1:
-        raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
+        raise InputError(f"dropout={dropout} must be at least 0 and below 1", "dropout")
 
 
 class _Block(nn.Module):
@@ -254,10 +254,10 @@ def build_network(
     if name.startswith(PYTHON):
         network = _call_function(name, classes, size)
     elif name.startswith(TORCHVISION):
-        require_architecture(name.removeprefix(TORCHVISION), f"model={name}")
+        require_architecture(name.removeprefix(TORCHVISION))
     else:
         choices = f"{WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
-        raise InputError(f"model={name}: choose {choices}")
+        raise InputError(f"name={name}: choose {choices}", "name")
     # An architecture can refuse a size in many ways.
     try:
         if network is None:
@@ -266,20 +266,20 @@ def build_network(
         _require_logits(network, len(classes), size)
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         task = f"{len(classes)} logits for images of {size} pixels per side"
-        fault = f"model={name} does not give {task} ({in_one_line(error)})"
-        raise InputError(f"{fault}: choose another") from error
+        fault = f"name={name} does not give {task} ({in_one_line(error)})"
+        raise InputError(f"{fault}: choose another", "name") from error
     return network
 
 
 def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     """Call the Python function of a name, and check the size and the classes that it returns."""
-    network, own_size, own_classes = call_python(name.removeprefix(PYTHON), f"model={name}")
+    network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if own_size != size:
         given = f"images of {own_size} pixels per side"
-        raise InputError(f"model={name} is for {given}, and the data has {size}")
+        raise InputError(f"name={name} is for {given}, and the data has {size}", "name")
     if list(own_classes) != list(classes):
         fault = "has other classes than the data, or in another order"
-        raise InputError(f"model={name} {fault}: {classes[0]!r} first")
+        raise InputError(f"name={name} {fault}: {classes[0]!r} first", "name")
     return network
 
 

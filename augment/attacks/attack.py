@@ -342,7 +342,7 @@ def warn_of_changed_light(given: Scene, physical: Scene) -> None:
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > NOTICED:
         problem = "the light is negative in places, and without that its irradiance is off by"
-        advice = "a higher scene.degree is closer, and attack.allow_negative=true leaves the light"
+        advice = "a higher degree is closer, and allow_negative=True leaves the light"
         message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice} as it is"
         warnings.warn(message, stacklevel=3)
 

@@ -116,7 +116,7 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
     reasons = []
     if lost_to_noise > success:
         reasons.append(
-            "most successes do not survive a sensor's noise, a larger attack.margin helps",
+            "most successes do not survive a sensor's noise, a larger margin helps",
         )
     if 0 < success <= checks["random_search"]:
         reasons.append("random search does as well or better")

@@ -100,7 +100,8 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     source, colon, model = name.partition(":")
     if source + colon not in SOURCES:
         choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
-        raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
+        message = f"name={name} is not known: choose one of {', '.join(choices)}"
+        raise InputError(message, "name")
     load = SOURCES[source + colon].load
     with announced(f"loading {name}"):
         return load(model, path) if colon else load(path)

@@ -52,7 +52,7 @@ class NetworkCall:
     """Calls a network and refuses what it returns in place of logits.
 
     Attributes:
-        name: Start of error messages, such as classifier=NAME.
+        name: Start of error messages, such as "classifier NAME".
         probability_rows: Number of outputs so far that are probabilities, or None once an output was none. From then
             on, outputs are not compared with probabilities, which costs nothing.
     """
@@ -141,21 +141,23 @@ class Classifier(nn.Module):
         super().__init__()
         require_kind("name", name, str, "a string for messages")
         require_kind("function", function, Callable, "a torch.nn.Module, or a function from images to logits")
-        require_whole(f"classifier={name}: size", size)
-        require_range(f"classifier={name}: size", size, 1, MAX_SIZE)
+        require_whole(f"classifier {name}: size", size)
+        require_range(f"classifier {name}: size", size, 1, MAX_SIZE)
         self.function = function
         self.size = size
-        self.classes = as_class_names(f"classifier={name}: classes", classes)
+        self.classes = as_class_names(f"classifier {name}: classes", classes)
         self.name = name
-        self._call_network = NetworkCall(f"classifier={name}")
+        self._call_network = NetworkCall(f"classifier {name}")
         if not 0 < len(set(self.classes)) == len(self.classes):
-            raise InputError(f"classifier={name}: name its classes, in the order of its logits, by different names")
+            remedy = "name its classes, in the order of its logits, by different names"
+            raise InputError(f"classifier {name}: {remedy}")
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
         """InputError for images of another size or far from [0, 1], and for a callable that fails or returns something
         else than finite logits with a gradient, such as probabilities."""
-        name, size = f"classifier={self.name}", self.size
+        name = f"classifier {self.name}"
+        size = self.size
         images = as_images("images", images)
         if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
@@ -178,10 +180,10 @@ class Classifier(nn.Module):
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
-            remedy = (
-                f"s but of {known}: give one of these as label" if known else ": publish it with pnb-publish calibrate="
-            )
-            raise InputError(f"classifier={self.name} has no operating point{remedy}")
+            remedy = ": choose one when it is published (pnb-publish)"
+            if known:
+                remedy = f"s but of {known}: give one of these as label"
+            raise InputError(f"classifier {self.name} has no operating point{remedy}")
         (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
@@ -202,7 +204,7 @@ class Classifier(nn.Module):
             InputError: If there is no such class. The sentence suggests the
                 nearest names.
         """
-        return class_index(self.classes, class_name, f"classifier={self.name}")
+        return class_index(self.classes, class_name, f"classifier {self.name}")
 
 
 def as_images(name: str, images: object) -> Tensor:
@@ -270,13 +272,14 @@ class Normalized(nn.Module):
         return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
 
 
-def class_index(classes: Sequence[str], name: str | int, key: str) -> int:
+def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     """Return the index of a class.
 
     Args:
         classes: Names of all classes.
         name: Name of the class, or its index, which may be written as text.
-        key: What names the class, for the error.
+        subject: Start of the error, such as "label" or "classifier NAME": the
+            argument that names the class, or the thing that lacks it.
 
     Returns:
         The index.
@@ -293,9 +296,9 @@ def class_index(classes: Sequence[str], name: str | int, key: str) -> int:
         if int(text) < len(classes):
             return int(text)
         indices = f"indices go from 0 to {len(classes) - 1}"
-        raise InputError(f"{key}: the label {text} is not a class: {indices}")
+        raise InputError(f"{subject}: the label {text} is not a class: {indices}")
     raise InputError(
-        f"{key}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
+        f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
     )
 
 
@@ -312,12 +315,26 @@ def load_python(name: str, weights: str | Path | None = None) -> Classifier:
     raises or returns something else, and for weights=, since the function loads its own.
     """
     if weights is not None:
-        raise InputError(f"weights={weights} is not for classifier=python:{name}, which loads its own: leave it out")
-    return Classifier(*call_python(name, f"classifier=python:{name}"), f"python:{name}")
+        fault = f"weights={weights} is not for python:{name}, which loads its own"
+        raise InputError(f"{fault}: leave it out", "weights")
+    return Classifier(*call_python(name), f"python:{name}")
 
 
-def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]:
-    """The result of `package.module:function`; errors name the setting that it came from."""
+def call_python(name: str) -> tuple[nn.Module, int, Sequence[str]]:
+    """Call a function of a user that makes a network.
+
+    Args:
+        name: "package.module:function", found from the current folder or
+            installed.
+
+    Returns:
+        The network, the pixels per side of its images, and the names of its
+        classes in the order of its logits.
+
+    Raises:
+        InputError: If there is no such function, or if the function or its
+            module raises or returns something else.
+    """
     module, _, function = name.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
@@ -329,9 +346,10 @@ def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]
         at = traceback.extract_tb(error.__traceback__)[-1]
         reason = f"{type(error).__name__}: {in_one_line(error)}, in line {at.lineno} of {at.filename}"  # type: ignore[arg-type]
         expected = "python:package.module:function, which returns (module, size, classes)"
-        raise InputError(f"{setting} fails ({reason}): give {expected}") from error
+        raise InputError(f"name=python:{name} fails ({reason}): give {expected}", "name") from error
     ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
     if not (isinstance(network, nn.Module) and type(size) is int and ordered and all(type(c) is str for c in classes)):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
-        raise InputError(f"{setting} returns ({kinds}): return (torch.nn.Module, pixels per side, class names)")
+        expected = "return (torch.nn.Module, pixels per side, class names)"
+        raise InputError(f"name=python:{name} returns ({kinds}): {expected}", "name")
     return network, size, classes

@@ -46,7 +46,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     do not fit it, and a failed download.
     """
     name = f"torchvision:{model}"
-    require_architecture(model, f"classifier={name}")
+    require_architecture(model)
     published = published_weights(model, weights)
     state = _download(published, name) if weights is None else read_weights(weights)
     source = weights or published.url
@@ -72,13 +72,22 @@ def build_torchvision(model: str, size: int | None = None, published: "WeightsEn
     return Classifier(normalized, size, published.meta["categories"], f"torchvision:{model}")
 
 
-def require_architecture(model: str, setting: str) -> None:
-    """InputError naming the setting, with the nearest names, for a classifier that torchvision lacks."""
+def require_architecture(model: str) -> None:
+    """Check that torchvision has a classifier.
+
+    Args:
+        model: Its name in `torchvision.models`.
+
+    Raises:
+        InputError: If there is none of this name. The error lists the nearest
+            names.
+    """
     from torchvision import models
 
     choices = models.list_models(module=models)
     if model not in choices:
-        raise InputError(f"{setting} is not a classifier of torchvision: choose one, such as {nearest(model, choices)}")
+        fault = f"name=torchvision:{model} is not a classifier of torchvision"
+        raise InputError(f"{fault}: choose one, such as {nearest(model, choices)}", "name")
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
@@ -95,7 +104,8 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
         remedy = f"give weights=FILE, a copy of {published.url}"
-        raise InputError(f"classifier={name} cannot be downloaded ({in_one_line(error)}): {remedy}") from error
+        fault = f"name={name} cannot be downloaded ({in_one_line(error)})"
+        raise InputError(f"{fault}: {remedy}", "name") from error
 
 
 def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
@@ -125,7 +135,8 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     InputError without one, or for one that does not fit. (Iandola et al. 2016.)
     """
     if weights is None:
-        raise InputError(f"classifier={SQUEEZENET_CAFFE} comes without weights: give weights=FILE")
+        fault = f"name={SQUEEZENET_CAFFE} comes without weights"
+        raise InputError(f"{fault}: give weights=FILE", "name")
     return fill(build_squeezenet_caffe(), read_weights(weights), weights)
 
 
@@ -152,7 +163,8 @@ def load_timm(model: str, weights: Path | None) -> Classifier:
         raise
     except Exception as error:  # no network, no room, no such set of weights
         reason = in_one_line(error)
-        raise InputError(f"classifier=timm:{model} cannot be downloaded ({reason}): give weights=FILE") from error
+        fault = f"name=timm:{model} cannot be downloaded ({reason})"
+        raise InputError(f"{fault}: give weights=FILE", "name") from error
 
 
 def build_timm(model: str, size: int | None = None, pretrained: bool = False) -> Classifier:
@@ -161,11 +173,13 @@ def build_timm(model: str, size: int | None = None, pretrained: bool = False) ->
     timm = _required("timm", f"timm:{model}")
     if not timm.is_model(model):
         choices = nearest(model, timm.list_models())
-        raise InputError(f"classifier={name} is not a network of timm: choose one, such as {choices}")
+        fault = f"name={name} is not a network of timm"
+        raise InputError(f"{fault}: choose one, such as {choices}", "name")
     network = timm.create_model(model, pretrained=pretrained)
     facts = network.pretrained_cfg
     if network.num_classes != len(classes):
-        raise InputError(f"classifier={name} has {network.num_classes} classes: choose one of ImageNet's 1,000")
+        fault = f"name={name} has {network.num_classes} classes"
+        raise InputError(f"{fault}: choose one of ImageNet's 1,000", "name")
     size = size or facts["input_size"][-1]
     return Classifier(Normalized(network, facts["mean"], facts["std"]), size, classes, name)
 
@@ -175,7 +189,8 @@ def _required(package: str, name: str, install: str = "") -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise InputError(f"classifier={name} needs {error.name}: pip install {install or package}") from error
+        message = f"name={name} needs {error.name}: pip install {install or package}"
+        raise InputError(message, "name") from error
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
@@ -190,7 +205,8 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
             raise TypeError("it holds other things than weights")
     except Exception as error:  # torch and safetensors raise many kinds for a damaged or foreign file
         reason = textwrap.shorten(str(error), 200)
-        raise InputError(f"weights={path} cannot be read ({reason}): save a network's state_dict() alone") from error
+        fault = f"weights={path} cannot be read ({reason})"
+        raise InputError(f"{fault}: save a network's state_dict() alone", "weights") from error
     return state
 
 
@@ -200,6 +216,6 @@ def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path
         cast(Normalized, classifier.function).network.load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
-        fault = f"weights={source} are not of classifier={classifier.name} ({reason})"
-        raise InputError(f"{fault}: give that network's") from error
+        fault = f"weights={source} are not of {classifier.name} ({reason})"
+        raise InputError(f"{fault}: give that network's", "weights") from error
     return classifier

@@ -70,6 +70,8 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_
         (["run=odd"], "PATH/odd/train.log cannot be read or written: Is a directory"),
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["compare=[non]"], "compare: "),
+        (["train.init_from=none"], "train.init_from=none holds neither best.pt nor model.safetensors"),
+        (["train.init_from=timm:"], "train.init_from=timm: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
         (["--multirun", "seed=0,0"], "the sweep has a run twice"),
         (["--multirun", "run=a", "seed=0,1"], "run= names the folder of a single run"),

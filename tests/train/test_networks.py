@@ -176,14 +176,14 @@ def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     ],
 )
 def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, message):
-    with pytest.raises(InputError, match=rf"^model={name}\W.*{re.escape(message)}"):
+    with pytest.raises(InputError, match=rf"^name={name}\W.*{re.escape(message)}"):
         build_network(CLASSES, size, name)
 
 
 @pytest.mark.parametrize("settings", [{"depth": 15}, {"width": 0}, {"dropout": 1.0}, {"depth": 6 * 10**9 + 4}], ids=str)
 def test_an_impossible_architecture_names_its_key(settings):
     ((key, value),) = settings.items()
-    with pytest.raises(InputError, match=f"model.{key}={value}"):
+    with pytest.raises(InputError, match=f"{key}={value}"):
         WideResNet(10, **settings)
 
 

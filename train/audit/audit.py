@@ -39,7 +39,7 @@ from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import published, read_objects, solid_name
 from train.system.device import choose_device
-from train.system.user_errors import writable_folder
+from train.system.user_errors import renamed, writable_folder
 
 # Views that are rendered in environment lighting.
 VIEWS = 24
@@ -164,10 +164,12 @@ class _Plan:
 
 def _load_networks(settings: AuditSettings, device: torch.device) -> dict[str, Classifier]:
     """Load the classifier and, if there is one, the hardened network."""
-    classifier = load_network(settings.classifier, settings.weights)
+    with renamed(name="classifier"):
+        classifier = load_network(settings.classifier, settings.weights)
     networks = {page.CLASSIFIER: classifier.to(device)}
     if settings.hardened:
-        networks[page.HARDENED] = load_network(settings.hardened).to(device)
+        with renamed(name="hardened"):
+            networks[page.HARDENED] = load_network(settings.hardened).to(device)
     return networks
 
 

@@ -27,6 +27,7 @@ from augment.scene.objects import SceneObject, load_object, on_ground
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
+from renderer.visibility.rasterizers import Rasterizer
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.commands.results import require_replaceable
@@ -45,7 +46,7 @@ from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
-from train.system.user_errors import keyed, writable_folder
+from train.system.user_errors import keyed, keys_of, renamed, writable_folder
 
 # Settings that `find_scene` may change, in the order in which they are printed.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
@@ -112,9 +113,10 @@ def run(settings: AttackExperimentSettings) -> None:
         with keyed("attack"):
             settings.attack.require_parameters()
     device = choose_device(settings.device)
-    classifier = load_network(settings.classifier, settings.weights).to(device)
+    with renamed(name="classifier"):
+        classifier = load_network(settings.classifier, settings.weights).to(device)
     if adversary is not None:
-        images = adversary.render(choose_rasterizer(settings.renderer)).to(device)
+        images = adversary.render(_start_rasterizer(settings)).to(device)
         print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
         if not settings.attack.parameters:
             return
@@ -139,6 +141,12 @@ def run(settings: AttackExperimentSettings) -> None:
             write_sweeps(sweeps, norms, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         write_config(out, settings, command=command_line("attack"))
+
+
+def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
+    """Start the rasterizer that the settings name."""
+    with renamed(**keys_of("renderer", settings.renderer)):
+        return choose_rasterizer(settings.renderer)
 
 
 def _require_attack_settings(settings: AttackExperimentSettings) -> None:
@@ -231,7 +239,7 @@ def _attack_adversary(
     if adversary.pixels is not None:
         fault = "no attack goes on from changed pixels"
         raise InputError(f"reload={settings.reload}: {fault}: leave attack= out")
-    scene = adversary.scene(choose_rasterizer(settings.renderer), device)
+    scene = adversary.scene(_start_rasterizer(settings), device)
     result = attack(
         classifier,
         scene,
@@ -299,8 +307,7 @@ def build_attacked(
     Raises:
         InputError: If a setting of the scene does not fit, which the message names.
     """
-    # An error of the rasterizer already names its key, renderer.rasterizer.
-    rasterizer = choose_rasterizer(settings.renderer)
+    rasterizer = _start_rasterizer(settings)
     with keyed("scene", vars(scene)):
         return build_scene(
             [item],
@@ -355,7 +362,8 @@ def _load_classifier(item: Any) -> Classifier:
         if key not in ("classifier", "weights"):
             advice = "give names, or {classifier, weights}"
             raise InputError(f"transfer.classifiers: {key} is not known: {advice}")
-    return load_network(str(named.get("classifier")), named.get("weights"))
+    with renamed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
+        return load_network(str(named.get("classifier")), named.get("weights"))
 
 
 def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:

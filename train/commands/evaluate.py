@@ -12,7 +12,7 @@ from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network, load_run
 from train.settings import label_names, published
 from train.system.device import MixedPrecision, choose_device, choose_precision
-from train.system.user_errors import writable_folder
+from train.system.user_errors import keyed, renamed, writable_folder
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -25,7 +25,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     network = _load_network(settings)
     labels = label_names(settings.label)
     for name in labels:
-        network.label(name)  # or InputError that names the network
+        with keyed("label"):
+            network.label(name)  # or InputError that names the network
     precision = choose_precision(settings.precision, device)
     model = MixedPrecision(network.to(device), precision)
     out = writable_folder(settings.out, "out")
@@ -37,7 +38,8 @@ def evaluate(settings: EvaluateSettings) -> None:
             folder = published(Path(settings.calibrate))
             rate = settings.false_positive_rate
             skip = settings.skip_unreadable
-            points = scoring.choose_operating_points(predictor, folder, labels, rate, skip)
+            with renamed(folder="calibrate"):
+                points = scoring.choose_operating_points(predictor, folder, labels, rate, skip)
         by_label = {point.label: point for point in points}
         has_all = by_label.keys() >= set(labels)
         points = [by_label[name] for name in labels] if has_all else []
@@ -52,5 +54,6 @@ def evaluate(settings: EvaluateSettings) -> None:
 def _load_network(settings: EvaluateSettings) -> Classifier:
     """Load the network of a run, or any other classifier."""
     if settings.run is None:
-        return load_network(str(settings.classifier), settings.weights)
+        with renamed(name="classifier"):
+            return load_network(str(settings.classifier), settings.weights)
     return load_run(settings.run, settings.weights, settings.model)

@@ -13,7 +13,7 @@ from train.networks import PYTHON
 from train.report.summary import summarize
 from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published
-from train.system.user_errors import writable_folder
+from train.system.user_errors import renamed, writable_folder
 
 
 def publish_network(settings: PublishSettings) -> None:
@@ -73,12 +73,13 @@ def _calibrate(
     """Choose the threshold of each label on a folder of photographs, and print it."""
     # The thresholds are those of the published weights, which have 16 bits.
     network.half().float()
-    points = scoring.choose_operating_points(
-        Predictor(network, network.classes, network.size),
-        published(Path(folder)),
-        label,
-        false_positive_rate,
-    )
+    with renamed(folder="calibrate"):
+        points = scoring.choose_operating_points(
+            Predictor(network, network.classes, network.size),
+            published(Path(folder)),
+            label,
+            false_positive_rate,
+        )
     entries = [asdict(point) for point in points]
     for entry in entries:
         meaning = scoring.describe_point(entry)

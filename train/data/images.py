@@ -107,7 +107,7 @@ class ImageFiles:
             broken |= faults
             if broken and not self.skip:
                 path, fault = next(iter(broken.items()))
-                advice = "replace it, or set evaluate.skip_unreadable=true"
+                advice = "replace it, or set skip_unreadable=True"
                 raise InputError(f"{self.folder / path} cannot be read ({fault}): {advice}")
             yield images
         if broken:

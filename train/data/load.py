@@ -8,7 +8,7 @@ from train.data.rendered_shapes import load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled
 from train.settings import MIN_SIZE, ExperimentSettings
 from train.system.processes import first_process_first
-from train.system.user_errors import keyed
+from train.system.user_errors import keyed, keys_of, renamed
 
 # Pixels per side of the images of a folder, where neither data.size nor the network begun with
 # says it.
@@ -33,7 +33,7 @@ def load_data(settings: ExperimentSettings, size: int | None = None) -> DataSet:
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
     console.info("data: %s", name)
-    with first_process_first():
+    with first_process_first(), renamed(**keys_of("data", settings.data)):
         data = _load(name, settings, size)
     with keyed("data.path"):
         require_range("image size", data.size, MIN_SIZE, MAX_SIZE)

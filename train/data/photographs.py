@@ -45,7 +45,7 @@ TABLE = "photos.csv"
 DESCRIPTION = "lab.json"
 # This stands between the sources in a cell of the column hard_negatives.
 SEPARATOR = ";"
-SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
+SKIP = ", or set skip_unreadable=True to skip them"
 
 
 @dataclass(frozen=True)

@@ -93,13 +93,13 @@ class DataSet:
         return self.train.images.shape[-1]
 
 
-def relabeled(data: DataSet, classes: Sequence[str], key: str) -> DataSet:
+def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
     """Number the labels of a data set by other classes.
 
     Args:
         data: The data set.
         classes: The names of the classes to count by.
-        key: The setting that an error names.
+        subject: Start of the error, which says what data it is.
 
     Returns:
         The data set with the other classes.
@@ -107,13 +107,13 @@ def relabeled(data: DataSet, classes: Sequence[str], key: str) -> DataSet:
     Raises:
         InputError: A class of the data is not among them.
     """
-    numbers = torch.tensor([class_index(classes, name, key) for name in data.classes])
+    numbers = torch.tensor([class_index(classes, name, subject) for name in data.classes])
     train = Split(data.train.images, numbers[data.train.labels])
     test = Split(data.test.images, numbers[data.test.labels])
     return replace(data, classes=tuple(classes), train=train, test=test)
 
 
-def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.validation") -> Tensor:
+def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fraction") -> Tensor:
     """Choose a fraction of the images of every class.
 
     The images that a smaller fraction chooses are among those of a larger one.
@@ -122,7 +122,7 @@ def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.val
         split: The images.
         fraction: The fraction, between 0 and 1, which is rounded to whole images of each class.
         seed: The seed of the choice.
-        key: The setting that an error names.
+        argument: Name of the argument that holds the fraction, for the error.
 
     Returns:
         Which images are chosen, bool, shape (N,).
@@ -131,7 +131,7 @@ def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.val
         InputError: The fraction is out of range, or it chooses none or all images of a class.
     """
     if not 0 < fraction < 1:
-        raise InputError(f"{key}={fraction} must lie between 0 and 1")
+        raise InputError(f"{argument}={fraction} must lie between 0 and 1", argument)
     is_held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(seed, "validation")
     for label in split.labels.unique():
@@ -139,7 +139,7 @@ def held_out_rows(split: Split, fraction: float, seed: int, key: str = "data.val
         count = round(fraction * len(members))
         if not 0 < count < len(members):
             images = f"class {int(label)}, {len(members)} images"
-            raise InputError(f"{key}={fraction} of {images}, is all or nothing")
+            raise InputError(f"{argument}={fraction} of {images}, is all or nothing", argument)
         order = torch.randperm(len(members), generator=draws)
         is_held_out[members[order[:count]]] = True
     return is_held_out
@@ -189,7 +189,7 @@ def load_cifar100(path: str) -> DataSet:
         test = CIFAR100(path, train=False, download=True)
     except (OSError, RuntimeError) as error:
         problem = "CIFAR-100 is not there and cannot be downloaded"
-        raise InputError(f"data.path={path}: {problem} ({error})") from error
+        raise InputError(f"path={path}: {problem} ({error})", "path") from error
     splits = []
     for part in (train, test):
         images = torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous()
@@ -213,14 +213,14 @@ def load_npz(path: str) -> DataSet:
         InputError: It is not such a file, or it would need pickle, which runs code.
     """
     if not Path(path).is_file():
-        raise InputError(f"data.path={path} does not exist: give the path of an .npz file")
+        raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return _read_npz(archive)
     # zipfile, zlib and NumPy raise many kinds of errors for a damaged or foreign file.
     except Exception as error:
         problem = f"is not an .npz file of labeled images: {in_one_line(error)}"
-        raise InputError(f"data.path={path} {problem}") from error
+        raise InputError(f"path={path} {problem}", "path") from error
 
 
 def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
@@ -276,15 +276,16 @@ def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: boo
     root = Path(path)
     if not root.is_dir():
         advice = "give a folder with one folder of images per class"
-        raise InputError(f"data.path={path} is not a folder: {advice}")
+        raise InputError(f"path={path} is not a folder: {advice}", "path")
     parts = [name for name in _folders(root) if name.lower() in PARTS]
     if parts not in ([], ["test", "train"]):
         advice = "divide it into train and test, or not at all"
-        raise InputError(f"data.path={path} holds {', '.join(parts)}: {advice}")
+        raise InputError(f"path={path} holds {', '.join(parts)}: {advice}", "path")
     train_root = root / "train" if parts else root
     classes = tuple(_folders(train_root))
     if len(classes) < 2:
-        raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
+        fault = f"path={path} holds {len(classes)} class folders"
+        raise InputError(f"{fault}: it needs two or more", "path")
     unread = left_out(root)
     if unread:
         shown = ", ".join(map(str, unread[:3]))
@@ -298,7 +299,7 @@ def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: boo
     if parts:
         test = _folder_split(root / "test", classes, size, skip_unreadable, workers)
         return DataSet(classes, train, test)
-    is_test = held_out_rows(train, test_fraction, seed=0, key="data.test_fraction")
+    is_test = held_out_rows(train, test_fraction, seed=0, argument="test_fraction")
     return DataSet(classes, train[~is_test], train[is_test])
 
 
@@ -322,7 +323,7 @@ def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: 
     _, images = _read(Path(path), found, size, skip_unreadable, workers)
     split = Split(images, torch.zeros(len(images), dtype=torch.int64))
     fraction = min(test_fraction, HELD_OUT / len(split))
-    is_test = held_out_rows(split, fraction, seed=0, key="data.test_fraction")
+    is_test = held_out_rows(split, fraction, seed=0, argument="test_fraction")
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 
@@ -335,7 +336,7 @@ def _folder_split(root: Path, classes: tuple[str, ...], size: int, skip_unreadab
     """Read the images of class folders, with their labels."""
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)
-    labels = [class_index(classes, item.label, f"data.path={root}") for item in found]
+    labels = [class_index(classes, item.label, str(root)) for item in found]
     return Split(images, torch.tensor(labels))
 
 

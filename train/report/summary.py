@@ -206,7 +206,7 @@ def summarize(folder: Path) -> RunSummary:
         problem = f"{folder}: {files} is not as `pnb-train` wrote it ({reason})"
         raise InputError(f"{problem}: use another run") from error
     if summary is None:
-        remedy = "let it finish, or resume it with train.resume=true"
+        remedy = "let it finish, or resume it"
         raise InputError(f"{folder} holds no finished run: {remedy}")
     return summary
 

@@ -78,15 +78,15 @@ def load_run(
         32
     """
     if weights is not None:
-        given = f"weights={weights} is not for classifier={RUN}{run}"
-        raise InputError(f"{given}, which has its own: leave it out")
+        given = f"weights={weights} is not for {RUN}{run}"
+        raise InputError(f"{given}, which has its own: leave it out", "weights")
     require_kind("model", model, str | None, "python:package.module:function, or None")
     path, state = load_selected(as_path("run", run))
     shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         problem = f"the network in {path} is made by {name}"
-        attack = "for an attack, classifier=python: with a function that loads the weights"
+        attack = f"for an attack, name {PYTHON}MODULE:FUNCTION, a function that loads the weights"
         raise InputError(f"{problem}: give model={name} to run that code or, {attack}")
     with of_one_architecture(path):
         size = int(shape.pop("size"))
@@ -167,7 +167,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     path = selected_file(run)
     if path is None:
         problem = f"run={run} holds neither {BEST} nor {PUBLISHED}"
-        raise InputError(f"{problem}: give a folder that pnb-train wrote")
+        raise InputError(f"{problem}: give a folder that pnb-train wrote", "run")
     if path.suffix == ".safetensors":
         return path, _load_published(path)
     return path, load(path)

@@ -124,7 +124,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     Raises:
         InputError: There is no such precision.
     """
-    require_choice("train.precision", precision, ("auto", *PRECISIONS))
+    require_choice("precision", precision, ("auto", *PRECISIONS))
     if device.type == "cuda":
         if precision != "auto":
             return precision
@@ -133,7 +133,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     is_native = device.type == "cpu" and _computes_in_bfloat16()
     if precision == "bfloat16" and not is_native:
         slow = "this CPU emulates bfloat16, some 10 times slower than float32"
-        console.warning("%s: leave train.precision out", slow)
+        console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
     is_depthwise = trained is not None and any(
@@ -187,8 +187,8 @@ def compiles(choice: str, device: torch.device) -> bool:
         InputError: The choice is "always" on a CPU, which has no graphs to replay.
     """
     if choice == "always" and device.type == "cpu":
-        problem = "train.compile=always is for a GPU, whose graphs it replays"
-        raise InputError(f"{problem}: use auto or never")
+        problem = "choice=always is for a GPU, whose graphs it replays"
+        raise InputError(f"{problem}: use auto or never", "choice")
     if choice != "auto" or device.type != "cuda" or distributed.world_size() > 1:
         return choice == "always"
     try:
@@ -237,7 +237,8 @@ def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
         The rasterizer.
 
     Raises:
-        InputError: If it does not start on this machine. The sentence begins with its key.
+        InputError: If it does not start on this machine. The sentence begins with the
+            field `rasterizer`.
     """
-    with keyed("renderer.rasterizer"), announced("starting the rasterizer"):
+    with keyed("rasterizer"), announced("starting the rasterizer"):
         return choose(settings.rasterizer)

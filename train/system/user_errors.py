@@ -4,9 +4,11 @@ import errno
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 
 from renderer.errors import InputError, is_out_of_memory
+from renderer.settings import Settings
 
 # Errors of a full disk, a full quota and a file that is too large.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -36,6 +38,43 @@ def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
         if str(error).startswith(key):
             raise
         raise error.within(key, names) from error
+
+
+@contextmanager
+def renamed(**keys: str) -> Iterator[None]:
+    """Put keys of the settings in the place of Python arguments in error messages.
+
+    A function of the library names its own argument. A caller that took the
+    value of this argument from a setting says which setting it was. Messages
+    about other arguments stay as they are.
+
+    Args:
+        **keys: The key for each argument, such as `name="train.init_from"`.
+
+    Raises:
+        InputError: If the block raises it. The message starts with the key if
+            it started with one of the arguments.
+    """
+    try:
+        yield
+    except InputError as error:
+        key = keys.get(error.argument)
+        if key is None:
+            raise
+        raise InputError(key + str(error).removeprefix(error.argument), key) from error
+
+
+def keys_of(key: str, settings: Settings) -> dict[str, str]:
+    """Return the key of each field of settings, for `renamed`.
+
+    Args:
+        key: Key of the settings, such as "train".
+        settings: The settings.
+
+    Returns:
+        The keys by field, such as "train.epochs" for "epochs".
+    """
+    return {field.name: f"{key}.{field.name}" for field in fields(settings)}
 
 
 def one_sentence(error: BaseException) -> str | None:

@@ -18,6 +18,7 @@ from train.runs.saved_networks import is_classifier, load_selected, of_one_archi
 from train.settings import WIDERESNET, ExperimentSettings
 from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
+from train.system.user_errors import renamed
 
 # What a network has in common with one that begins with its weights.
 SHARED = ("classes", "size", "name", "depth", "width")
@@ -106,14 +107,16 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return _classifier(name, settings.weights, settings.data.size)
     if settings.weights is not None:
         given = f"weights={settings.weights} is not for train.init_from={name}"
-        raise InputError(f"{given}, which has its own: leave it out")
-    path, state = load_selected(Path(name))
+        raise InputError(f"{given}, which has its own: leave it out", "weights")
+    with renamed(run="train.init_from"):
+        path, state = load_selected(Path(name))
     return Initial(path, state["architecture"], state["model"])
 
 
 def _classifier(name: str, weights: str | None, size: int | None) -> Initial:
     """Load a classifier that was trained elsewhere, for images of its own size or another one."""
-    classifier = load_classifier(name, weights)
+    with renamed(name="train.init_from"):
+        classifier = load_classifier(name, weights)
     network = cast(nn.Module, classifier.function)
     shape = {"name": name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)

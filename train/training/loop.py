@@ -34,6 +34,7 @@ from train.runs.run_log import PHASES, RunLog
 from train.settings import TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
 from train.system.processes import Interruption, replicated, summed
+from train.system.user_errors import renamed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
@@ -139,8 +140,8 @@ class Trainer:
     ):
         _require_equal_shares(settings)
         if settings.ranking and not service.studied:
-            needed = "name some in scene.hard_negatives or augment.folder"
-            raise InputError(f"train.ranking ranks hard negatives: {needed}")
+            needed = "name some in the scene, or give a folder of images of other things"
+            raise InputError(f"ranking ranks hard negatives: {needed}", "ranking")
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -189,7 +190,9 @@ class Trainer:
         self._baseline = Baseline(settings.augmentation, self.model, self.seed, studied[1:])
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
-        if compiles(settings.compile, self.device):
+        with renamed(choice="compile"):
+            is_compiled = compiles(settings.compile, self.device)
+        if is_compiled:
             torch.compiler.reset()  # torch limits the graphs of all runs of a process.
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
             self._attacked = GraphedModel(self.model)
@@ -386,10 +389,10 @@ class Trainer:
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
             settings = self.settings
-            rate = f"train.learning_rate={settings.learning_rate}"
-            decay = f"train.weight_decay={settings.weight_decay}"
+            rate = f"learning_rate={settings.learning_rate}"
+            decay = f"weight_decay={settings.weight_decay}"
             effect = f"made the loss or weights NaN or infinite in epoch {epoch}"
-            raise InputError(f"{rate} with {decay} {effect}: set lower ones")
+            raise InputError(f"{rate} with {decay} {effect}: set lower ones", "learning_rate")
 
     def _save(self) -> None:
         """Write last.pt, keeping the one before, and best.pt if there is a better network."""
@@ -488,7 +491,7 @@ class Trainer:
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             reason = in_one_line(error)
             fault = f"the checkpoint in {self.folder} is not one that this run can go on from"
-            remedy = f"restore {checkpoint.LAST}, or start in another folder with run="
+            remedy = f"restore {checkpoint.LAST}, or start in another folder"
             raise InputError(f"{fault} ({reason}): {remedy}") from error
         self._require_own_best()
         if problem:
@@ -520,7 +523,7 @@ class Trainer:
                     raise ValueError("its accuracy is not the one that this run had")
         except (LookupError, TypeError, ValueError) as error:
             fault = f"{path} is not the network that this run kept ({in_one_line(error)})"
-            remedy = f"restore {checkpoint.BEST}, or start in another folder with run="
+            remedy = f"restore {checkpoint.BEST}, or start in another folder"
             raise InputError(f"{fault}: {remedy}") from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
@@ -533,8 +536,9 @@ def _require_equal_shares(settings: TrainSettings) -> None:
     """Raise InputError where a batch cannot be divided among processes and parts."""
     processes = distributed.world_size()
     if settings.batch_size % (processes * settings.accumulate):
-        divisor = f"{processes} processes × train.accumulate={settings.accumulate}"
-        raise InputError(f"train.batch_size={settings.batch_size} is no multiple of {divisor}")
+        divisor = f"{processes} processes × accumulate={settings.accumulate}"
+        message = f"batch_size={settings.batch_size} is no multiple of {divisor}"
+        raise InputError(message, "batch_size")
 
 
 @torch.no_grad()

@@ -112,7 +112,7 @@ def freeze(network: nn.Module, stage: str) -> None:
         frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
     if not frozen:
         parts = nearest(stage, sorted(set(modules)))
-        fault = f"train.freeze={stage} is no part of the network"
-        raise InputError(f"{fault}: choose one, such as {parts}")
+        fault = f"stage={stage} is no part of the network"
+        raise InputError(f"{fault}: choose one, such as {parts}", "stage")
     for parameter in list(network.parameters())[: frozen[-1] + 1]:
         parameter.requires_grad_(False)

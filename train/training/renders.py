@@ -19,7 +19,7 @@ from train.data.sets import DataSet
 from train.settings import OTHER, ExperimentSettings, label_names
 from train.system.device import choose_rasterizer
 from train.system.processes import first_process_first
-from train.system.user_errors import keyed
+from train.system.user_errors import keyed, keys_of, renamed
 
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
@@ -77,7 +77,8 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
 
 def _build_scene(settings: ExperimentSettings, size: int, device: torch.device, phases: Phases) -> Scene:
     """Build the scene of a run's meshes, in the first process before the others."""
-    rasterizer = choose_rasterizer(settings.renderer)
+    with renamed(**keys_of("renderer", settings.renderer)):
+        rasterizer = choose_rasterizer(settings.renderer)
     console.info("rasterizer: %s", rasterizer.description)
     with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
         return build_scene(

@@ -29,6 +29,7 @@ from train.runs.run_log import BEFORE, RunLog, remove_run
 from train.runs.saved_networks import WEIGHTS, export, without_normalization
 from train.settings import ExperimentSettings
 from train.system.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
+from train.system.user_errors import keys_of, renamed
 from train.training.initial import CachedModel, Initial, ValidationPart, choose_validation
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
@@ -89,7 +90,8 @@ class Run:
         set_deterministic(settings.train.deterministic)
         before = self._require_folder()
         part = choose_validation(settings, self.data, self.initial)
-        self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
+        with renamed(fraction="data.validation"):
+            self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
         self.trainer = build_trainer(settings, self.data, self.folder, self.initial, part, self._asked_threads(before))
         self._threads = torch.get_num_threads()
         if before is not None:
@@ -117,7 +119,8 @@ class Run:
         if self.trainer.initial:
             self._score_initial(self.trainer.initial)
         split = self.data.train.to(self.trainer.device)
-        self.trainer.fit(split, self.held_out, self.log)
+        with renamed(**keys_of("train", self.settings.train)):
+            self.trainer.fit(split, self.held_out, self.log)
 
     def score(self) -> dict[str, float]:
         """Score the selected network on the test images and the photographs, once.
@@ -292,11 +295,11 @@ def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | No
     if not data.labeled:
         if not (initial and settings.train.distillation):
             missing = "set train.init_from and train.distillation"
-            problem = f"data={settings.data.name}: a network keeps its answers on it"
+            problem = f"data.name={settings.data.name}: a network keeps its answers on it"
             raise InputError(f"{problem}: {missing}")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
-        return relabeled(data, initial.classes, f"data={settings.data.name}")
+        return relabeled(data, initial.classes, f"data.name={settings.data.name}")
     return data
 
 
@@ -324,14 +327,17 @@ def build_trainer(
     Raises:
         InputError: The network, the renders or the initial weights do not fit together.
     """
-    device = choose_device(settings.train.device)
+    keys = keys_of("train", settings.train)
+    with renamed(**keys):
+        device = choose_device(settings.train.device)
     shape = _network_shape(settings, initial)
     images = data.train.images
     if not isinstance(images, Tensor):
         images = data.train.sample(SAMPLED)
     mean, std = channel_statistics(images)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
+    with renamed(**keys_of("model", settings.model)):
+        network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {
         "classes": list(data.classes),
         "size": data.size,
@@ -341,21 +347,19 @@ def build_trainer(
     if initial:
         initial.copy_to(network, facts)
     if settings.train.freeze:
-        freeze(without_normalization(network), settings.train.freeze)
-    precision = choose_precision(settings.train.precision, device, network)
+        with renamed(stage="train.freeze"):
+            freeze(without_normalization(network), settings.train.freeze)
+    with renamed(**keys):
+        precision = choose_precision(settings.train.precision, device, network)
     model = MixedPrecision(network.to(device), precision)
     torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
     recipe = settings.train
     if recipe.eval_mode is None:
         recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
-    return Trainer(
-        recipe,
-        model,
-        describe(network, **facts, validation=validation.record),
-        build_service(settings, data, device),
-        folder,
-        data.labeled,
-    )
+    description = describe(network, **facts, validation=validation.record)
+    service = build_service(settings, data, device)
+    with renamed(**keys):
+        return Trainer(recipe, model, description, service, folder, data.labeled)
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
@@ -364,7 +368,7 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     if initial is None or not initial.is_classifier:
         return shape
     if shape.get("name", initial.name) != initial.name:
-        problem = f"model={shape['name']}: train.init_from={initial.source} has its own network"
+        problem = f"model.name={shape['name']}: train.init_from={initial.source} has its own network"
         raise InputError(f"{problem}: leave it out")
     return {"name": initial.name, CLASSIFIER: True}
 

@@ -127,6 +127,8 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
 
 
 REFUSED = [
+    (["classifier=resnet18"], "classifier=resnet18 is not known: choose one of"),
+    (["transfer.classifiers=[resnet18]"], "transfer.classifiers=resnet18 is not known: choose one of"),
     (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network is not known: give names"),
     (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class of the model: choose one, such"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry cannot be transferred"),

@@ -99,7 +99,7 @@ def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, ti
     [
         (["attack.restarts=2"], r"restarts draws from the norm-balls: set the radius of every parameter"),
         (["scene.meshes=[]"], r"^scene\.meshes must not be empty"),
-        (["label=mango"], r"classifier=by_color: 'mango' is not a class of the model"),
+        (["label=mango"], r"classifier by_color: 'mango' is not a class of the model"),
         (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
         (["target=[[lime]]"], r"target: give a class, least_likely, or a list of classes"),
         (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),

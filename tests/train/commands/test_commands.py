@@ -98,13 +98,13 @@ def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_rea
 
 WRONG = [
     ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe must be true or false"),
-    ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
+    ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear' is not a class of the model"),
     ([*EVALUATE, "label=[]"], "label=[] must name a class, or several, each once"),
-    ([*EVALUATE, "label=[fig,pear]"], "classifier=run:1.10: 'pear' is not a class of the model"),
+    ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear' is not a class of the model"),
     ([*EVALUATE, "classifier=python:own:build"], "give one network"),
     ([*EVALUATE, "run=null", "classifier=python:own:build", "model=python:a:b"], "model=python:a:b is for"),
     ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
-    ([*EVALUATE, "weights=b"], "weights=b is not for classifier=run:1.10"),
+    ([*EVALUATE, "weights=b"], "weights=b is not for run:1.10"),
     ([*EVALUATE, "out=file"], "out=file cannot be written to (Not a directory): choose another folder"),
     (["compare"], "runs is not set: give runs=..."),
     (["compare", "runs=[a,b,./a]"], "runs names a twice"),

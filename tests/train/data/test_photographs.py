@@ -204,7 +204,7 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
 
     save(tmp_path / "good.png", plain())
     found = find_photographs(tmp_path, CLASSES, "orange")
-    with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=true"):
+    with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=True"):
         load_photographs(tmp_path, found)
     loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
     assert [str(photograph.path) for photograph in loaded] == ["good.png"]

@@ -12,7 +12,7 @@ from train.report.summary import summarize
 def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
     if lines is not None:
         (tmp_path / "metrics.jsonl").write_text(lines)
-    with pytest.raises(InputError, match=r"holds no finished run: let it finish, or resume it with train.resume=true"):
+    with pytest.raises(InputError, match=r"holds no finished run: let it finish, or resume it"):
         summarize(tmp_path)
 
 

@@ -110,11 +110,11 @@ def test_labeled_folders_are_scored_in_the_networks_classes_before_and_after(tun
     [
         ("label=ornage", "label: 'ornage' is not a class of the model: choose one, such as orange"),
         ("weights=absent.pt", "absent.pt does not exist"),
-        ("train.init_from=torchvision:resnet18", r"weights=.* are not of classifier=torchvision:resnet18 "),
+        ("train.init_from=torchvision:resnet18", r"weights=.* are not of torchvision:resnet18 "),
         ("train.init_from=pretrained/none", "weights=.* is not for train.init_from=pretrained/none"),
         (
             "model.name=torchvision:resnet18",
-            f"model=torchvision:resnet18: train.init_from=torchvision:{NAME} has its own",
+            f"model.name=torchvision:resnet18: train.init_from=torchvision:{NAME} has its own",
         ),
         ("data.path=absent", "absent is not a folder"),
         ("train.distillation=0", "a network keeps its answers on it: set train.init_from and train.distillation"),

@@ -264,7 +264,7 @@ def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trai
 
 
 def test_a_stage_that_the_network_lacks_is_refused():
-    with pytest.raises(InputError, match=r"\bfreeze=group\.1\b.*groups"):
+    with pytest.raises(InputError, match=r"^stage=group\.1\b.*groups"):
         freeze(WideResNet(3, 10, 1, dropout=0.0), "group.1")
 
 

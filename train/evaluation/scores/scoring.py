@@ -313,9 +313,10 @@ def choose_operating_points(
         )
         count = len(log_odds)
         if count * exact_rate < 1:
-            fault = f"calibrate={folder} has {count} images of other things than {name}"
+            fault = f"folder={folder} has {count} images of other things than {name}"
             least = math.ceil(1 / exact_rate)
-            raise InputError(f"{fault}: give at least {least} for false_positive_rate={rate}")
+            advice = f"give at least {least} for false_positive_rate={rate}"
+            raise InputError(f"{fault}: {advice}", "folder")
         (threshold,) = thresholds(log_odds, np.ones(count, int), [str(rate)])
         points.append(
             OperatingPoint(
