@@ -4,7 +4,6 @@ import errno
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 
 from renderer.errors import InputError, is_out_of_memory
@@ -74,7 +73,7 @@ def keys_of(key: str, settings: Settings) -> dict[str, str]:
     Returns:
         The keys by field, such as "train.epochs" for "epochs".
     """
-    return {field.name: f"{key}.{field.name}" for field in fields(settings)}
+    return {name: f"{key}.{name}" for name in vars(settings)}
 
 
 def one_sentence(error: BaseException) -> str | None:
