@@ -251,7 +251,11 @@ def megabytes_of(operator: TransferOperator) -> float:
 
 
 def time_build(mesh: Mesh, size: int, samples: int, case: Case) -> float:
-    """Return the seconds per view of building the operators of VIEWS views, the better of two."""
+    """Return how many seconds it takes to build an operator.
+
+    The time is averaged over VIEWS views. It is measured twice, and the smaller
+    result counts.
+    """
     cameras = orbit_cameras(VIEWS, 2.2)
     call = partial(build, mesh, size, samples, case, cameras)
     seconds = repeat(call, timer=time.process_time, number=1, repeat=2)

@@ -23,9 +23,10 @@ def shade_by_face(
     light: Tensor,
     albedo: Tensor,
 ) -> Tensor:
-    """Compute what `shading.radiance` computes, by plain autograd at its cheapest.
+    """Compute the same radiance as `shading.radiance`, with operations of torch alone.
 
-    Each face is shaded once, instead of once for each of its samples.
+    Each face is shaded once, instead of once for each of its samples. This is
+    the cheapest way for autograd.
 
     Args:
         fragments: The S visible samples and the P covered pixels.

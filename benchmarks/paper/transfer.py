@@ -82,11 +82,11 @@ class Adversaries:
     further: Tensor
 
     def first_random(self, draws: torch.Generator) -> Tensor:
-        """Return random changes that are as large as those of the first success."""
+        """Return `first` with random signs of its changes from the start."""
         return with_random_signs(self.first, self.start, draws)
 
     def further_random(self, draws: torch.Generator) -> Tensor:
-        """Return random changes that are as large as those of the further steps."""
+        """Return `further` with random signs of its changes from the start."""
         return with_random_signs(self.further, self.start, draws)
 
 
