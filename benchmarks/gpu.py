@@ -53,7 +53,8 @@ MORE_STEPS = 6
 ROUNDS = 5
 # Samples per side of the images that the question `rasterizers` draws.
 SAMPLES_PER_SIDE = (64, 512, 2048)
-# No logit reaches this margin, so that every attack takes all its steps.
+# An attack ends when its margin is reached. No logit reaches this margin, so
+# that every attack takes all its steps.
 ENDLESS_MARGIN = 1e3
 # Longest text of an error, or of the end of an output, in characters.
 MAX_TEXT = 2000

@@ -86,7 +86,7 @@ def attack_orange(classifier: augment.Classifier, mesh: str, folder: Path) -> No
     )
     result = augment.attack(classifier, scene, "balloon", settings)
 
-    # The environment light comes first in the basis, and then the projector.
+    # The basis has two parts: the environment light, and then the projector.
     pattern_rows, projector = parts_of(scene.basis)[1]
     light = result.conditions.light.clone()
     pattern = to_bytes(light[0, pattern_rows] / projector.power)

@@ -131,7 +131,8 @@ class Peer:
         self.coefficients = coefficients.to(device)
         self.irradiance = (harmonics.T * factors).float().contiguous().to(device)
 
-        # Weight the faces in their pixels, and give the rest to the background.
+        # A face counts with the part of the pixel that it covers. The background
+        # has the part of each pixel that no face covers.
         colors = torch.from_numpy(mesh.corner_colors[faces, 0])
         weight = pairs.coverage * colors[pair_to_visible_face].T
         self.weight = weight.contiguous().to(device)

@@ -72,10 +72,10 @@ PANELS_PER_ROW = 4
 
 @dataclass(frozen=True)
 class Contender:
-    """A way to the image and the gradient.
+    """A method that renders the image and computes the gradient.
 
     Attributes:
-        setting: Name of the way.
+        setting: Name of the method with its settings.
         samples: Samples per side of a pixel.
         degree: Degree of the light's harmonics.
         step: Step whose errors are measured.
@@ -226,7 +226,8 @@ class LightRenders:
         )
         renders: dict[str, Callable[[Tensor], Tensor]] = {}
         if self.samples == 1:
-            # With more samples, these two take as many times as long.
+            # The time of these two grows in proportion to the samples, so that
+            # one sample per pixel is enough to know it.
             renders["nothing"] = self.rasterize_and_shade
             renders["visibility"] = self.shade
         renders["harmonics of the seen faces"] = peer.radiance
@@ -379,8 +380,8 @@ def describe_contender(contender: Contender, panel: str, size: int) -> Row:
 def mark_front(rows: Sequence[Row]) -> None:
     """Set the column "front", which says that no other contender beats a contender.
 
-    A contender is beaten by another one with a time and an error that are at
-    most its own, unless both are equal.
+    Another contender beats it with a smaller time and no larger error, or with a
+    smaller error and no larger time.
 
     Args:
         rows: Rows with their times and errors, which are changed.

@@ -70,7 +70,7 @@ class LightStep:
         self.background = light.new_full((1, 1), BACKGROUND)
 
     def __call__(self) -> Result:
-        """Take the step, and return the gradient by the light."""
+        """Render the light, and return the radiance and the gradient by the light."""
         light = self.light.clone().requires_grad_()
         radiance = self.operator.radiance(light)
         image = tonemap(radiance, self.coverage, self.background)
@@ -110,7 +110,7 @@ class VertexStep:
             self.kept_surface = view.visible_surface(samples, self.vertices)
 
     def __call__(self) -> Result:
-        """Take the step, and return the gradient by the vertices."""
+        """Render the vertices, and return the radiance and the gradient by the vertices."""
         vertices = self.vertices.clone().requires_grad_()
         surface = self.kept_surface
         if surface is None:

@@ -133,7 +133,7 @@ def collate(
 
 
 class PlainLoop:
-    """Training loop that one writes with torchvision, without compilation.
+    """Training loop as one writes it with torchvision, without `torch.compile`.
 
     Args:
         options: Parsed command line.

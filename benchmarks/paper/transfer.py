@@ -23,7 +23,8 @@ from renderer.errors import FACTOR
 
 # Number of steps after the first success.
 FURTHER_STEPS = 10
-# No logit reaches this margin, so that a descent takes all its steps.
+# A descent ends when its margin is reached. No logit reaches this margin, so
+# that a descent takes all its steps.
 ENDLESS_MARGIN = FACTOR
 # Numbers of views that share an attacked light or shape.
 ATTACKED_VIEW_COUNTS = (1, 5)
