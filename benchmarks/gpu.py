@@ -46,11 +46,15 @@ MESH_COUNT = 2
 VIEW_COUNT = 10
 # Steps of each attack.
 STEPS = 10
+# Steps of the two attacks that the question `synchronizations` compares.
+FEWER_STEPS = 2
+MORE_STEPS = 6
 # Rounds in which the ways of a question take turns.
 ROUNDS = 5
 # Samples per side of the images that the question `rasterizers` draws.
 SAMPLES_PER_SIDE = (64, 512, 2048)
-# No logit reaches this margin, so that every attack takes all its steps.
+# An attack ends when its margin is reached. No logit reaches this margin, so
+# that every attack takes all its steps.
 ENDLESS_MARGIN = 1e3
 # Longest text of an error, or of the end of an output, in characters.
 MAX_TEXT = 2000
@@ -269,19 +273,19 @@ def synchronizations(device: str) -> Iterator[Row]:
         device: Device of the attacks, a GPU.
 
     Yields:
-        A row for each place in the code, with the number of times per step. The
-        attacks are on the light and on the shape.
+        A row for each place in the code, with the number of waits per step.
+        There are rows of an attack on the light, and of one on the shape.
     """
     attacked_parameters: dict[str, dict[str, StepSettings]] = {"light": {}, "shape": SHAPE}
     for name, parameters in attacked_parameters.items():
-        counts = Counter(count_synchronizations(device, steps=6, parameters=parameters))
-        # The difference leaves out what happens before and after the steps.
-        counts.subtract(count_synchronizations(device, steps=2, parameters=parameters))
+        counts = count_synchronizations(device, MORE_STEPS, parameters)
+        # Waits before and after the steps are in both counts, and cancel.
+        counts.subtract(count_synchronizations(device, FEWER_STEPS, parameters))
         for place, count in counts.most_common():
             yield {
                 "question": f"synchronizations in a step on {name}",
                 "way": place,
-                "value": count / (6 - 2),
+                "value": count / (MORE_STEPS - FEWER_STEPS),
             }
 
 

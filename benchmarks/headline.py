@@ -86,7 +86,7 @@ def attack_orange(classifier: augment.Classifier, mesh: str, folder: Path) -> No
     )
     result = augment.attack(classifier, scene, "balloon", settings)
 
-    # The environment light comes first in the basis, and then the projector.
+    # The basis has two parts: the environment light, and then the projector.
     pattern_rows, projector = parts_of(scene.basis)[1]
     light = result.conditions.light.clone()
     pattern = to_bytes(light[0, pattern_rows] / projector.power)
@@ -173,8 +173,9 @@ class Bar:
 def draw_bars(card: Figure, runs: Sequence[Path]) -> None:
     """Draw AUC and recall at three false-positive rates, before and after hardening.
 
-    The bar before is the network that all runs started from, with its 95%
-    interval. The bar after is the mean of the runs, with their range.
+    Each metric has two bars. The gray bar is the network that all runs started
+    from, with its 95% interval. The blue bar is the mean of the runs, with their
+    lowest and highest value.
 
     Args:
         card: Figure to draw on.
@@ -186,20 +187,27 @@ def draw_bars(card: Figure, runs: Sequence[Path]) -> None:
     auc, *recalls = RANKED
     metrics = [*recalls, auc]
     for row, metric in enumerate(metrics):
-        seeds = [read_metric(summary, metric).value for summary in after]
-        mean = Estimate(fmean(seeds), min(seeds), max(seeds))
+        values = [read_metric(summary, metric).value for summary in after]
+        mean_after = Estimate(fmean(values), min(values), max(values))
         draw_bar(axes, row, Bar(-0.19, GRAY_BAR, read_metric(before, metric)))
-        draw_bar(axes, row, Bar(0.19, BLUE, mean))
+        draw_bar(axes, row, Bar(0.19, BLUE, mean_after))
     axes.set(xlim=(0, 1.14), ylim=(3.5, -0.5), xticks=[])
     titles = [metric_title(name).replace(" at ", "\nat ") for name in metrics]
     axes.set_yticks(range(len(titles)), titles)
     axes.tick_params(axis="y", length=0, labelsize=15, labelcolor=INK)
     axes.spines[["top", "right", "bottom"]].set_visible(False)
-    counts = "on {positives} path-traced oranges, {negatives} other things"
+    write_legend(axes, before["n"], len(after))
+
+
+def write_legend(axes: Axes, counts: dict[str, int], seed_count: int) -> None:
+    """Write a title above the bars, and what their colors mean below them."""
+    positives = counts["positives"]
+    negatives = counts["negatives"]
+    images = f"on {positives} path-traced oranges, {negatives} other things"
     label(axes, -0.4, 1.13, "Another network, hardened", INK, size=17)
-    label(axes, -0.4, 1.035, counts.format(**before["n"]), GRAY)
+    label(axes, -0.4, 1.035, images, GRAY)
     label(axes, -0.4, -0.13, "■ before, 95 %", GRAY)
-    label(axes, 0.2, -0.13, f"■ after, {len(after)} seeds", BLUE)
+    label(axes, 0.2, -0.13, f"■ after, {seed_count} seeds", BLUE)
 
 
 def read_summary(run: Path) -> dict:

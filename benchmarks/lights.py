@@ -251,7 +251,11 @@ def megabytes_of(operator: TransferOperator) -> float:
 
 
 def time_build(mesh: Mesh, size: int, samples: int, case: Case) -> float:
-    """Return the seconds per view of building the operators of VIEWS views, the better of two."""
+    """Return how many seconds it takes to build an operator.
+
+    The time is averaged over VIEWS views. It is measured twice, and the smaller
+    result counts.
+    """
     cameras = orbit_cameras(VIEWS, 2.2)
     call = partial(build, mesh, size, samples, case, cameras)
     seconds = repeat(call, timer=time.process_time, number=1, repeat=2)
@@ -360,7 +364,7 @@ def compare_with_mitsuba(size: int) -> Iterator[Row]:
 
 
 def differences_from_mitsuba(mesh: Mesh, size: int, case: Case) -> Row:
-    """Measure how far images are from the image by Mitsuba.
+    """Measure how far three of our images are from the image by Mitsuba.
 
     Args:
         mesh: Mesh to render.
@@ -368,10 +372,12 @@ def differences_from_mitsuba(mesh: Mesh, size: int, case: Case) -> Row:
         case: Kind of light paths.
 
     Returns:
-        Row with the root mean square of the difference inside the outline of
-        the mesh, divided by the brightest value, for our usual image, our
-        converged image, and our image of direct light alone. "image_noise" is
-        the standard error of Mitsuba's image in the same unit.
+        Row with the errors of our usual image ("image_error"), of our converged
+        image ("image_error_converged") and of our image of direct light alone
+        ("image_error_direct"). An error is the root mean square of the
+        difference inside the outline of the mesh, divided by the brightest
+        value of Mitsuba's image. "image_noise" is the standard error of
+        Mitsuba's image in the same unit.
     """
     # This probe is positive all around.
     light = load_light("st_peters")

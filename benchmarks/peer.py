@@ -124,12 +124,15 @@ class Peer:
         self.pair_to_covered_pixel = torch.from_numpy(pair_to_covered_pixel).to(device)
         self.pair_to_pixel = self.pixels[self.pair_to_covered_pixel]
 
+        # Evaluate the harmonics once for each visible face.
         corners = torch.from_numpy(mesh.vertices[mesh.faces[faces]])
         normals = reference.face_normals(corners)
         harmonics, coefficients, factors = reference.reaching_harmonics(normals, degree)
         self.coefficients = coefficients.to(device)
         self.irradiance = (harmonics.T * factors).float().contiguous().to(device)
 
+        # A face counts with the part of the pixel that it covers. The background
+        # has the part of each pixel that no face covers.
         colors = torch.from_numpy(mesh.corner_colors[faces, 0])
         weight = pairs.coverage * colors[pair_to_visible_face].T
         self.weight = weight.contiguous().to(device)

@@ -72,10 +72,10 @@ PANELS_PER_ROW = 4
 
 @dataclass(frozen=True)
 class Contender:
-    """A way to the image and the gradient.
+    """A method that renders the image and computes the gradient.
 
     Attributes:
-        setting: Name of the way.
+        setting: Name of the method with its settings.
         samples: Samples per side of a pixel.
         degree: Degree of the light's harmonics.
         step: Step whose errors are measured.
@@ -226,7 +226,8 @@ class LightRenders:
         )
         renders: dict[str, Callable[[Tensor], Tensor]] = {}
         if self.samples == 1:
-            # With more samples, these two take as many times as long.
+            # The time of these two grows in proportion to the samples, so that
+            # one sample per pixel is enough to know it.
             renders["nothing"] = self.rasterize_and_shade
             renders["visibility"] = self.shade
         renders["harmonics of the seen faces"] = peer.radiance
@@ -334,8 +335,7 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row
         with_mitsuba: Whether Mitsuba 3 is a contender, too.
 
     Returns:
-        A row for each contender. Its column "front" says whether no other
-        contender is as fast and as accurate, and better in one of the two.
+        A row for each contender, with the column "front" of `mark_front`.
     """
     panel = PANELS[title]
     exact = Converged(view, panel.irradiance)
@@ -346,17 +346,7 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row
         contenders.append(Contender("Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step))
     rows: list[Row] = []
     for contender in contenders:
-        is_default = contender.samples == SAMPLES and contender.setting in DEFAULT_SETTINGS
-        row = {
-            "panel": f"{title}, {view.size}²",
-            "setting": contender.setting,
-            # This keeps the place of the column until the time is measured.
-            "time_ms": None,
-            "degree": contender.degree,
-            "samples": contender.samples**2,
-            "size": view.size,
-            "default": is_default,
-        }
+        row = describe_contender(contender, f"{title}, {view.size}²", view.size)
         rows.append(row | exact.errors(contender.step, exact_gradient))
     calls = {index: contender.call for index, contender in enumerate(contenders)}
     for index, milliseconds in medians(calls, rounds, view.device).items():
@@ -366,8 +356,32 @@ def measure(title: str, view: View, rounds: int, with_mitsuba: bool) -> list[Row
     return rows
 
 
+def describe_contender(contender: Contender, panel: str, size: int) -> Row:
+    """Return the row of a contender without its time and errors.
+
+    Args:
+        contender: Contender to describe.
+        panel: Title of the panel with the size.
+        size: Pixels per side of the image.
+    """
+    is_default = contender.samples == SAMPLES and contender.setting in DEFAULT_SETTINGS
+    return {
+        "panel": panel,
+        "setting": contender.setting,
+        # None keeps the place of the column until the time is measured.
+        "time_ms": None,
+        "degree": contender.degree,
+        "samples": contender.samples**2,
+        "size": size,
+        "default": is_default,
+    }
+
+
 def mark_front(rows: Sequence[Row]) -> None:
-    """Set the column "front" of the rows of a panel.
+    """Set the column "front", which says that no other contender beats a contender.
+
+    Another contender beats it with a smaller time and no larger error, or with a
+    smaller error and no larger time.
 
     Args:
         rows: Rows with their times and errors, which are changed.

@@ -170,48 +170,71 @@ def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
     maps |= {path.stem: str(path) for path in (data / "hdri").glob("*.npy")}
     files = {path.name: str(path) for path in (data / "meshes").iterdir()}
     files |= {path.name: str(path) for path in extra.rglob("*.obj")}
-    reporting_maps = [maps[name] for name in sorted(maps) if name not in CHOOSING_MAPS]
+    slides = sorted(str(path) for path in (extra / "slides").iterdir())
+    return choosing_parts(maps) | reporting_parts(maps, files, slides)
 
-    new_objects = {
-        "meshes": [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
-    }
-    trained = [
-        {"mesh": files[name], "label": LABEL, "albedo_scale": scale}
-        for name, scale in TRAINED.items()
-    ]
-    seen_objects = {"meshes": [*trained, *solids(0)]}
-    choosing_objects = {"meshes": solids(2001)}
-    patterns = {
-        **UNSEEN,
-        "patterns": UNSEEN_PATTERNS,
-        "slides": sorted(str(path) for path in (extra / "slides").iterdir()),
-        "seed": 3,
-    }
-    skies = {
-        "environments": reporting_maps,
-        "patterns": [],
-        "setups": 5 * len(reporting_maps),
-        "seed": 4,
-        "roughness": UNSEEN["roughness"],
-    }
+
+def choosing_parts(maps: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Return the settings of the parts of the choosing side.
+
+    Args:
+        maps: File of each environment map, by its name.
+    """
+    meshes = solids(2001)
     return {
         "choosing/laboratory": {
-            **choosing_objects,
+            "meshes": meshes,
             "patterns": ["gradient", "rings", "colors"],
             "setups": 240,
             "seed": 1,
         },
         "choosing/hdri": {
-            **choosing_objects,
+            "meshes": meshes,
             "environments": [maps[name] for name in CHOOSING_MAPS],
             "patterns": [],
             "setups": 80,
             "seed": 2,
         },
-        "reporting/laboratory": {**new_objects, **patterns, "setups": 200},
-        "reporting/hdri": {**new_objects, **skies},
-        "reporting/laboratory_seen_objects": {**seen_objects, **patterns, "setups": 100},
-        "reporting/hdri_seen_objects": {**seen_objects, **skies},
+    }
+
+
+def reporting_parts(
+    maps: Mapping[str, str],
+    files: Mapping[str, str],
+    slides: Sequence[str],
+) -> dict[str, dict[str, Any]]:
+    """Return the settings of the parts of the reporting side.
+
+    Args:
+        maps: File of each environment map, by its name.
+        files: File of each mesh, by its file name.
+        slides: Pictures that the projector shows.
+    """
+    new_meshes = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
+    trained_meshes = [
+        {"mesh": files[name], "label": LABEL, "albedo_scale": scale}
+        for name, scale in TRAINED.items()
+    ]
+    seen_meshes = [*trained_meshes, *solids(0)]
+    laboratory = {
+        **UNSEEN,
+        "patterns": UNSEEN_PATTERNS,
+        "slides": slides,
+        "seed": 3,
+    }
+    environments = [maps[name] for name in sorted(maps) if name not in CHOOSING_MAPS]
+    hdri = {
+        "environments": environments,
+        "patterns": [],
+        "setups": 5 * len(environments),
+        "seed": 4,
+        "roughness": UNSEEN["roughness"],
+    }
+    return {
+        "reporting/laboratory": {"meshes": new_meshes, **laboratory, "setups": 200},
+        "reporting/hdri": {"meshes": new_meshes, **hdri},
+        "reporting/laboratory_seen_objects": {"meshes": seen_meshes, **laboratory, "setups": 100},
+        "reporting/hdri_seen_objects": {"meshes": seen_meshes, **hdri},
     }
 
 
@@ -237,15 +260,17 @@ def unpack_wheel(archive: zipfile.ZipFile, extra: Path) -> None:
     for name in archive.namelist():
         file_name = Path(name)
         if name.endswith((*OUTSIDE, *TEXTURES)):
-            adapt_texture(Path(archive.extract(name, extra)))
+            adapt_texture_or_material(Path(archive.extract(name, extra)))
         elif file_name.stem in PICTURES and file_name.suffix in (".png", ".jpg"):
             (extra / "slides" / file_name.name).write_bytes(archive.read(name))
 
 
-def adapt_texture(path: Path) -> None:
-    """Resize a texture to 1024 × 1024 pixels, and remove the gray factor of a material.
+def adapt_texture_or_material(path: Path) -> None:
+    """Change an unpacked file so that its mesh is loaded with the texture as it is.
 
-    The loader of meshes would paint a texture anew for a gray factor.
+    A texture (.png) is resized to 1024 × 1024 pixels. A material (.mtl) loses the
+    gray factor 0.8 of its texture. With this factor, the loader would paint a
+    new texture. Other files stay as they are.
     """
     if path.suffix == ".png":
         Image.open(path).convert("RGB").resize((1024, 1024)).save(path)

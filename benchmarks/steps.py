@@ -23,9 +23,10 @@ def shade_by_face(
     light: Tensor,
     albedo: Tensor,
 ) -> Tensor:
-    """Compute what `shading.radiance` computes, by plain autograd at its cheapest.
+    """Compute the same radiance as `shading.radiance`, with operations of torch alone.
 
-    Each face is shaded once, instead of once for each of its samples.
+    Each face is shaded once, instead of once for each of its samples. This is
+    the cheapest way for autograd.
 
     Args:
         fragments: The S visible samples and the P covered pixels.
@@ -69,7 +70,7 @@ class LightStep:
         self.background = light.new_full((1, 1), BACKGROUND)
 
     def __call__(self) -> Result:
-        """Take the step, and return the gradient by the light."""
+        """Render the light, and return the radiance and the gradient by the light."""
         light = self.light.clone().requires_grad_()
         radiance = self.operator.radiance(light)
         image = tonemap(radiance, self.coverage, self.background)
@@ -109,7 +110,7 @@ class VertexStep:
             self.kept_surface = view.visible_surface(samples, self.vertices)
 
     def __call__(self) -> Result:
-        """Take the step, and return the gradient by the vertices."""
+        """Render the vertices, and return the radiance and the gradient by the vertices."""
         vertices = self.vertices.clone().requires_grad_()
         surface = self.kept_surface
         if surface is None:

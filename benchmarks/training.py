@@ -109,7 +109,8 @@ def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, 
 def make_certain(weight: Tensor, bias: Tensor, label: int = 0) -> None:
     """Edit the last layer of a network so that it predicts one class for every image.
 
-    The gradient of the logits is not zero.
+    The logits of the other classes still depend on the image, so that the
+    gradient of a loss is not zero.
 
     Args:
         weight: Weights of the layer, shape (classes, features), changed in
@@ -132,7 +133,7 @@ def collate(
 
 
 class PlainLoop:
-    """Training loop that one writes with torchvision, without compilation.
+    """Training loop as one writes it with torchvision, without `torch.compile`.
 
     Args:
         options: Parsed command line.

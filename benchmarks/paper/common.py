@@ -332,7 +332,7 @@ def clean_correct_views(
             if name == subject.label:
                 correct.append(view)
         drawn_count += len(views)
-        # The first batch may have no correct view.
+        # The subtraction allows for a batch that has no correct view by chance.
         if len(correct) < MIN_CORRECT_FRACTION * drawn_count - BATCH_SIZE:
             images_text = f"{len(correct)} of {drawn_count} images of {subject.name}"
             raise InputError(

@@ -113,7 +113,9 @@ def is_successful(attacked: AttackResult, values: Tensor) -> Tensor:
 
 
 def without_negative_radiance(light: Tensor) -> Tensor:
-    """Set negative radiance of a light to 0, as an environment map would.
+    """Set the negative radiance of a light to 0.
+
+    An environment map cannot hold negative radiance either.
 
     Args:
         light: SH coefficients, shape (49, 3).

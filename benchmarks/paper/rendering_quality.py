@@ -55,6 +55,7 @@ def measure_confidences(
     correct_count = 0
     while correct_count < renders:
         made_count = len(rows) * len(common.GRAYS)
+        # At least 5,000 renders are made before the search is given up.
         if made_count > max(100, renders) / common.MIN_CORRECT_FRACTION:
             counts = f"{correct_count} of {made_count} renders of {subject.name}"
             raise InputError(

@@ -83,7 +83,7 @@ def format_counts(hits: int, n: int) -> str:
 
 
 def format_percentages(value: float, low: float, high: float) -> str:
-    """Write a fraction and the ends of its interval in percent."""
+    """Write a fraction and the ends of its interval in percent, such as "89 % [81, 94]"."""
     return f"{100 * value:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
@@ -243,7 +243,7 @@ def run_time(records: Sequence[Row]) -> Cells:
         records: Records of `benchmarks.paper.run_time`.
     """
     successes = [row for row in records if row["success"]]
-    # Without successes, the table has NaN.
+    # If no attack succeeded, the table has NaN.
     steps = [row["steps"] for row in successes] or [np.nan]
     seconds = [row["seconds"] for row in successes] or [np.nan]
     medians = f"{np.median(steps):.0f} steps, {np.median(seconds):.2f} s"

@@ -23,7 +23,8 @@ from renderer.errors import FACTOR
 
 # Number of steps after the first success.
 FURTHER_STEPS = 10
-# No logit reaches this margin, so that a descent takes all its steps.
+# A descent ends when its margin is reached. No logit reaches this margin, so
+# that a descent takes all its steps.
 ENDLESS_MARGIN = FACTOR
 # Numbers of views that share an attacked light or shape.
 ATTACKED_VIEW_COUNTS = (1, 5)
@@ -82,11 +83,11 @@ class Adversaries:
     further: Tensor
 
     def first_random(self, draws: torch.Generator) -> Tensor:
-        """Return random changes that are as large as those of the first success."""
+        """Return `first` with random signs of its changes from the start."""
         return with_random_signs(self.first, self.start, draws)
 
     def further_random(self, draws: torch.Generator) -> Tensor:
-        """Return random changes that are as large as those of the further steps."""
+        """Return `further` with random signs of its changes from the start."""
         return with_random_signs(self.further, self.start, draws)
 
 

@@ -62,15 +62,13 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
 
 @pytest.fixture
 def view() -> scene.View:
-    """An ellipsoid of 162 vertices in 8 × 8 pixels."""
+    """Return a view of an ellipsoid of 162 vertices in 8 × 8 pixels."""
     return scene.View(scene.ellipsoid(2), 8, choose("numpy"))
 
 
 def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
-    """Four times as many samples per side reduce the error to less than a quarter.
-
-    Even random samples would reduce the error to a quarter.
-    """
+    # With four times as many samples per side, even random samples would reduce
+    # the error to a quarter.
     exact = scene.Converged(view)
     light = scene.coefficients(6).float()
     gradient_errors = []
@@ -92,7 +90,6 @@ def test_the_benchmarks_plain_autograd_is_the_analytic_gradient(view):
 
 @pytest.mark.parametrize(("samples", "count"), [(1, 5), (scene.SAMPLES, 4)])
 def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, count):
-    """Radiance and gradient are equal up to the rounding of float32 sums over all pixels."""
     view = scene.View(scene.ellipsoid(2), 16, choose("numpy"))
     results = [
         contender.step()
@@ -103,6 +100,7 @@ def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, c
     assert len(results) == count
     for other in others:
         assert torch.equal(other.pixels, first.pixels)
+        # Sums over all pixels are rounded to float32.
         whole_steps.require_close(
             [other.radiance, other.gradient],
             [first.radiance, first.gradient],
@@ -127,35 +125,49 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
         assert all(0 < float(row[name]) < 0.4 for name in ("image_error", "gradient_error"))
 
 
+def save_random_data(path: Path) -> None:
+    """Write a data set of random images in two classes, as data=npz reads it."""
+    rng = np.random.default_rng(0)
+    arrays = {"classes": np.array(["orange", "other"])}
+    for split in ("train", "test"):
+        arrays[f"{split}_images"] = rng.integers(0, 256, (200, 3, 32, 32), dtype=np.uint8)
+        arrays[f"{split}_labels"] = np.arange(200) % 2
+    np.savez(path, **arrays)
+
+
 @pytest.mark.slow
 def test_training_is_timed_beside_a_plain_loop(tmp_path):
-    """With attacks that take all their steps."""
-    rng, data = np.random.default_rng(0), tmp_path / "data.npz"
-    arrays = {"classes": np.array(["orange", "other"])}
-    for part in ("train", "test"):
-        arrays[f"{part}_images"] = rng.integers(0, 256, (200, 3, 32, 32), dtype=np.uint8)
-        arrays[f"{part}_labels"] = np.arange(200) % 2
-    np.savez(data, **arrays)
-    tiny = ["--images", "32", "--rounds", "1", "--depth", "10", "--width", "1", "--workers", "0"]
-    overrides = ["renderer.rasterizer=numpy", "renderer.samples=1", "augment.examples=10", "train.threads=1"]
-    out = ["--data", str(data), "--csv", str(tmp_path / "speed.csv")]
-    first, median = training.main(["speed", *tiny, *out, "--overrides", *overrides, "augment.attack.max_steps=2"])
-    assert first | {"round": "median"} == median and first["attack_steps"] == 2
+    save_random_data(tmp_path / "data.npz")
+    arguments = ["speed", "--data", str(tmp_path / "data.npz")]
+    arguments += ["--images", "32", "--rounds", "1", "--depth", "10", "--width", "1"]
+    arguments += ["--workers", "0", "--csv", str(tmp_path / "speed.csv"), "--overrides"]
+    arguments += ["renderer.rasterizer=numpy", "renderer.samples=1", "augment.examples=10"]
+    arguments += ["train.threads=1", "augment.attack.max_steps=2"]
+    first, median = training.main(arguments)
+    assert first | {"round": "median"} == median
+    # The attacked network is so certain that all attacks take both steps.
+    assert first["attack_steps"] == 2
     for loop in ("float32", "bfloat16", "data"):
         ratio = first["train_images_per_second"] / first[f"{loop}_images_per_second"]
-        assert first[f"{loop}_ratio"] == pytest.approx(ratio) and ratio > 0
+        assert ratio > 0
+        assert first[f"{loop}_ratio"] == pytest.approx(ratio)
     assert 0 < first["attack_fraction_of_epoch"] < 1
     assert len(read(tmp_path / "speed.csv")) == 2
 
 
 def test_the_cost_of_renders_is_measured_over_their_number_and_meshes(tmp_path, monkeypatch):
-    """Here in a thread, since a process would take seconds to import torch."""
-    monkeypatch.setattr(training, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers))
+    # A process would take seconds to import torch.
+    monkeypatch.setattr(
+        training,
+        "ProcessPoolExecutor",
+        lambda workers, context: ThreadPoolExecutor(workers),
+    )
     path = tmp_path / "renders.csv"
     rows = training.main(["renders", "--numbers", "10", "--meshes", "1", "2", "--csv", str(path)])
     loads = [(row["renders"], row["meshes"], row["views"]) for row in rows]
     assert loads == [(10, 1, 2), (20, 2, 4)]
-    assert all(row["attack_seconds"] > 0 and row["ms_per_render_and_pass"] > 0 for row in rows)
+    assert all(row["attack_seconds"] > 0 for row in rows)
+    assert all(row["ms_per_render_and_pass"] > 0 for row in rows)
     assert len(read(path)) == 2
 
 

@@ -1,4 +1,4 @@
-"""The sides for choosing and reporting: what they share, and that looks are logged."""
+"""The sides for choosing and reporting share nothing, and looks are logged."""
 
 import csv
 import zipfile
@@ -13,26 +13,41 @@ from PIL import Image
 from benchmarks import sides
 from train.evaluation.laboratory import lab_patterns as patterns
 
-TRAINING = {"stripes", "checkers", "spots", "half", "solid", "grace", "eucalyptus", "st_peters", *sides.TRAINED}
+# Patterns, lights and meshes of training.
+TRAINING = {
+    "stripes",
+    "checkers",
+    "spots",
+    "half",
+    "solid",
+    "grace",
+    "eucalyptus",
+    "st_peters",
+    *sides.TRAINED,
+}
+# Number of setups in each part of a side, instead of up to 240.
 SETUPS = {"choosing": 12, "reporting": 10}
-GIVEN = ["--sides", "sides", "--packages", "packages"]
+ARGUMENTS = ["--sides", "sides", "--packages", "packages"]
+LOG_HEADER = "date,commit,table,network,weights,parts,images\n"
 
 
 @pytest.fixture
 def data(tmp_path, monkeypatch) -> None:
-    """A ball in the place of each mesh, maps, and 16 photographs of two sources; a wheel with the rest."""
+    """Write small data and packages into the working folder.
+
+    A ball takes the place of each mesh. There are three environment maps and 16
+    photographs of two sources. A wheel has what comes from packages.
+    """
     monkeypatch.chdir(tmp_path)
-    ball, rng = trimesh.creation.icosphere(1), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     for folder in ("meshes", "hdri", "photos/orange", "photos/apple", "packages"):
         Path(folder).mkdir(parents=True)
-    rows = [[f"{('orange', 'apple')[n % 2]}/{n}.png", ("orange", "apple")[n % 2], f"tag{n // 8}"] for n in range(16)]
-    rows[-1][2] = sides.EXCLUDED_SOURCES[0]
-    for path in (*(f"photos/{row[0]}" for row in rows), "packages/astronaut.png"):
-        Image.fromarray(rng.integers(0, 256, (8, 8, 3), np.uint8)).save(path)
-    with open("photos/photos.csv", "w", newline="") as file:
-        csv.writer(file).writerows([["path", "class", "source_tag"], *rows])
+    write_photographs(rng)
+    save_noise(Path("packages/astronaut.png"), rng)
+    ball = trimesh.creation.icosphere(1)
     for name in (*sides.OUTSIDE, *sides.TRAINED):
-        ball.export(f"{'packages' if name.endswith('.obj') else 'meshes'}/{name}")
+        folder = "packages" if name.endswith(".obj") else "meshes"
+        ball.export(f"{folder}/{name}")
     with zipfile.ZipFile("packages/objects.whl", "w") as archive:
         for path in Path("packages").glob("*.[op]*"):
             archive.write(path)
@@ -40,27 +55,82 @@ def data(tmp_path, monkeypatch) -> None:
         np.save(f"hdri/{name}.npy", rng.random((8, 16, 3), np.float32))
 
 
-@pytest.mark.slow  # bootstraps
-def test_the_sides_share_no_image_object_or_light_and_looks_are_logged(data, monkeypatch, capsys):
+def write_photographs(rng: np.random.Generator) -> None:
+    """Write 16 photographs with their table. The last is of a source that is left out."""
+    rows = []
+    for number in range(16):
+        label = ("orange", "apple")[number % 2]
+        rows.append([f"{label}/{number}.png", label, f"tag{number // 8}"])
+    rows[-1][2] = sides.EXCLUDED_SOURCES[0]
+    for path, _, _ in rows:
+        save_noise(Path("photos", path), rng)
+    with open("photos/photos.csv", "w", newline="") as file:
+        csv.writer(file).writerows([["path", "class", "source_tag"], *rows])
+
+
+def save_noise(path: Path, rng: np.random.Generator) -> None:
+    """Write an image of 8 × 8 random pixels."""
+    Image.fromarray(rng.integers(0, 256, (8, 8, 3), np.uint8)).save(path)
+
+
+@pytest.fixture
+def made_sides(data, monkeypatch) -> None:
+    """Make both sides with few renders of 8 × 8 pixels."""
     pytest.importorskip("mitsuba")
-    whole, log = sides.parts, Path("log.csv")
-    few = lambda *folders: {k: {**part, "setups": SETUPS[k.split("/")[0]]} for k, part in whole(*folders).items()}  # noqa: E731
-    small = partial(sides.LabSettings, size=8, spp=1, bounces=1)
-    for name, value in {"parts": few, "LabSettings": small, "LOG": log}.items():
-        monkeypatch.setattr(sides, name, value)
+    all_parts = sides.parts
+
+    def small_parts(*folders):
+        parts = all_parts(*folders)
+        for name, settings in parts.items():
+            settings["setups"] = SETUPS[Path(name).parent.name]
+        return parts
+
+    monkeypatch.setattr(sides, "parts", small_parts)
+    small_lab = partial(sides.LabSettings, size=8, spp=1, bounces=1)
+    monkeypatch.setattr(sides, "LabSettings", small_lab)
     monkeypatch.setattr(patterns, "RESOLUTION", 64)
-    sides.main(["make", *GIVEN, "--data", "."])
-    images, names, photographs = [], [TRAINING], []
-    for side in SETUPS:
-        tables = [Path("sides", side, part, "photos.csv").read_text() for part in ("laboratory", "hdri")]
-        rows = [row for table in tables for row in csv.DictReader(table.splitlines())]
-        names.append({name for row in rows for name in (Path(row["mesh"]).name, row["source_tag"])})
-        images.append({path.read_bytes() for path in Path("sides", side).glob("*/*/*.png")})
-        photographs.append({path.name for path in Path("sides", side, "photographs").glob("*/*.png")})
-    assert len(set.union(*names)) == sum(map(len, names)) and not images[0] & images[1]
-    assert not photographs[0] & photographs[1] and len(photographs[0] | photographs[1]) == 15  # one is left out
-    log.write_text("date,commit,table,network,weights,parts,images\n")
-    for command, looks in (("choose", 0), ("report", 1), ("report", 2)):
-        sides.main([command, "pretrained/none", *GIVEN, "--part", "photographs", "--table", "mine"])
-        assert len(log.read_text().splitlines()) == 1 + looks
-        assert ("was looked at for 'mine' before" in capsys.readouterr().out) == (looks == 2)
+    sides.main(["make", *ARGUMENTS, "--data", "."])
+
+
+def images_of(side: str) -> set[bytes]:
+    """Return the contents of all renders and photographs of a side."""
+    return {path.read_bytes() for path in Path("sides", side).glob("*/*/*.png")}
+
+
+def names_of(side: str) -> set[str]:
+    """Return the names of the meshes, patterns and maps of the renders of a side."""
+    names = set()
+    for part in ("laboratory", "hdri"):
+        with Path("sides", side, part, "photos.csv").open() as file:
+            for row in csv.DictReader(file):
+                names.add(Path(row["mesh"]).name)
+                names.add(row["source_tag"])
+    return names
+
+
+def photographs_of(side: str) -> set[str]:
+    """Return the file names of the photographs of a side."""
+    return {path.name for path in Path("sides", side, "photographs").glob("*/*.png")}
+
+
+@pytest.mark.slow  # Scoring takes bootstraps.
+def test_the_sides_share_no_image_object_or_light_and_looks_are_logged(
+    made_sides, monkeypatch, capsys
+):
+    names = [TRAINING, names_of("choosing"), names_of("reporting")]
+    assert len(set.union(*names)) == sum(len(part) for part in names)
+    assert images_of("choosing").isdisjoint(images_of("reporting"))
+    photographs = [photographs_of("choosing"), photographs_of("reporting")]
+    assert photographs[0].isdisjoint(photographs[1])
+    # One of the 16 photographs is of a source that is left out.
+    assert len(photographs[0] | photographs[1]) == 15
+
+    log = Path("log.csv")
+    log.write_text(LOG_HEADER)
+    monkeypatch.setattr(sides, "LOG", log)
+    arguments = ["pretrained/none", *ARGUMENTS, "--part", "photographs", "--table", "mine"]
+    for command, look_count in (("choose", 0), ("report", 1), ("report", 2)):
+        sides.main([command, *arguments])
+        assert len(log.read_text().splitlines()) == 1 + look_count
+        is_warned = "was looked at for 'mine' before" in capsys.readouterr().out
+        assert is_warned == (look_count == 2)
