@@ -28,8 +28,8 @@ from renderer.transport.rays import Rays, Surface
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizers import choose
 
-CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
-PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, fov=math.radians(35))
+CAMERA = OrthographicCamera(51.6, 22.9, 2.2)
+PROJECTOR = Projector(pixels=7, polar=28.6, azimuth=91.7, distance=3.0, fov=35.0)
 LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
 DISCS = replace(LAMPS, radius=0.3)
 SIZE, SAMPLES = 24, 16
@@ -102,7 +102,7 @@ def test_images_are_mitsubas_and_gradients_their_adjoint(solid, basis, tmp_path,
 
 def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
     """Thrown along the camera's view, each pixel of a white screen is one of the pattern's."""
-    straight = Projector(4, CAMERA.polar, CAMERA.azimuth, 3.0, 2 * math.atan(CAMERA.width / 2 / 3.0))
+    straight = Projector(4, CAMERA.polar, CAMERA.azimuth, 3.0, 2 * math.degrees(math.atan(CAMERA.width / 2 / 3.0)))
     right, up, _ = CAMERA.axes()
     corners = 3 * np.array([-right - up, right - up, right + up, up - right])
     screen = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
@@ -196,7 +196,7 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
 @pytest.mark.parametrize("solid", [ball, ball_on_a_table])
 def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(monkeypatch, batch, solid):
     """In harmonics and a projector at once, of one color and of two."""
-    both, mesh = SumBasis((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8))), solid()
+    both, mesh = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8))), solid()
     monkeypatch.setattr(sparse, "SMALL", 0)
     few = operator(mesh, both, samples=2)
     monkeypatch.setattr(sparse, "SPARSE", 0)

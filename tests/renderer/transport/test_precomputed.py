@@ -70,7 +70,7 @@ CONVEX = {
 
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
 def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh):
-    camera = OrthographicCamera(1.0, 0.3, 2.2)
+    camera = OrthographicCamera(57.3, 17.2, 2.2)
     direct = operator_of(mesh, camera, shadows=False)
     for bounces in (0, 2):
         shaped = operator_of(mesh, camera, bounces=bounces)
