@@ -19,6 +19,7 @@ value of the image instead.
 """
 
 import argparse
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -51,7 +52,7 @@ from renderer.transport import precomputed, rays
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.rasterizers import choose
 
-CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
+CAMERA = OrthographicCamera(math.degrees(0.9), math.degrees(0.6), 2.2)
 # Number of views over which the time of building an operator is averaged.
 VIEWS = 20
 # Number of images by Mitsuba. Their spread is Mitsuba's noise.

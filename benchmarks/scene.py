@@ -4,6 +4,7 @@
 `MitsubaStep` renders the scene with Mitsuba.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,7 +34,7 @@ from renderer.visibility.rasterizers import Rasterizer
 # Samples per side of a pixel that the renderer takes by default.
 SAMPLES = ImageSettings().samples
 ALBEDO = (0.8, 0.5, 0.3)
-CAMERA = OrthographicCamera(1.0, 0.5, 2.4)
+CAMERA = OrthographicCamera(math.degrees(1.0), math.degrees(0.5), 2.4)
 # Gray value of the background.
 BACKGROUND = 0.5
 

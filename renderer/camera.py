@@ -18,8 +18,11 @@ from renderer.validation import require_whole
 
 # Default of `Camera.reach`. A normalized mesh has a radius of at most √3.
 REACH = 2.0
-# Largest angle in radians, two turns. Larger angles are probably in degrees.
-MOST_TURN = 4 * math.pi
+# Largest polar angle and largest first azimuth of an orbit in degrees: two turns.
+MOST_TURN = 720.0
+# Limits of the field of view in degrees.
+MIN_FOV = 0.05
+MAX_FOV = 172.0
 # Distance of the near plane from a perspective camera is at least this fraction
 # of the distance of the camera. A mesh that comes nearer raises an error.
 NEAREST = 0.01
@@ -31,11 +34,12 @@ class Camera(ABC):
 
     The camera lies at a polar angle from +z and at an azimuth from +x toward
     +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
-    are differentiable with respect to fields that are tensors.
+    are differentiable with respect to fields that are tensors. Derivatives with
+    respect to an angle are per degree.
 
     Attributes:
-        polar: Polar angle in radians, within two turns.
-        azimuth: Azimuth in radians.
+        polar: Polar angle in degrees, within two turns.
+        azimuth: Azimuth in degrees.
         width: Width of the image at the origin in world units. A normalized
             mesh spans at most [-1, 1] along each axis.
         right: Position of the origin in the image, to the right of the center
@@ -68,7 +72,7 @@ class Camera(ABC):
                 object.__setattr__(self, name, _as_scalar(name, value))
         require_range("width", self.width, 1 / LARGEST, LARGEST)
         require_range("reach", self.reach, 1 / LARGEST, LARGEST)
-        _require_radians("polar", self.polar)
+        require_range("polar", self.polar, -MOST_TURN, MOST_TURN)
         for name in ("azimuth", "right", "up"):
             require_range(name, getattr(self, name), -LARGEST, LARGEST)
 
@@ -116,8 +120,8 @@ class Camera(ABC):
         width.
 
         Args:
-            polar: Angle to add to the polar angle in radians, shape ().
-            azimuth: Angle to add to the azimuth in radians, shape ().
+            polar: Angle to add to the polar angle in degrees, shape ().
+            azimuth: Angle to add to the azimuth in degrees, shape ().
             log_distance: Natural logarithm of the factor for the distance,
                 shape ().
 
@@ -139,10 +143,12 @@ class Camera(ABC):
             Unit vectors to the right, up and back (from the origin to the
             camera) as rows, float64, shape (3, 3).
         """
-        sin_polar = math.sin(self.polar)
-        cos_polar = math.cos(self.polar)
-        sin_azimuth = math.sin(self.azimuth)
-        cos_azimuth = math.cos(self.azimuth)
+        polar = math.radians(self.polar)
+        azimuth = math.radians(self.azimuth)
+        sin_polar = math.sin(polar)
+        cos_polar = math.cos(polar)
+        sin_azimuth = math.sin(azimuth)
+        cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
         # This is the sine of the polar angle.
@@ -208,8 +214,8 @@ class Camera(ABC):
             - the nearness of each point, shape (V,). It is larger for nearer
               points, and linear in the image on a plane.
         """
-        polar = torch.as_tensor(self.polar).to(points)
-        azimuth = torch.as_tensor(self.azimuth).to(points)
+        polar = torch.as_tensor(_in_radians(self.polar)).to(points)
+        azimuth = torch.as_tensor(_in_radians(self.azimuth)).to(points)
         sin_polar = polar.sin()
         cos_polar = polar.cos()
         sin_azimuth = azimuth.sin()
@@ -261,7 +267,7 @@ class OrthographicCamera(Camera):
 
     The attributes are those of `Camera`.
 
-    >>> camera = OrthographicCamera(polar=math.pi / 2, azimuth=0.0, width=2.0)  # It lies on +x.
+    >>> camera = OrthographicCamera(polar=90.0, azimuth=0.0, width=2.0)  # It lies on +x.
     >>> camera.project(np.array([[0.0, 1.0, 0.5]]))[:, :2].round(6).tolist()  # x and y
     [[1.0, 0.5]]
     """
@@ -290,7 +296,7 @@ class PerspectiveCamera(Camera):
     The attributes are those of `Camera`. From a large distance, the image is
     the same as the image of an orthographic camera of the same width.
 
-    >>> camera = PerspectiveCamera(polar=math.pi / 2, azimuth=0.0, width=2.0, distance=4.0)
+    >>> camera = PerspectiveCamera(polar=90.0, azimuth=0.0, width=2.0, distance=4.0)
     >>> point = np.array([[2.0, 0.5, 0.0]])  # It has half the distance of the origin.
     >>> camera.project(point)[0, 0].round(6).item()
     1.0
@@ -310,8 +316,8 @@ class PerspectiveCamera(Camera):
 
     @property
     def angle(self) -> float:
-        """Field of view: the angle between opposite sides of the image in radians."""
-        return 2 * math.atan(self.width / 2 / self.distance)
+        """Field of view: the angle between opposite sides of the image in degrees."""
+        return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points to normalized device coordinates, see `Camera.project`."""
@@ -354,19 +360,17 @@ def _as_scalar(name: str, value: Any) -> Any:
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
 
 
-def _require_radians(name: str, angle: float) -> None:
-    """Raise InputError if an angle is beyond two turns, as angles in degrees usually are."""
-    if not -MOST_TURN <= angle <= MOST_TURN:
-        given = f"{float(angle):g}"
-        raise InputError(
-            f"{name}={given} is more than two turns: give radians, such as math.radians({given})"
-        )
+def _in_radians(degrees: Any) -> Any:
+    """Convert an angle, which is a number or a tensor that gradients flow to."""
+    if isinstance(degrees, Tensor):
+        return torch.deg2rad(degrees)
+    return math.radians(degrees)
 
 
 def orbit_cameras(
     views: int,
     width: float,
-    polar: float = math.pi / 3,
+    polar: float = 60.0,
     azimuth: float = 0.0,
     fov: float | None = None,
 ) -> list[Camera]:
@@ -377,11 +381,11 @@ def orbit_cameras(
     Args:
         views: Number of cameras.
         width: Width of the images at the origin in world units.
-        polar: Polar angle in radians.
-        azimuth: Azimuth of the first camera in radians.
+        polar: Polar angle in degrees, within two turns.
+        azimuth: Azimuth of the first camera in degrees, within two turns.
         fov: Field of view: the angle between opposite sides of the image in
-            radians. It sets the distance of perspective cameras. None creates
-            orthographic cameras.
+            degrees, from 0.05 to 172. It sets the distance of perspective
+            cameras. None creates orthographic cameras.
 
     Returns:
         Cameras in ascending order of the azimuth.
@@ -389,9 +393,9 @@ def orbit_cameras(
     Raises:
         InputError: If a value is out of range.
 
-    >>> [round(math.degrees(camera.azimuth)) for camera in orbit_cameras(views=4, width=2.0)]
-    [0, 90, 180, 270]
-    >>> orbit_cameras(views=1, width=2.0, fov=math.radians(30))[0].distance.__round__(3)
+    >>> [camera.azimuth for camera in orbit_cameras(views=4, width=2.0)]
+    [0.0, 90.0, 180.0, 270.0]
+    >>> orbit_cameras(views=1, width=2.0, fov=30.0)[0].distance.__round__(3)
     3.732
     """
     require_whole("views", views)
@@ -399,11 +403,11 @@ def orbit_cameras(
     width = _as_scalar("width", width)
     polar = _as_scalar("polar", polar)
     azimuth = _as_scalar("azimuth", azimuth)
-    _require_radians("azimuth", azimuth)
-    azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
+    require_range("azimuth", azimuth, -MOST_TURN, MOST_TURN)
+    azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
     fov = _as_scalar("fov", fov)
-    require_range("fov", fov, 1e-3, 3)
-    distance = width / 2 / math.tan(fov / 2)
+    require_range("fov", fov, MIN_FOV, MAX_FOV)
+    distance = width / 2 / math.tan(math.radians(fov) / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

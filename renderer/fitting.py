@@ -53,15 +53,16 @@ KEPT = 3
 STEPS = 20
 # Relative change of the squared error, or of the camera, at which a descent ends.
 LEAST_GAIN = 1e-3
-# Steps of the numerical derivatives by polar angle, azimuth, relative width, right
-# and up, as multiples of 1 / size. A step to the right is half a pixel.
+# Steps of the numerical derivatives by polar angle and azimuth (in radians),
+# relative width, right and up, as multiples of 1 / size. A step to the right is half a pixel.
 DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
-# Smallest angle between +z or -z and the camera in a descent, in radians.
+# Smallest angle between +z or -z and the camera in a descent. Descents are in
+# radians.
 POLE_DISTANCE = 0.02
 # Samples per side of a pixel.
 SAMPLES = 8
-# Cameras whose axes differ by a smaller angle in radians count as one.
-DISTINCT = math.radians(2)
+# Cameras whose axes differ by a smaller angle in degrees count as one.
+DISTINCT = 2.0
 # Cameras of the search are compared at the full size if their squared error is at
 # most this multiple of the smallest one.
 PLAUSIBLE = 3
@@ -99,8 +100,8 @@ BORDER = 2
 MARGIN = 1.6
 # A pixel of a mask belongs to the object if its value is larger.
 OPAQUE = 127
-# First guess of the camera's angle from +z, in radians.
-USUAL_POLAR = math.radians(60)
+# First guess of the camera's angle from +z, in degrees.
+USUAL_POLAR = 60.0
 # If the axes of a window change by more, the window is cut anew.
 TILTED = 1e-3
 # Number of pixels that the object must cover.
@@ -163,7 +164,7 @@ def fit_photograph(
         mesh: The mesh, normalized and upright.
         size: Pixels per side that are compared.
         fov: Angle across a square `MARGIN` times as wide as the object, in
-            radians. None for a camera without perspective.
+            degrees. None for a camera without perspective.
         encoding: Encoding of the photograph and of the images that are to be
             rendered, "linear" or "srgb".
         **options: Further arguments of `fit_scene`.
@@ -183,11 +184,12 @@ def fit_photograph(
         )
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
-    focal_length = None if fov is None else side / 2 / math.tan(fov / 2)
+    focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
     camera_image = Photograph(photograph, focal_length)
     fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
 
-    up_at_usual_angle = np.array([0.0, math.sin(USUAL_POLAR), math.cos(USUAL_POLAR)])
+    usual_polar = math.radians(USUAL_POLAR)
+    up_at_usual_angle = np.array([0.0, math.sin(usual_polar), math.cos(usual_polar)])
     window = camera_image.window(center, side, up_at_usual_angle)
     scene = fit.fit(window, None)
     up = _up_direction(scene.camera, window)
@@ -245,8 +247,8 @@ def _turned_to_mesh(camera: Camera) -> Camera:
     distance = math.hypot(x, y, z)
     return replace(
         camera,
-        polar=math.acos(z / distance),
-        azimuth=math.atan2(y, x),
+        polar=math.degrees(math.acos(z / distance)),
+        azimuth=math.degrees(math.atan2(y, x)),
         width=camera.width * distance / camera.distance,
         right=0.0,
         up=0.0,
@@ -289,7 +291,7 @@ def fit_scene(
             count as clipped.
         mask: The object's share of each pixel in [0, 1], shape (size, size).
         mesh: The mesh, normalized and upright.
-        fov: Angle between the sides of the image in radians. None for a camera
+        fov: Angle between the sides of the image in degrees. None for a camera
             without perspective.
         albedo_scale: Factor of the mesh's albedo.
         encoding: Encoding of the images that are to be rendered with the result,
@@ -351,7 +353,7 @@ def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
     cameras = []
     for polar in POLAR:
-        for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, math.radians(polar), fov=fov):
+        for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, polar, fov=fov):
             cameras.append(_framed(camera.seeing(radius), mesh, mask))
     framed = [camera for _, camera in coarse.ranked(cameras)]
     # All azimuths fit a round object equally well. The best camera of each polar
@@ -369,7 +371,7 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
     kept: list[Camera] = []
     for camera in cameras:
         cosines = [float((camera.axes() * other.axes()).sum(1).min()) for other in kept]
-        if max(cosines, default=-1.0) < math.cos(DISTINCT):
+        if max(cosines, default=-1.0) < math.cos(math.radians(DISTINCT)):
             kept.append(camera)
     return kept
 
@@ -513,7 +515,7 @@ class _Target(NamedTuple):
 class _Descent:
     """The Gauss-Newton method in a trust region, over five values of a camera.
 
-    The values are polar angle, azimuth, the width relative to the first camera's,
+    The values are polar angle and azimuth in radians, the width relative to the first camera's,
     and the shifts right and up in units of the first camera's width. The light is
     fitted anew for each camera (variable projection). Central differences over
     half a pixel smooth the steps that the error makes at single samples.
@@ -530,7 +532,9 @@ class _Descent:
         up = camera.up / camera.width
         lowest = [POLE_DISTANCE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - POLE_DISTANCE, np.inf, 2.0, 1.0, 1.0]
-        start = np.array([camera.polar, camera.azimuth, 1.0, right, up]).clip(lowest, highest)
+        polar = math.radians(camera.polar)
+        azimuth = math.radians(camera.azimuth)
+        start = np.array([polar, azimuth, 1.0, right, up]).clip(lowest, highest)
         found = least_squares(
             self._residuals,
             start,
@@ -549,8 +553,8 @@ class _Descent:
         width = self._camera.width
         moved = replace(
             self._camera,
-            polar=polar,
-            azimuth=azimuth,
+            polar=math.degrees(polar),
+            azimuth=math.degrees(azimuth),
             width=width * relative_width,
             right=width * right,
             up=width * up,

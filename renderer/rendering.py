@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
 WHITE = 1 + 1e-4  # the largest albedo, and what rounding adds to it
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
-_OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `orbit_cameras`
+_OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)  # the first of `orbit_cameras`
 _choose = cache(choose)  # "opengl" checks the driver, which takes longer than an image
 _white_ball = cache(lambda: Mesh.plain(*sphere(5)))
 

@@ -96,17 +96,18 @@ def rotation_matrices(vectors: Tensor) -> Tensor:
 
     Args:
         vectors: Rotation vectors, shape (..., 3). The direction is the axis,
-            and the length is the angle in radians.
+            and the length is the angle in degrees.
 
     Returns:
         Rotation matrices, shape (..., 3, 3), differentiable with respect to the
-        vectors.
+        vectors, per degree.
 
     Example:
-        >>> quarter = torch.tensor([0, 0, torch.pi / 2])
+        >>> quarter = torch.tensor([0, 0, 90.0])
         >>> (rotation_matrices(quarter) @ torch.tensor([1.0, 0, 0])).round() + 0
         tensor([0., 1., 0.])
     """
-    axes = torch.eye(3).to(vectors).expand(*vectors.shape, 3)
-    cross_products = torch.linalg.cross(vectors[..., None, :].expand_as(axes), axes)
+    radians = torch.deg2rad(vectors)
+    axes = torch.eye(3).to(radians).expand(*radians.shape, 3)
+    cross_products = torch.linalg.cross(radians[..., None, :].expand_as(axes), axes)
     return torch.matrix_exp(cross_products.mT)

@@ -21,7 +21,7 @@ MESH = renderer.Mesh.plain(
     [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
     color=(1.0, 0.5, 0.0),
 )
-CAMERA = renderer.OrthographicCamera(1.0, 0.5, 4.0)
+CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
 LIGHT = renderer.load_light("grace")
 LAMP = Lamps(((2.0, 2.0, 2.0),))
 [OPERATOR] = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
@@ -71,8 +71,8 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "lights": (torch.rand(1, 3), lambda x: render(lights=[(LAMP, x)], light=None)),
     "roughness": (0.25 + 0.5 * torch.rand(4), lambda x: render(gloss=renderer.Gloss(x, 0.0, 0.5))),
     "strength": (torch.tensor(0.5), lambda x: render(gloss=renderer.Gloss(0.3, 0.0, x))),
-    "camera": (torch.tensor([1.0, 0.5, 4.0, 0.25, 8.0]), lambda x: perspective(*x)),
-    "orbit": (torch.tensor([2.0, 1.0, 0.5]), lambda x: render(cameras=orbit_of(x))),
+    "camera": (torch.tensor([57.0, 28.5, 4.0, 0.25, 8.0]), lambda x: perspective(*x)),
+    "orbit": (torch.tensor([2.0, 57.0, 28.5]), lambda x: render(cameras=orbit_of(x))),
     "operator's lights": (torch.stack([LIGHT, 2 * LIGHT]), OPERATOR.image),
     "operator's radiance": (LIGHT, OPERATOR.radiance),
     "operator's background": (IMAGES[0], lambda x: OPERATOR.image(LIGHT, x)),
@@ -88,7 +88,7 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "radiance": (torch.rand(8, 16, 3), lambda x: harmonics.project(x, 2)),
     "coefficients": (LIGHT, lambda x: harmonics.rotate(x, torch.eye(3))),
     "rotation": (torch.eye(3).roll(1, 0), lambda x: harmonics.rotate(LIGHT, x)),
-    "zenith": (torch.tensor([0.25, 0.5]), lambda x: skylight.coefficients(x, 0.5, 3.0).float()),
+    "zenith": (torch.tensor([15.0, 30.0]), lambda x: skylight.coefficients(x, 30.0, 3.0).float()),
     "light of a scene": (
         LIGHT,
         lambda x: render_scene(augment.build_scene([(MESH, "a")], SIZE, light=x, samples=1)),

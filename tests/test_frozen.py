@@ -17,7 +17,6 @@ renamed keyword or key is edited there.
 
 import hashlib
 import json
-import math
 import os
 import platform
 import re
@@ -49,10 +48,10 @@ LIBRARIES = ("torch", "numpy", "scipy", "embreex", "pillow")
 SOFTWARE = {"rasterizer": "numpy"}  # the same on every machine; "numba" has a case of its own
 SIZE = 24
 
-ABOVE = renderer.OrthographicCamera(math.pi / 3, 0.4, 2.2)
-ASIDE = renderer.OrthographicCamera(1.4, 2.5, 2.6, 0.2, -0.1)
-NEAR = renderer.PerspectiveCamera(1.1, -0.7, 2.2, distance=4.0)
-RING = renderer.orbit_cameras(3, 2.2, fov=math.radians(40))
+ABOVE = renderer.OrthographicCamera(60.0, 22.91831180523293, 2.2)
+ASIDE = renderer.OrthographicCamera(80.21409131831524, 143.2394487827058, 2.6, 0.2, -0.1)
+NEAR = renderer.PerspectiveCamera(63.02535746439056, -40.10704565915762, 2.2, distance=4.0)
+RING = renderer.orbit_cameras(3, 2.2, fov=40.0)
 VARNISHED_METAL = renderer.Gloss(roughness=0.4, metallic=0.3, strength=0.8)
 
 # name: (mesh, cameras, light, keywords of `render`, differentiated arguments)
@@ -353,7 +352,7 @@ def mesh_named(name: str, folder: Path) -> renderer.Mesh:
 
 def light_named(name: str, folder: Path) -> Tensor:
     if name == "skylight":
-        return 0.02 * skylight(torch.tensor(0.9), torch.tensor(2.0), torch.tensor(3.5))
+        return 0.02 * skylight(torch.tensor(0.9).rad2deg(), torch.tensor(2.0).rad2deg(), torch.tensor(3.5))
     if name == "lamp":
         return directional(torch.tensor([0.48, 0.6, 0.64]), torch.tensor([1.0, 0.9, 0.7]))
     if name == "environment":

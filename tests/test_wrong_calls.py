@@ -35,7 +35,7 @@ MESH = renderer.Mesh.plain(
     color=(1.0, 0.5, 0.0),
 )
 TRIMESH = trimesh.creation.icosahedron()
-CAMERA = renderer.OrthographicCamera(1.0, 0.5, 4.0)
+CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
 LIGHT = renderer.load_light("grace")
 LAMP = Lamps(((2.0, 2.0, 2.0),))
 CLASSES = ("orange", "other")
@@ -344,7 +344,7 @@ CAMERAS = [
         "60",
         None,
         NAN,
-        60.0,
+        721.0,
         [1.0, 2.0],
     ),
     *calls_of(
@@ -354,9 +354,9 @@ CAMERAS = [
         None,
         NAN,
         [0.0, 1.0],
-        45.0,
+        -721.0,
     ),
-    *calls_of("fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 30, "30", 0, -1.0, NAN, 1j),
+    *calls_of("fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, -1.0, NAN, 1j),
     *calls_of(
         "polar",
         lambda x: renderer.OrthographicCamera(x, 0.0, 2.0),
@@ -370,7 +370,7 @@ CAMERAS = [
     *calls_of("azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]),
     *calls_of(
         "width",
-        lambda x: renderer.OrthographicCamera(1.0, 0.0, x),
+        lambda x: renderer.OrthographicCamera(57.3, 0.0, x),
         0.0,
         -1.0,
         "wide",
@@ -380,16 +380,16 @@ CAMERAS = [
     ),
     *calls_of(
         "right",
-        lambda x: renderer.OrthographicCamera(1.0, 0.0, 2.0, right=x),
+        lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, right=x),
         "x",
         None,
         NAN,
         (0.0, 0.1),
     ),
-    *calls_of("reach", lambda x: renderer.OrthographicCamera(1.0, 0.0, 2.0, reach=x), 0.0, "far", None),
+    *calls_of("reach", lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x), 0.0, "far", None),
     *calls_of(
         "distance",
-        lambda x: renderer.PerspectiveCamera(1.0, 0.0, 2.0, distance=x),
+        lambda x: renderer.PerspectiveCamera(57.3, 0.0, 2.0, distance=x),
         0,
         -4.0,
         "far",
@@ -460,7 +460,7 @@ LIGHTS = [
         lambda x: skylight.coefficients(x, 0.0, 3.0),
         "noon",
         None,
-        2.0,
+        91.0,
         -0.1,
         NAN,
         1j,
@@ -483,7 +483,7 @@ LIGHTS = [
     ),
     *calls_of("power", lambda x: Lamps(((1.0, 1.0, 1.0),), x), 0, -1, "bright", None, NAN),
     *calls_of("pixels", lambda x: Projector(pixels=x), 0, 2.5, "16", None, 257, True),
-    *calls_of("fov", lambda x: Projector(fov=x), 30, "30", None, 0),
+    *calls_of("fov", lambda x: Projector(fov=x), 173.0, "30", None, 0),
 ]
 
 MESHES = [
@@ -1218,7 +1218,7 @@ def test_whole_numbers_of_numpy_are_sizes(size):
 
 
 def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():
-    expected = render(albedo_scale=0.5, cameras=renderer.OrthographicCamera(1.0, 2.0, 4.0))
+    expected = render(albedo_scale=0.5, cameras=renderer.OrthographicCamera(57.0, 115.0, 4.0))
     for kind in (
         int,
         np.float32,
@@ -1227,7 +1227,7 @@ def test_numbers_of_any_kind_are_factors_and_fields_of_cameras():
         torch.tensor,
         lambda value: np.array([value]),
     ):
-        camera = renderer.OrthographicCamera(kind(1.0), kind(2.0), kind(4.0))
+        camera = renderer.OrthographicCamera(kind(57.0), kind(115.0), kind(4.0))
         assert torch.equal(render(albedo_scale=np.float32(0.5), cameras=camera), expected)
 
 
@@ -1238,13 +1238,13 @@ def test_ones_whole_floats_and_paths_pass_where_they_always_did():
     augment.VariationSettings(backgrounds=Path("photos"), environments=[Path("a.hdr")])  # type: ignore[arg-type]
     assert renderer.Mesh.plain(MESH.vertices, MESH.faces.astype(float)).faces.dtype == np.int64
     assert scene(ground=np.array([0.5, 0.5, 0.5]), backgrounds=torch.tensor([0.2, 0.4])).views == 1
-    assert skylight.coefficients([0.25, 0.5], 0.5, 3.0).dtype == torch.float64
+    assert skylight.coefficients([15.0, 30.0], 30.0, 3.0).dtype == torch.float64
 
 
 def test_gradients_reach_fields_of_cameras_and_lists_of_tensors():
-    polar = torch.tensor([1.0], requires_grad=True)
+    polar = torch.tensor([57.0], requires_grad=True)
     rows = [row.clone().requires_grad_() for row in LIGHT]
-    camera = renderer.OrthographicCamera(polar, 0.5, 4.0)
+    camera = renderer.OrthographicCamera(polar, 28.6, 4.0)
     image = render(cameras=camera, light=rows, silhouettes=True, samples=4)
     gradients = torch.autograd.grad(image.sum(), [polar, *rows[:4]])
     assert gradients[0].shape == (1,)

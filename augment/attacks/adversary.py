@@ -15,6 +15,7 @@ from torch import Tensor
 from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
+from renderer.angles import ANGLE_UNIT, DEGREES, angles_in_degrees
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
     FACTOR,
@@ -200,6 +201,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "local_lights": [basis.name for basis, _ in local_lights],
         "background": _write_background(adversary.background, folder),
         "cameras": [asdict(camera) for camera in adversary.cameras],
+        ANGLE_UNIT: DEGREES,
         "image": asdict(settings),
         "pixels": adversary.pixels is not None,
     }
@@ -306,7 +308,8 @@ def reload(folder: str | Path) -> Adversary:
 def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     """Return the adversary of a folder with the given description."""
     settings = ImageSettings(**description["image"])
-    cameras = tuple(_camera(camera) for camera in description["cameras"])
+    angle_unit = description.get(ANGLE_UNIT)
+    cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
     shown = _read_object(folder, description)
     for camera in cameras:
         # A camera refuses a mesh around it.
@@ -334,10 +337,10 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     )
 
 
-def _camera(description: dict[str, Any]) -> Camera:
+def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
     """Return the camera of a description; one with perspective has a distance."""
     kind = PerspectiveCamera if "distance" in description else OrthographicCamera
-    return kind(**description)
+    return kind(**angles_in_degrees(description, angle_unit))
 
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -239,7 +238,7 @@ def transfer(
         resized = adversaries.changed(partial(_resized, size=classifier.size))
         rows.append({"network": classifier.name, **resized.shown_to(classifier)})
     for azimuth in azimuths:
-        turned = adversaries.changed(partial(_turned, angle=math.radians(azimuth)))
+        turned = adversaries.changed(partial(_turned, angle=azimuth))
         rows.append({"azimuth": f"{azimuth:+g}°", **turned.shown_to(result.classifier)})
     for item in objects:
         exchanged = adversaries.changed(partial(replace, shown=item))
@@ -570,6 +569,6 @@ def _with_size(images: Tensor, size: int) -> Tensor:
 
 
 def _turned(adversary: Adversary, angle: float) -> Adversary:
-    """Return an adversary seen by cameras that are turned around the vertical, in radians."""
+    """Return an adversary seen by cameras that are turned around the vertical, in degrees."""
     cameras = [replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras]
     return replace(adversary, cameras=tuple(cameras))

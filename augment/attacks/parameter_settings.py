@@ -7,6 +7,7 @@ imports neither torch nor NumPy; see `renderer.settings`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -64,7 +65,8 @@ class StepSettings(Settings):
 class SkylightSettings(StepSettings):
     """Attack on the sun and the air of a clear sky, and where it starts.
 
-    The radius is in radians for the zenith and the azimuth, and in units of 4 for the turbidity.
+    The radius and the steps count the zenith and the azimuth in the unit `sun`, and the turbidity in
+    the unit 4. With the default of `sun`, a radius of 0.1 is 5.7 degrees and 0.4 of turbidity.
     """
 
     zenith: float = setting(45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90)
@@ -80,6 +82,13 @@ class SkylightSettings(StepSettings):
         "Turbidity of the air at the start, from 2 (clear) to 10 (hazy).",
         minimum=TURBIDITY[0],
         maximum=TURBIDITY[1],
+    )
+    sun: float = setting(
+        math.degrees(1),
+        "Change of the zenith angle and the azimuth of the sun for a value of 1.",
+        "degrees",
+        minimum=0.1,
+        maximum=360,
     )
 
 

@@ -24,7 +24,8 @@ class EOTSettings(Settings):
     )
     jitter: float = setting(
         0.03,
-        "Largest motion of the camera: a fraction of the width of the image, radians, and a fraction of the distance.",
+        "Largest motion of the camera: its shift as a fraction of the width of the image, and its approach as a "
+        "fraction of the distance. It also rolls by up to 57 degrees times this number, which is 1.7 degrees for 0.03.",
         minimum=0,
         maximum=0.5,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -177,10 +176,7 @@ def _load_member(member: ObjectSettings | tuple[Shown, str | int], vertices: int
 
 def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:
     """Place a number of cameras on a circle around the object of a scene."""
-    polar = math.radians(settings.polar)
-    azimuth = math.radians(settings.azimuth)
-    fov = None if settings.fov is None else math.radians(settings.fov)
-    return orbit_cameras(count, settings.width, polar, azimuth, fov)
+    return orbit_cameras(count, settings.width, settings.polar, settings.azimuth, settings.fov)
 
 
 def _build_lights(

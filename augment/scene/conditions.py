@@ -49,11 +49,11 @@ class Conditions:
         albedo: What is added to the linear albedo of each face, shape (A, F, 3).
         pixels: What is added to the values of the V images, shape (A, V, 3, size, size).
         positions: The positions of the L lamps, shape (A, L, 3). None for those of the basis.
-        cameras: What is added to the polar angle, the azimuth (in radians) and the logarithm of
+        cameras: What is added to the polar angle, the azimuth (in degrees) and the logarithm of
             the distance of all V cameras, shape (A, 3).
         gloss: Roughness, metallic and strength of each face or of all faces, shape (A, F, 3) or
             (A, 1, 3). Textures of gloss multiply them.
-        hue: The angle in radians by which the hue of a changed albedo is turned, shape (A, F).
+        hue: The angle in degrees by which the hue of a changed albedo is turned, shape (A, F).
     """
 
     light: Float[Tensor, "A coefficients 3"]

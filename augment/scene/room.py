@@ -159,8 +159,9 @@ def irradiance(
 
 def _turn(camera: Camera) -> Tensor:
     """Return the rotation about the vertical whose first row is the wall's normal, (3, 3)."""
-    sine = math.sin(camera.azimuth)
-    cosine = math.cos(camera.azimuth)
+    azimuth = math.radians(camera.azimuth)
+    sine = math.sin(azimuth)
+    cosine = math.cos(azimuth)
     rows = [[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]
     return torch.tensor(rows, dtype=torch.float64)
 
@@ -294,13 +295,13 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _turned(sky: Tensor, azimuth: float) -> Tensor:
-    """Turn the coefficients (size, 3) of a sky back by an azimuth in radians.
+    """Turn the coefficients (size, 3) of a sky back by an azimuth in degrees.
 
     The harmonics Y_lm and Y_l-m depend on the azimuth φ as cos mφ and sin mφ.
     """
     l = bands(degree_of(sky))
     order = torch.arange(len(l)) - l * (l + 1)
-    angle = (order * azimuth).double()[:, None]
+    angle = (order * math.radians(azimuth)).double()[:, None]
     mirrored = l * (l + 1) - order
     return angle.cos() * sky + angle.sin() * sky[mirrored]
 

@@ -30,13 +30,14 @@ from renderer.surface.gloss import Gloss
 from renderer.transport.rays import Rays
 from renderer.vectors import rotation_matrices
 
-# The elevation of a camera above a table, in radians.
-MIN_ELEVATION = math.radians(15)
-MAX_ELEVATION = math.radians(75)
+# The elevation of a camera above a table, in degrees.
+MIN_ELEVATION = 15.0
+MAX_ELEVATION = 75.0
 # The smallest and the largest distance of a wall behind the object, in world units.
 WALL_DISTANCES = (1.8, 8.0)
-# The largest angle from the camera to a directional light, around the object and up or down.
-MAX_LIGHT_ANGLE = math.radians(70)
+# The largest angle from the camera to a directional light, around the object and up or down,
+# in degrees.
+MAX_LIGHT_ANGLE = 70.0
 
 
 def vary(
@@ -125,10 +126,10 @@ def _draw_cameras(
     count = len(scene)
     shifts = _draw_pairs(settings.shift, count, draws)
     scales = _draw_log_uniform(settings.scale, count, draws)
-    angles = _draw_pairs(math.radians(settings.azimuth), count, draws)
+    angles = _draw_pairs(settings.azimuth, count, draws)
     fovs = [0.0] * count
     if any(settings.fov):
-        low, high = map(math.radians, settings.fov)
+        low, high = settings.fov
         fractions = torch.rand(count, generator=draws, dtype=torch.float64)
         fovs = (low + (high - low) * fractions).tolist()
     examples = []
@@ -161,21 +162,21 @@ def _move_camera(
 
 
 def _turn_camera(camera: Camera, polar: float, azimuth: float) -> Camera:
-    """Add angles in radians to the direction of a camera."""
+    """Add angles in degrees to the direction of a camera."""
     return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
 
 def _raise_above_table(camera: Camera) -> Camera:
     """Mirror a camera to above a table and limit its elevation."""
-    elevation = abs(math.asin(math.cos(camera.polar)))
+    elevation = abs(math.degrees(math.asin(math.cos(math.radians(camera.polar)))))
     elevation = min(max(elevation, MIN_ELEVATION), MAX_ELEVATION)
-    return replace(camera, polar=math.pi / 2 - elevation)
+    return replace(camera, polar=90 - elevation)
 
 
 def _to_perspective(camera: Camera, fov: float) -> Camera:
-    """Return a perspective camera that sees the same width at the origin, for a fov in radians."""
+    """Return a perspective camera that sees the same width at the origin, for a fov in degrees."""
     shared = {item.name: getattr(camera, item.name) for item in fields(Camera)}
-    return PerspectiveCamera(**shared, distance=camera.width / 2 / math.tan(fov / 2))
+    return PerspectiveCamera(**shared, distance=camera.width / 2 / math.tan(math.radians(fov) / 2))
 
 
 def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:
@@ -205,7 +206,7 @@ def _draw_objects(
         pairs = progress(zip(drawn, seeds, strict=True), "new instances", len(drawn))
         drawn = [another_instance(item, seed) for item, seed in pairs]
     if settings.rotation:
-        rotations = _draw_rotations(math.radians(settings.rotation), len(drawn), draws)
+        rotations = _draw_rotations(settings.rotation, len(drawn), draws)
         drawn = [rotated(item, rotation) for item, rotation in zip(drawn, rotations, strict=True)]
     if any(settings.gloss.strength):
         glosses = _draw_glosses(settings.gloss, len(drawn), draws)
@@ -214,7 +215,7 @@ def _draw_objects(
 
 
 def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.ndarray:
-    """Draw matrices (count, 3, 3) of rotations by up to max_angle radians about random axes."""
+    """Draw matrices (count, 3, 3) of rotations by up to max_angle degrees about random axes."""
     axes = torch.randn(count, 3, generator=draws, dtype=torch.float64)
     angles = max_angle * torch.rand(count, 1, generator=draws, dtype=torch.float64)
     return rotation_matrices(angles * axes / axes.norm(dim=1, keepdim=True)).numpy()

@@ -10,7 +10,6 @@ file, solid:NAME:SEED, or a YAML mapping such as
 
 import argparse
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,8 +32,8 @@ from train.runs.saved_networks import load_network
 # Meshes whose shape is attacked are subdivided until they have more vertices
 # (the paper's Section 4).
 VERTICES = 10_000
-# Polar angle of all cameras in radians (the paper's appendix C).
-POLAR = math.pi / 3
+# Polar angle of all cameras in degrees (the paper's appendix C).
+POLAR = 60.0
 # Widths of the image in world units (the paper's appendix "Evaluate Rendering
 # Quality").
 WIDTHS = (2.0, 3.0)
@@ -292,7 +291,7 @@ def random_views(count: int, draws: torch.Generator) -> list[View]:
     Returns:
         The views.
     """
-    azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
+    azimuths = (360 * torch.rand(count, generator=draws)).tolist()
     widths = torch.randint(len(WIDTHS), (count,), generator=draws).tolist()
     grays = torch.randint(len(GRAYS), (count,), generator=draws).tolist()
     views = []

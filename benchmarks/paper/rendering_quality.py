@@ -62,7 +62,7 @@ def measure_confidences(
                 f"{classifier.name} classifies only {counts} correctly. "
                 "Choose another mesh, label or classifier."
             )
-        azimuth = 2 * math.pi * float(torch.rand((), generator=draws))
+        azimuth = 360 * float(torch.rand((), generator=draws))
         width = common.WIDTHS[len(rows) % len(common.WIDTHS)]
         camera = OrthographicCamera(common.POLAR, azimuth, width)
         rows.append(confidences_of_camera(subject, classifier, camera))

@@ -1,5 +1,6 @@
 """Meshes as .glb files with colors, textures, normals and cameras."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -219,7 +220,7 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     """Return the glTF description of a camera."""
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
-        perspective = {"yfov": camera.angle, "aspectRatio": 1.0, **planes}
+        perspective = {"yfov": math.radians(camera.angle), "aspectRatio": 1.0, **planes}
         return {"type": "perspective", "perspective": perspective}
     half_width = camera.width / 2
     orthographic = {"xmag": half_width, "ymag": half_width, **planes}

@@ -6,7 +6,6 @@ under "bitmap", or the name of a file under "filename". `renderer.io.mitsuba`
 loads and writes such scenes.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -96,7 +95,7 @@ def sensor(pose: np.ndarray, size: int, fov: float | None = None, pixel_format: 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     """Describe a camera of the renderer, see `sensor`."""
     if isinstance(camera, PerspectiveCamera):
-        return sensor(pose_of(camera), size, math.degrees(camera.angle), pixel_format)
+        return sensor(pose_of(camera), size, camera.angle, pixel_format)
     return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
 
 

@@ -60,7 +60,7 @@ def with_added_albedo(
         added: Linear color that is added to each face, shape (F, 3).
         encoding: Encoding of colors and textures, "linear" or "srgb".
         albedo_scale: Factor s for the albedo of the mesh.
-        hue: Hue rotation of each face in radians, shape (F,). None leaves the
+        hue: Hue rotation of each face in degrees, shape (F,). None leaves the
             hues unchanged.
 
     Returns:
@@ -129,7 +129,7 @@ class _Painter:
         scale: Factor s for the original albedo.
         new_scale: Scale s' by which the result is divided.
         added: Linear color that is added to each face, float32, shape (F, 3).
-        hue: Hue rotation of each face in radians, float32, shape (F,). None
+        hue: Hue rotation of each face in degrees, float32, shape (F,). None
             leaves the hues unchanged.
     """
 

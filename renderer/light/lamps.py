@@ -160,8 +160,9 @@ class Lamps(LocalBasis):
         The radiance is that of a far point's intensity on the disc's area.
         """
         x, y, z = position
-        polar = math.atan2(math.hypot(x, y), z)
-        camera = PerspectiveCamera(polar, math.atan2(y, x), 1.0, distance=math.hypot(x, y, z))
+        polar = math.degrees(math.atan2(math.hypot(x, y), z))
+        azimuth = math.degrees(math.atan2(y, x))
+        camera = PerspectiveCamera(polar, azimuth, 1.0, distance=math.hypot(x, y, z))
         area = math.pi * self.radius**2
         radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}
         emitter = {"type": "area", "radiance": radiance}

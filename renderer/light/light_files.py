@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from renderer.angles import ANGLE_UNIT, ANGLES, DEGREES, angles_in_degrees
 from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.image import to_bytes
 from renderer.io.files import write_whole
@@ -64,6 +65,8 @@ def save_light(
         shape = tuple(coefficients.shape)
         raise InputError(f"coefficients {shape} are not of {basis}: give {(basis.size, 3)}")
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
+    if any(name in description for name in ANGLES):
+        description[ANGLE_UNIT] = DEGREES
     picture = basis.picture(coefficients)
     try:
         write_whole(path, json.dumps(description, allow_nan=False) + "\n")
@@ -100,6 +103,7 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         if name not in kind_of_name:
             known = " or ".join(kind_of_name)
             raise InputError(f"its basis is {name!r}, give one of {known}")
+        description = angles_in_degrees(description, description.pop(ANGLE_UNIT, None))
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

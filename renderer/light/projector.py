@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.camera import MAX_FOV, MIN_FOV, OrthographicCamera, PerspectiveCamera
 from renderer.errors import FACTOR, require_range
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
@@ -30,10 +30,10 @@ class Projector(LocalBasis):
 
     Attributes:
         pixels: Pixels per side, at most 256.
-        polar: Angle of the position off +z, in radians.
-        azimuth: Angle of the position off +x toward +y, in radians.
+        polar: Angle of the position off +z, in degrees.
+        azimuth: Angle of the position off +x toward +y, in degrees.
         distance: Distance from the origin, at least 2.
-        fov: Angle between opposite sides of the pattern, in radians.
+        fov: Angle between opposite sides of the pattern, in degrees, from 0.05 to 172.
         power: The largest coefficient. The smallest is 0.
 
     Raises:
@@ -46,10 +46,10 @@ class Projector(LocalBasis):
     """
 
     pixels: int = 16
-    polar: float = math.pi / 3
-    azimuth: float = 0.5
+    polar: float = 60.0
+    azimuth: float = 30.0
     distance: float = 4.0
-    fov: float = math.radians(30)
+    fov: float = 30.0
     power: float = 1.0
 
     name = "projector"
@@ -58,7 +58,7 @@ class Projector(LocalBasis):
         require_field_types(self)
         require_range("projector.pixels", self.pixels, 1, MAX_PIXELS)
         require_range("projector.distance", self.distance, 2, FACTOR)
-        require_range("projector.fov", self.fov, 1e-3, 3)
+        require_range("projector.fov", self.fov, MIN_FOV, MAX_FOV)
         require_range("projector.power", self.power, 1 / FACTOR, FACTOR)
 
     @classmethod
@@ -68,10 +68,10 @@ class Projector(LocalBasis):
         require_range("fov", settings.fov, 0.1, 170)
         light = cls(
             pixels=settings.pixels,
-            polar=math.radians(settings.polar),
-            azimuth=math.radians(settings.azimuth),
+            polar=settings.polar,
+            azimuth=settings.azimuth,
             distance=settings.distance,
-            fov=math.radians(settings.fov),
+            fov=settings.fov,
             power=settings.power,
         )
         pattern = gray_or_image("pattern", settings.pattern, light.pixels).expand(3, -1, -1)
@@ -94,7 +94,7 @@ class Projector(LocalBasis):
         source = self.distance * axes[2]
         right, up, back = ((points - source) @ axes.T).unbind(1)
         depth = -back
-        edge = math.tan(self.fov / 2)
+        edge = math.tan(math.radians(self.fov) / 2)
         column = ((1 + right / (depth * edge)) / 2 * self.pixels).floor()
         row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
         # The cosine at the surface over that of the angle from the axis.
@@ -113,4 +113,4 @@ class Projector(LocalBasis):
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
         scale = albedo_scale * self.distance**2
-        return [projector(pose_of(camera), math.degrees(self.fov), pattern, scale)]
+        return [projector(pose_of(camera), self.fov, pattern, scale)]

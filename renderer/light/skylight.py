@@ -2,7 +2,7 @@
 
 The source is their "A Practical Analytic Model for Daylight" (1999). The sky
 has three scalar parameters: the zenith angle and the azimuth of the sun in
-radians, in world axes, and the turbidity (haziness) of the air. The disc of the
+degrees, in world axes, and the turbidity (haziness) of the air. The disc of the
 sun is not part of the sky.
 
 Radiance is linear Rec. 709 RGB in kcd/m²: (1, 1, 1) is white of 1000 cd/m². The
@@ -19,7 +19,7 @@ Parameters", after Habel et al. 2008.
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from safetensors.torch import load_file
@@ -31,8 +31,8 @@ from renderer.light.basis import HARMONICS
 from renderer.settings import TURBIDITY
 from renderer.validation import as_tensor
 
-# The sun's zenith angle in radians, from overhead to the horizon, inclusive.
-ZENITH = (0.0, math.pi / 2)
+# The sun's zenith angle in degrees, from overhead to the horizon, inclusive.
+ZENITH = (0.0, 90.0)
 
 _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
 # The order m of each coefficient.
@@ -51,30 +51,32 @@ def coefficients(
 ) -> Tensor:
     """Compute the light of a daylight sky.
 
-    The result has analytic first derivatives by the parameters. Its error is at
+    The result has analytic first derivatives by the parameters, per degree for
+    the angles. Its error is at
     most 7e-5 of the norm of the coefficients (4e-4 in haze with the sun on the
     horizon, where the coefficients are smallest). The error of the derivatives
     is at most 0.1 % by zenith and azimuth and 0.5 % by turbidity, and two to
     three times as large at the ends of the domain.
 
     Args:
-        zenith: Zenith angle of the sun in radians, in `ZENITH`. The shapes of
+        zenith: Zenith angle of the sun in degrees, in `ZENITH`. The shapes of
             the three parameters broadcast to (...).
-        azimuth: Azimuth of the sun in radians.
+        azimuth: Azimuth of the sun in degrees.
         turbidity: Haziness of the air, in `TURBIDITY`.
         fit: Polynomials to evaluate, as tests/renderer/fit_skylight.py writes
             them. None for the fit that comes with the library.
 
     Returns:
         SH coefficients of degree 6, shape (..., 49, 3), linear RGB in kcd/m²,
-        in the dtype of the parameters (float64 if all are numbers).
+        in the dtype of the turbidity. If that is a number, the dtype is that of
+        the angles, and float64 if all are numbers.
 
     Raises:
         InputError: If a parameter is outside of its range, NaN or infinite.
 
     Example:
-        >>> noon = coefficients(0.5, 0.0, 3.0)
-        >>> evening = coefficients(1.4, 0.0, 3.0)
+        >>> noon = coefficients(30.0, 0.0, 3.0)
+        >>> evening = coefficients(80.0, 0.0, 3.0)
         >>> noon.shape, bool(noon[0].sum() > evening[0].sum())  # index 0: the mean
         (torch.Size([49, 3]), True)
     """
@@ -83,7 +85,7 @@ def coefficients(
 
 
 class _FittedSky(torch.autograd.Function):
-    """Evaluate the polynomials and rotate them about z by the azimuth φ.
+    """Evaluate the polynomials and rotate them about z by the azimuth φ, in radians.
 
     With the coefficients Ũ of the sky at azimuth 0, the rotated ones are
     U_lm = Ũ_lm cos(mφ) and U_l,-m = Ũ_lm sin(mφ) for m ≥ 0. The paper prints
@@ -132,35 +134,49 @@ def _library_fit() -> Tensor:
 def _as_parameters(
     zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float
 ) -> list[Tensor]:
-    """Return the parameters as tensors, or raise `InputError` for values outside of the domain.
+    """Return the angles in radians and the turbidity as tensors.
 
-    They have the dtype and the device of the first floating tensor among them.
-    If all are numbers, they are float64.
+    They have the dtype and the device of the first floating tensor among
+    turbidity, zenith and azimuth. If all are numbers, they are float64. Angles in
+    float64 are rounded to this dtype only after the conversion. Values outside of
+    the domain raise `InputError`.
     """
     named = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
     for name, value in named.items():
         if not is_number(value):
             as_tensor(name, value)  # This raises InputError for anything but a tensor.
-    floating = [
-        value for value in named.values() if isinstance(value, Tensor) and value.is_floating_point()
-    ]
+    floating = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
     like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
-    zenith, azimuth, turbidity = (
-        torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in named.values()
-    )
-    require_finite(azimuth=azimuth)
-    _require_in_domain("zenith", zenith, ZENITH, "0 to π/2, with the sun above the horizon")
-    _require_in_domain("turbidity", turbidity, TURBIDITY, "2 to 10")
-    return [zenith, azimuth, turbidity]
+    turbidities = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
+    degrees = []
+    for angle in (zenith, azimuth):
+        dtype = angle.dtype if _is_floating(angle) else torch.float64
+        degrees.append(torch.as_tensor(angle, dtype=dtype, device=like.device))
+    zeniths, azimuths = degrees
+    require_finite(azimuth=azimuths)
+    expected = "0 to 90 degrees, with the sun above the horizon"
+    _require_in_domain("zenith", zeniths.to(like.dtype), ZENITH, expected)
+    _require_in_domain("turbidity", turbidities, TURBIDITY, "2 to 10")
+    radians = [torch.deg2rad(angles).to(like.dtype) for angles in degrees]
+    return [*radians, turbidities]
+
+
+def _is_floating(value: object) -> TypeGuard[Tensor]:
+    """Return whether a value is a tensor of floating-point numbers."""
+    return isinstance(value, Tensor) and value.is_floating_point()
 
 
 def _require_in_domain(
     name: str, value: Tensor, limits: tuple[float, float], description: str
 ) -> None:
-    """Raise `InputError` if an entry of a parameter is outside of its limits or NaN."""
+    """Raise `InputError` if an entry of a parameter is outside of its limits or NaN.
+
+    An entry may exceed a limit by rounding.
+    """
     low, high = limits
+    rounding = 4 * torch.finfo(value.dtype).eps
     # NaN fails both comparisons, so it counts as outside.
-    is_outside = ~((value >= low) & (value <= high))
+    is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
     if is_outside.any():
         first = value[is_outside][0].item()
         raise InputError(

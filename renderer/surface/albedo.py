@@ -299,7 +299,7 @@ def painted_albedo(
             "srgb".
         albedo_scale: Factor for the albedo of the mesh.
         added: Linear color that is added to each face, shape (F, 3).
-        hue: Hue rotation of each face in radians, shape (F,). None leaves the
+        hue: Hue rotation of each face in degrees, shape (F,). None leaves the
             hues unchanged.
 
     Returns:
@@ -363,7 +363,7 @@ def _interpolate_painted_texels(
         uvs: Texture coordinates u and v of N points, shape (2, N).
         colors: Linear color that multiplies the texels around each point,
             shape (N, 3).
-        hue: Hue rotation at each point in radians, shape (N,). None leaves the
+        hue: Hue rotation at each point in degrees, shape (N,). None leaves the
             hue unchanged.
         added: Linear color that is added at each point, shape (N, 3).
 
@@ -387,7 +387,7 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
 
     Args:
         albedo: Linear albedo, shape (..., 3).
-        hue: Rotation angle in radians, shape (...). None leaves the hue
+        hue: Rotation angle in degrees, shape (...). None leaves the hue
             unchanged.
         added: Linear color to add, shape (..., 3).
 
@@ -396,7 +396,7 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
     """
     rotated = albedo
     if hue is not None:
-        angle = hue[..., None]
+        angle = torch.deg2rad(hue)[..., None]
         gray = albedo.mean(-1, keepdim=True)
         # This is Rodrigues' rotation formula. The cross product of the albedo
         # with the gray axis, (1, 1, 1) / √3, is a difference of permuted

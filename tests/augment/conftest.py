@@ -20,7 +20,8 @@ from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import choose
 
 SIZE = 6
-FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ((0.9, 0.3), (1.3, 1.9), (1.1, 3.5)))
+ANGLES = (51.6, 17.2), (74.5, 108.9), (63.0, 200.5)  # polar angles and azimuths in degrees
+FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ANGLES)
 
 
 @pytest.fixture(scope="session")

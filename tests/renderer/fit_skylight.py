@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import roots_legendre
 
 from renderer.light.harmonics import basis
-from renderer.light.skylight import ZENITH, coefficients
+from renderer.light.skylight import coefficients
 from renderer.settings import TURBIDITY
 
 # Preetham et al., appendix A.2: the parameters A to E of Perez's formula, as
@@ -133,12 +133,12 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
     The error is relative to the L2 norm of the sky's coefficients by
     quadrature.
     """
-    lowest = [ZENITH[0], 0, TURBIDITY[0]]
-    highest = [ZENITH[1], 2 * math.pi, TURBIDITY[1]]
+    lowest = [0, 0, TURBIDITY[0]]
+    highest = [math.pi / 2, 2 * math.pi, TURBIDITY[1]]
     suns = rng.uniform(lowest, highest, (skies, 3))
     exact = np.stack([coefficients_by_quadrature(*sun) for sun in suns])
     zenith, azimuth, turbidity = torch.from_numpy(suns.T)
-    errors = coefficients(zenith, azimuth, turbidity, fit).numpy() - exact
+    errors = coefficients(zenith.rad2deg(), azimuth.rad2deg(), turbidity, fit).numpy() - exact
     relative_errors = np.linalg.norm(errors, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))
     return float(relative_errors.max())
 

@@ -37,7 +37,7 @@ from renderer.transport.rays import Surface
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import Rasterizer, choose
 
-CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, width=2.2)
+CAMERA = OrthographicCamera(polar=57.3, azimuth=28.6, width=2.2)
 TOWARDS = CAMERA.axes()[2]
 SETTINGS = ImageSettings(size=16, samples=2)
 RASTERIZER = choose("numpy")

@@ -31,14 +31,14 @@ CUBE_CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
 ORTHOGRAPHIC = [
     *orbit_cameras(7, 2.0),
     OrthographicCamera(0, 0, 2.0),
-    OrthographicCamera(math.pi, 1, 3.0),
+    OrthographicCamera(180.0, 57.3, 3.0),
 ]
 PERSPECTIVE = [
-    PerspectiveCamera(math.pi / 3, 0, 4.0, distance=2.0),
-    PerspectiveCamera(1.0, -2.0, 2.4, right=0.3, up=-0.2, distance=3.0),
-    PerspectiveCamera(2.5, 0.7, 1.0, distance=1.8),
+    PerspectiveCamera(60.0, 0, 4.0, distance=2.0),
+    PerspectiveCamera(57.3, -114.6, 2.4, right=0.3, up=-0.2, distance=3.0),
+    PerspectiveCamera(143.2, 40.1, 1.0, distance=1.8),
 ]
-CAMERA = PerspectiveCamera(0.9, 0.4, 2.4, right=0.2, up=-0.1, distance=1.9)
+CAMERA = PerspectiveCamera(51.6, 22.9, 2.4, right=0.2, up=-0.1, distance=1.9)
 POSITION = CAMERA.pose()[:3, 3]
 NO_NUMBA = find_spec("numba") is None
 NO_EGL = find_library("EGL") is None
@@ -67,7 +67,7 @@ def test_axes_are_orthonormal_and_right_handed(camera):
 def test_the_world_z_axis_points_up_in_the_image(camera):
     x, y, _ = camera.project(np.array([[0.0, 0.0, 1.0]]))[0]
     assert abs(x) < EPS
-    assert y == pytest.approx(2 * math.sin(camera.polar) / camera.width, abs=EPS)
+    assert y == pytest.approx(2 * math.sin(math.radians(camera.polar)) / camera.width, abs=EPS)
 
 
 @pytest.mark.parametrize("camera", ORTHOGRAPHIC)
@@ -84,43 +84,43 @@ def test_orthographic_depth_grows_with_distance_and_positions_do_not_depend_on_i
 @pytest.mark.parametrize(
     ("camera", "points", "expected"),
     [
-        # The camera is on the +x side at the polar angle π/3. Right is +y, and
+        # The camera is on the +x side at the polar angle 60°. Right is +y, and
         # up is (-1/2, 0, √3/2).
         (
-            OrthographicCamera(math.pi / 3, 0, width=4.0),
+            OrthographicCamera(60.0, 0, width=4.0),
             [[1.0, 1.0, 1.0], [0.5, -0.25, 0.0], [0.0, 0.0, 0.0]],
             [[0.5, (math.sqrt(3) - 1) / 4], [-0.125, -0.125], [0, 0]],
         ),
         # Each direction is to the right for the camera on one side.
         (
-            OrthographicCamera(math.pi / 2, 0, 2.0),
+            OrthographicCamera(90.0, 0, 2.0),
             [[0, 1, 0]],
             [[1, 0]],
         ),
         (
-            OrthographicCamera(math.pi / 2, math.pi / 2, 2.0),
+            OrthographicCamera(90.0, 90.0, 2.0),
             [[-1, 0, 0]],
             [[1, 0]],
         ),
         (
-            OrthographicCamera(math.pi / 2, math.pi, 2.0),
+            OrthographicCamera(90.0, 180.0, 2.0),
             [[0, -1, 0]],
             [[1, 0]],
         ),
         (
-            OrthographicCamera(math.pi / 2, -math.pi / 2, 2.0),
+            OrthographicCamera(90.0, -90.0, 2.0),
             [[1, 0, 0]],
             [[1, 0]],
         ),
         (
-            OrthographicCamera(math.pi / 2, 0, 2, 0.5, -0.25),
+            OrthographicCamera(90.0, 0, 2, 0.5, -0.25),
             [[0, 0, 0], [9, 0.5, 1]],
             [[0.5, -0.25], [1, 0.75]],
         ),
         # The camera lies on +x at distance 2, and the image is 4 wide. What is
         # 1 in front of the origin is twice as large, and 2 behind half as large.
         (
-            PerspectiveCamera(math.pi / 2, 0, 4.0, right=0.5, distance=2.0),
+            PerspectiveCamera(90.0, 0, 4.0, right=0.5, distance=2.0),
             [
                 [0.0, 1.0, 1.0],
                 [1.0, 1.0, 1.0],
@@ -153,8 +153,8 @@ def test_perspective_depth_grows_from_the_near_plane_to_the_far_plane(
 def test_a_camera_inside_or_in_front_of_the_mesh_is_refused(distance):
     """A normalized mesh ends at most √3 from the origin, at the point (1, 1, 1)."""
     corner = np.ones((1, 3))
-    toward_corner = math.acos(1 / math.sqrt(3))
-    camera = PerspectiveCamera(toward_corner, math.pi / 4, 2.0, distance=distance)
+    toward_corner = math.degrees(math.acos(1 / math.sqrt(3)))
+    camera = PerspectiveCamera(toward_corner, 45.0, 2.0, distance=distance)
     with pytest.raises(InputError, match="distance"):
         camera.project(corner)
     assert np.isfinite(replace(camera, distance=1.8).project(corner)).all()
@@ -163,7 +163,7 @@ def test_a_camera_inside_or_in_front_of_the_mesh_is_refused(distance):
 @pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
 def test_distances_and_angles_out_of_range_are_refused(value):
     with pytest.raises(InputError, match=r"^distance"):
-        PerspectiveCamera(1.0, 0.4, 2.0, distance=value)
+        PerspectiveCamera(57.3, 22.9, 2.0, distance=value)
     with pytest.raises(InputError, match=r"^fov"):
         orbit_cameras(1, 2.0, fov=value)
 

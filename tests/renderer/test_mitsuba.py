@@ -35,10 +35,10 @@ MAP_ROWS = 192  # linear interpolation dims band l by l(l + 1) (π / 191)² / 12
 BAND_WEIGHTS = [0, 1, 1, 0.3, 1, 0.3, 1]  # bands 3 and 5 reach no diffuse surface and only add noise
 
 VIEWS = {
-    "near the pole": OrthographicCamera(0.03, 0.4, 2.5),
-    "from above": OrthographicCamera(1.0, 2.2, 2.3),
-    "from below": OrthographicCamera(2.3, 5.1, 2.7),
-    "from close by": PerspectiveCamera(1.1, 0.7, 2.7, right=0.1, up=-0.2, distance=2.0),
+    "near the pole": OrthographicCamera(1.72, 22.9, 2.5),
+    "from above": OrthographicCamera(57.3, 126.1, 2.3),
+    "from below": OrthographicCamera(131.8, 292.2, 2.7),
+    "from close by": PerspectiveCamera(63.0, 40.1, 2.7, right=0.1, up=-0.2, distance=2.0),
 }
 
 

@@ -26,18 +26,19 @@ def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndar
 @pytest.mark.parametrize(("size", "side"), [(48, 260.0), (160, 120.0)])
 def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, side):
     mesh = renderer.solid("pear")
-    camera = PerspectiveCamera(1.0, 0.7, 6.0, 1.2, -0.9, distance=5.0)
+    camera = PerspectiveCamera(57.3, 40.1, 6.0, 1.2, -0.9, distance=5.0)
     pixels = photographed(mesh, camera)
     focal_length = SIZE * camera.distance / camera.width
     photograph = Photograph(pixels, focal_length)
     origin = np.array([camera.right, -camera.up]) / camera.width * SIZE + SIZE / 2
-    above = np.array([0.0, math.sin(camera.polar), math.cos(camera.polar)])
+    polar = math.radians(camera.polar)
+    above = np.array([0.0, math.sin(polar), math.cos(polar)])
     window = photograph.window(origin, side, above)
     eye = camera.eye()[:3]
     distance = float(np.linalg.norm(eye))
     turned = PerspectiveCamera(
-        polar=math.acos(eye[2] / distance),
-        azimuth=math.atan2(eye[1], eye[0]),
+        polar=math.degrees(math.acos(eye[2] / distance)),
+        azimuth=math.degrees(math.atan2(eye[1], eye[0])),
         width=side * distance / focal_length,
         distance=distance,
     )
@@ -56,13 +57,13 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
 
 def test_a_window_without_perspective_is_what_the_moved_camera_renders():
     mesh = renderer.solid("pear")
-    pixels = photographed(mesh, OrthographicCamera(1.0, 0.7, 6.0, 1.25, -0.9375))
+    pixels = photographed(mesh, OrthographicCamera(57.3, 40.1, 6.0, 1.25, -0.9375))
     # The center of the window is at a corner of pixels.
     origin = np.array([1.25, 0.9375]) / 6 * SIZE + SIZE / 2
     window = Photograph(pixels, None).window(origin, SIZE / 2, np.array([0.0, 1.0, 0.0]))
     expected = renderer.render(
         mesh,
-        OrthographicCamera(1.0, 0.7, 3.0),
+        OrthographicCamera(57.3, 40.1, 3.0),
         renderer.load_light("grace").double(),
         48,
         0.0,

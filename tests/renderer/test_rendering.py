@@ -138,7 +138,7 @@ def test_an_image_of_few_pixels_is_the_mean_of_those_of_a_finer_one(stone, light
 @pytest.mark.parametrize("samples", [1, 2])
 def test_lamps_and_projectors_are_added_as_by_operators(light, samples):
     """With all their power where they have no coefficients, and shadows."""
-    cup, lamps, projector = renderer.solid("cup"), Lamps(((2.0, 1.0, 2.0),), radius=0.3), Projector(8, 0.5, 1.6)
+    cup, lamps, projector = renderer.solid("cup"), Lamps(((2.0, 1.0, 2.0),), radius=0.3), Projector(8, 28.6, 91.7)
     pattern = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
     choices = {"size": 9, "samples": samples, "normals": "flat", "shadows": True, "rasterizer": "numpy"}
     images = renderer.render(cup, CAMERAS, light, lights=[lamps, (projector, pattern)], **choices)

@@ -4,6 +4,7 @@ That commit wrote earlier_files/ with one small run and one attack on its networ
 """
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+import augment
 import renderer
+from augment.attacks.adversary import write_adversary
+from renderer.light.light_files import read_light
+from renderer.light.projector import Projector
 from train.runs.saved_networks import load_run
 
 EARLIER = Path(__file__).with_name("earlier_files")
@@ -44,6 +49,28 @@ def test_an_earlier_adversary_is_rendered_and_gives_the_probabilities_that_were_
     reloaded = f"reload={folder}"
     assert call("attack", reloaded, f"classifier=run:{earlier}/run", "out=again", "renderer.rasterizer=numpy") == 0
     assert f"{recorded()['confidence'][0]:.1%}" in capsys.readouterr().out
+
+
+def test_the_angles_of_an_earlier_adversary_are_read_as_radians_and_written_in_degrees(tmp_path):
+    [camera] = augment.reload(EXAMPLE).cameras
+    described = json.loads((EXAMPLE / "adversary.json").read_text())["cameras"][0]
+    assert math.radians(camera.polar) == pytest.approx(described["polar"], rel=1e-15)
+    assert math.radians(camera.azimuth) == pytest.approx(described["azimuth"], rel=1e-15)
+    rendered = augment.reload(EXAMPLE).render("numpy")
+    expected = torch.from_numpy(np.load(EXAMPLE / "after.npy")).view(1, 3, 16, 16)
+    assert (rendered - expected).abs().max() < 1e-5
+    write_adversary(augment.reload(EXAMPLE), tmp_path)
+    assert augment.reload(tmp_path).cameras == (camera,)
+
+
+def test_the_angles_of_an_earlier_projector_are_read_as_radians_and_written_in_degrees(tmp_path):
+    described = {"basis": "projector", "pixels": 1, "polar": math.pi / 3, "azimuth": 0.5, "distance": 4.0}
+    described |= {"fov": math.pi / 6, "power": 1.0, "coefficients": [[0.5, 0.25, 1.0]]}
+    (tmp_path / "projector.json").write_text(json.dumps(described))
+    earlier, pattern = read_light(tmp_path / "projector.json", Projector)
+    assert (earlier.polar, earlier.azimuth, earlier.fov) == pytest.approx((60.0, math.degrees(0.5), 30.0), rel=1e-15)
+    renderer.save_light(tmp_path / "new.json", pattern, earlier)
+    assert read_light(tmp_path / "new.json", Projector)[0] == earlier
 
 
 def test_an_earlier_light_is_read():

@@ -6,7 +6,6 @@ negative radiance in any direction.
 """
 
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,11 +51,11 @@ LIGHT = "grace"
 AMPLITUDE = 0.5
 # Start of the name of every random light.
 RANDOM = "random "
-# Distance of the camera from the origin, in world units, and its azimuth,
-# elevation and field of view, in degrees.
+# Distance of the camera from the origin, in world units, and its polar angle,
+# azimuth and field of view, in degrees.
 CAMERA_DISTANCE = 2.6
 CAMERA_ANGLES = (60, 45, 40)
-CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *map(math.radians, CAMERA_ANGLES))
+CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *CAMERA_ANGLES)
 # Range of the random cameras, poses and sizes, around CAMERA and the objects.
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
 # Steps of the attack at each radius, and random draws at each radius.
@@ -95,7 +94,7 @@ KINDS = {
     ),
     "skylight": LightKind(
         title="a daylight sky",
-        unit="radians of the sun, a quarter of turbidity",
+        unit="times 57.3° of the sun, or 4 of turbidity",
         radii=(0.1, 0.3, 1.0, 3.0),
     ),
     "projector": LightKind(

@@ -1,6 +1,5 @@
 """The fit command: find the camera and the light of a photograph of a mesh."""
 
-import math
 import shlex
 from importlib import import_module
 from pathlib import Path
@@ -58,7 +57,7 @@ def fit(settings: FitSettings) -> None:
         mask,
         load_object(mesh_settings).mesh,
         settings.size,
-        fov=None if settings.fov is None else math.radians(settings.fov),
+        fov=settings.fov,
         albedo_scale=settings.albedo_scale,
         encoding=settings.encoding,
         bounces=settings.bounces,
@@ -101,11 +100,11 @@ def attack_settings(settings: FitSettings, camera: Camera, out: Path) -> AttackE
     """
     fov = None
     if isinstance(camera, PerspectiveCamera):
-        fov = round(math.degrees(camera.angle), 3)
+        fov = round(camera.angle, 3)
     scene = AttackSceneSettings(
         meshes=[{"mesh": settings.mesh, "albedo_scale": settings.albedo_scale}],
-        polar=round(math.degrees(camera.polar), 3),
-        azimuth=round(math.degrees(camera.azimuth) % 360, 3),
+        polar=round(camera.polar, 3),
+        azimuth=round(camera.azimuth % 360, 3),
         width=round(camera.width, 4),
         fov=fov,
         light=str(out / "light.json"),

@@ -100,9 +100,9 @@ def _portraits(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> T
     polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64).tolist()
     cameras = []
     for view in range(VIEWS):
-        height = math.radians(40 + 45 * polar[view])
-        turn = 2 * math.pi * azimuth[view]
-        cameras.append(OrthographicCamera(height, turn, 2 + width[view]))
+        polar_angle = 40 + 45 * polar[view]
+        camera = OrthographicCamera(polar_angle, 360 * azimuth[view], 2 + width[view])
+        cameras.append(camera)
     backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
     lights = []
     for camera in cameras:

@@ -63,7 +63,7 @@ class Material(Parameter):
         self._face_count = max(len(item.mesh.faces) for item in scene.objects)
 
         gloss_units = [settings.roughness, settings.metallic, settings.strength]
-        units = torch.tensor([*gloss_units, math.radians(settings.hue)]).to(scene.lights)
+        units = torch.tensor([*gloss_units, settings.hue]).to(scene.lights)
         attacked_mask = units > 0
         self._changes_gloss = bool(attacked_mask[GLOSS].any())
         self._changes_hue = settings.hue > 0
@@ -150,7 +150,7 @@ class Material(Parameter):
 
         Args:
             conditions: Conditions of the A examples.
-            angle: Rotation angles in radians, shape (A, 1).
+            angle: Rotation angles in degrees, shape (A, 1).
             objects: Index of the object of each example, shape (A,).
         """
         hue = (angle * self._object_mask[objects]).expand(-1, self._face_count)

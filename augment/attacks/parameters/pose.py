@@ -143,20 +143,17 @@ def _pose_units(settings: PoseSettings, item: SceneObject) -> Tensor:
     """Return how far the pose of an object and its cameras changes per attack value of 1.
 
     Returns:
-        Rotation vector in radians (3 values), shift in world units (2),
+        Rotation vector in degrees (3 values), shift in world units (2),
         logarithm of the scale (1), polar angle and azimuth of the cameras in
-        radians (2), logarithm of their distance (1), and a rotation vector in
-        radians for each joint that rotates (3 each), shape (D,).
+        degrees (2), logarithm of their distance (1), and a rotation vector in
+        degrees for each joint that rotates (3 each), shape (D,).
     """
-    object_angle = math.radians(settings.rotation)
-    view_angle = math.radians(settings.view)
-    units = [object_angle, object_angle, object_angle]
+    units = [settings.rotation, settings.rotation, settings.rotation]
     units += [settings.shift, settings.shift]
     units += [math.log1p(settings.scale)]
-    units += [view_angle, view_angle]
+    units += [settings.view, settings.view]
     units += [math.log1p(settings.distance)]
-    for degrees in joint_limits(settings, item):
-        joint_angle = math.radians(degrees)
+    for joint_angle in joint_limits(settings, item):
         units += [joint_angle, joint_angle, joint_angle]
     return torch.tensor(units, dtype=torch.float64)
 
@@ -208,7 +205,7 @@ class _MovableObject:
         Args:
             vertices: Vertices of the object, its props and its table,
                 shape (N, 3).
-            change: Change of the pose in radians, world units and logarithms,
+            change: Change of the pose in degrees, world units and logarithms,
                 in the order of `Pose`, shape (D,).
 
         Returns:
@@ -232,7 +229,7 @@ class _MovableObject:
         Args:
             vertices: Vertices of the object, its props and its table,
                 shape (N, 3).
-            joint_rotations: Rotation vectors of the joints in radians, one
+            joint_rotations: Rotation vectors of the joints in degrees, one
                 after the other, shape (3 J,).
         """
         if self.skin is None or not self.rotated_joint_count:

@@ -18,14 +18,18 @@ from renderer.light.skylight import coefficients as sky_coefficients
 from renderer.settings import TURBIDITY
 
 # `Skylight` divides the turbidity by this unit to get an attack value. The
-# turbidity then has a range of 2 (from 2 / 4 to 10 / 4). This is of the same
-# order as the ranges of the zenith angle (1.6 radians) and of the azimuth (6.3
-# radians), so one radius and one step size suit all three values.
+# turbidity then has a range of 2 (from 2 / 4 to 10 / 4). With the default of
+# `SkylightSettings.sun`, this is of the same order as the ranges of the zenith
+# angle (1.6) and of the azimuth (6.3), so one radius and one step size suit all
+# three values.
 TURBIDITY_UNIT = 4.0
 
 
 class Skylight(Parameter):
-    """Zenith angle and azimuth of the sun in radians, and turbidity divided by `TURBIDITY_UNIT`.
+    """Zenith angle and azimuth of the sun, and turbidity, divided by their units.
+
+    The unit of both angles is `SkylightSettings.sun`, in degrees. The unit of the
+    turbidity is `TURBIDITY_UNIT`.
 
     The sky replaces the environment lighting of the scene. It is multiplied by
     a constant factor, so that the initial sky has the mean luminance of the
@@ -40,25 +44,28 @@ class Skylight(Parameter):
 
     def __init__(self, scene: Scene, settings: SkylightSettings):
         self._rows, self._basis = environment_light(scene)
-        zenith = math.radians(settings.zenith)
-        azimuth = math.radians(settings.azimuth)
-        turbidity = settings.turbidity
-
-        sky_luminance = mean_luminance(sky_coefficients(zenith, azimuth, turbidity))
+        initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
+        sky_luminance = mean_luminance(initial_sky)
         replaced_lights = scene.lights[:, self._rows]
         scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
         # Factor of the sky for each example, shape (E,).
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
-        values = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64)
-        super().__init__(settings, start=values.to(scene.lights).expand(len(scene), -1))
+        self._sun = settings.sun
+        values = [
+            settings.zenith / settings.sun,
+            settings.azimuth / settings.sun,
+            settings.turbidity / TURBIDITY_UNIT,
+        ]
+        start = torch.tensor(values, dtype=torch.float64).to(scene.lights)
+        super().__init__(settings, start=start.expand(len(scene), -1))
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         """Return a copy of the conditions with the sky in place of the environment lighting.
 
         Args:
-            values: Zenith angle and azimuth in radians, and turbidity divided
-                by `TURBIDITY_UNIT`, shape (A, 3).
+            values: Zenith angle, azimuth and turbidity, divided by their units,
+                shape (A, 3).
             conditions: Conditions of the A examples.
             examples: Indices of the examples in the scene, shape (A,).
 
@@ -66,9 +73,11 @@ class Skylight(Parameter):
             Conditions with the light of the sky, differentiable with respect to
             the values.
         """
-        zenith, azimuth, scaled_turbidity = values.unbind(1)
+        # In float64, the conversions of the angles add no rounding to their values.
+        zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
+        turbidity = values[:, 2] * TURBIDITY_UNIT
         # Shape (A, 49, 3).
-        sky = sky_coefficients(zenith, azimuth, scaled_turbidity * TURBIDITY_UNIT)
+        sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
         # The environment lighting may have a higher degree than the sky model.
         # The sky then has zeros as its last coefficients.
@@ -80,6 +89,6 @@ class Skylight(Parameter):
         # The sky model is defined for these ranges, and for any azimuth.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY
-        low = values.new_tensor([lowest_zenith, -math.inf, lowest_turbidity / TURBIDITY_UNIT])
-        high = values.new_tensor([highest_zenith, math.inf, highest_turbidity / TURBIDITY_UNIT])
+        low = values.new_tensor([lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT])
+        high = values.new_tensor([highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT])
         return nearest_in_box(values, low, high, within)

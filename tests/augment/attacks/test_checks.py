@@ -1,6 +1,5 @@
 """Checks, success by radius and transfer of an attack's result."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -152,7 +151,7 @@ def test_other_azimuths_and_other_meshes_are_those_of_a_scene_with_them(result):
     apple = scene.changed(objects=augment.build_scene([("solid:apple", "lime")], 12).objects)
     turned, other = augment.transfer(result, azimuths=[-30.0], objects=apple.objects)
     assert (turned["azimuth"], other["mesh"]) == ("-30°", "solid:apple")
-    cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - math.pi / 6) for row in scene.examples]
+    cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - 30) for row in scene.examples]
     rows = [replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)]
     for row, shown in ((turned, scene.changed(examples=rows)), (other, apple)):
         logits = network()(shown.render(result.conditions, torch.arange(2))[:, 0])[:, None]

@@ -17,7 +17,7 @@ from renderer.transport.rays import Rays
 
 SIZE, FAR = 32, 1000.0
 BALL = normalize(renderer.solid("ball"))
-CAMERAS = PerspectiveCamera(1.1, 0.4, 3.0, 0.1, -0.2, distance=7.0), OrthographicCamera(1.1, 0.4, 3.0, 0.1, -0.2)
+CAMERAS = PerspectiveCamera(63.0, 22.9, 3.0, 0.1, -0.2, distance=7.0), OrthographicCamera(63.0, 22.9, 3.0, 0.1, -0.2)
 LAMP = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
 SKY, NONE = probe("grace").double() / 5, torch.zeros(3).double()
 
@@ -33,7 +33,7 @@ def square(middle: list[float], first: list[float], second: list[float]) -> Mesh
 @pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
 @pytest.mark.parametrize("surface", ["table", "wall"])
 def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
-    towards = [math.cos(camera.azimuth), math.sin(camera.azimuth), 0.0]
+    towards = [math.cos(math.radians(camera.azimuth)), math.sin(math.radians(camera.azimuth)), 0.0]
     aside = [-towards[1], towards[0], 0.0]
     if surface == "table":
         height, wall, mesh = -1.0, 50.0, square([0, 0, -1], [1, 0, 0], [0, 1, 0])

@@ -179,14 +179,14 @@ def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
 def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
     """The matrices of the file project points with y up to where `project` puts them."""
     view = {
-        "polar": 2.0,
-        "azimuth": 1.0,
+        "polar": 114.6,
+        "azimuth": 57.3,
         "width": 2.5,
         "right": 0.3,
         "up": -0.2,
     }
     cameras = [
-        *orbit_cameras(2, 3.0, 1.0, 0.4),
+        *orbit_cameras(2, 3.0, 57.3, 22.9),
         OrthographicCamera(**view),
         PerspectiveCamera(**view, distance=1.2),
         PerspectiveCamera(**view, distance=3.0),

@@ -34,9 +34,9 @@ from renderer.visibility.rasterizers import choose
 pytest.importorskip("mitsuba")
 drjit = pytest.importorskip("drjit")
 CAMERAS = [
-    OrthographicCamera(1.0, 2.2, 2.3),
-    OrthographicCamera(2.3, 5.1, 2.7, right=0.2, up=-0.1),
-    PerspectiveCamera(1.4, 0.3, 2.7, right=0.2, up=-0.1, distance=2.2),
+    OrthographicCamera(57.3, 126.1, 2.3),
+    OrthographicCamera(131.8, 292.2, 2.7, right=0.2, up=-0.1),
+    PerspectiveCamera(80.2, 17.2, 2.7, right=0.2, up=-0.1, distance=2.2),
 ]
 
 
@@ -165,7 +165,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
 
 def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
     """With a single thread, Mitsuba would wait forever for its own reader of .exr files."""
-    camera = OrthographicCamera(1.0, 0.0, 2.0)
+    camera = OrthographicCamera(57.3, 0.0, 2.0)
     write_mitsuba_scene(tmp_path, ball(), 1.0, [camera], ImageSettings(8), "light.exr")
     write_map(tmp_path / "light.exr", torch.ones(8, 16, 3))
     drjit.set_thread_count(1)

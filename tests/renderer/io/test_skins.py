@@ -65,7 +65,7 @@ def corners_by_gltf(vectors: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("vectors", [0 * VECTORS, VECTORS], ids=["rest", "posed"])
 def test_vertices_are_those_of_the_formula_of_gltf(tmp_path, suffix, vectors):
     mesh = renderer.load_mesh(skinned_arm.write(tmp_path / f"arm.{suffix}"), up="z")
-    moved = mesh.vertices + mesh.skin.displacements(rotation_matrices(vectors)).numpy()
+    moved = mesh.vertices + mesh.skin.displacements(rotation_matrices(vectors.rad2deg())).numpy()
     expected = corners_by_gltf(vectors.numpy()).reshape(-1, 9)
     # The parts may have another order.
     distances, nearest = KDTree(expected).query(moved[mesh.faces].reshape(-1, 9))

@@ -85,7 +85,7 @@ def test_each_projector_has_its_own_pattern_in_a_scene_of_mitsuba(
         (Projector(2), bright_pattern),
     ]
     ball = Mesh.plain(*sphere(1))
-    camera = OrthographicCamera(1.0, 0.0, 2.0)
+    camera = OrthographicCamera(57.3, 0.0, 2.0)
     write_mitsuba_scene(
         tmp_path,
         ball,

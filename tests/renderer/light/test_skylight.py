@@ -3,6 +3,7 @@
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import fit_skylight
 import numpy as np
@@ -14,8 +15,8 @@ from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
 
 from renderer.errors import InputError
+from renderer.light import skylight
 from renderer.light.harmonics import basis, rotate
-from renderer.light.skylight import coefficients
 
 ROOT = Path(__file__).parents[3]
 FIT = ROOT / "renderer" / "light" / "skylight_fit.safetensors"
@@ -30,7 +31,7 @@ RGB_TO_XYZ = np.array(
         [0.0193, 0.1192, 0.9505],
     ]
 )
-# Zenith angle of the sun, its azimuth, and the turbidity.
+# Zenith angle of the sun and its azimuth in radians, and the turbidity.
 SKIES = [
     (0.0, 0.0, 2.0),
     (0.9, -2.0, 3.0),
@@ -38,6 +39,12 @@ SKIES = [
     (HORIZON, 0.7, 10.0),
 ]
 by_quadrature = fit_skylight.coefficients_by_quadrature
+
+
+def coefficients(zenith: Any, azimuth: Any, turbidity: Any) -> torch.Tensor:
+    """Return the coefficients of a sky whose angles are in radians, as in the paper."""
+    degrees = 180 / math.pi
+    return skylight.coefficients(degrees * zenith, degrees * azimuth, turbidity)
 
 
 def perez(theta: ArrayLike, gamma: ArrayLike, parameters: list[float]) -> np.ndarray:
@@ -274,4 +281,4 @@ def test_gradients_are_finite_differences(sky):
 def test_a_sky_outside_the_domain_is_refused_by_name(sky, argument):
     for values in (sky, sky_parameters(*sky)):
         with pytest.raises(InputError, match=f"^{argument}"):
-            coefficients(*values)
+            skylight.coefficients(*values)

@@ -53,7 +53,7 @@ from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizers import choose
 
 [CAMERA] = orbit_cameras(1, 2.2)
-[NEARBY] = orbit_cameras(1, 2.2, fov=0.7)
+[NEARBY] = orbit_cameras(1, 2.2, fov=40.0)
 DOUBLE = torch.float64
 UP = torch.tensor([[0.0, 0, 1]], dtype=DOUBLE)
 REFRACTIVE_INDEX = 1.5
@@ -366,7 +366,7 @@ class FloorView:
 
     def reflectance(self, light: LocalBasis, coefficient: float, gloss: Gloss) -> float:
         """Measure the reflectance in a light with one coefficient for all functions."""
-        camera = OrthographicCamera(self.seen, 0.0, 1e-3)
+        camera = OrthographicCamera(math.degrees(self.seen), 0.0, 1e-3)
         [operator] = operators_of(FLOOR, [camera], ImageSettings(1, 1), light, gloss)
         coefficients = UP.new_full((light.size, 3), coefficient)
         return float(operator.radiance(coefficients)[0, 0]) / math.cos(self.lit)
@@ -391,7 +391,7 @@ def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(roughness, met
         light = unit_vector(view.lit, view.azimuth + math.pi)
         [expected] = surface.reflectance(math.cos(view.seen), light[None])
         lamp = Lamps((tuple(4 * unit_vector(view.lit, view.azimuth)),))
-        projector = Projector(1, view.lit, view.azimuth, 4.0)
+        projector = Projector(1, math.degrees(view.lit), math.degrees(view.azimuth), 4.0)
         # A lamp of power 16 has the irradiance 1 at a distance of 4.
         assert view.reflectance(lamp, 16.0, gloss) == pytest.approx(expected, rel=2e-3)
         assert view.reflectance(projector, 1.0, gloss) == pytest.approx(expected, rel=2e-3)
@@ -447,7 +447,9 @@ class FloorUnderSky:
     def __init__(self, gloss: Gloss) -> None:
         node, weight = legendre.leggauss(24)
         cosines = torch.from_numpy((node + 1) / 2)
-        cameras = [OrthographicCamera(math.acos(cosine), 0.3, 1.0) for cosine in cosines]
+        cameras = [
+            OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines
+        ]
         operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
         rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
         self.transfer = torch.stack(rows)
@@ -489,7 +491,7 @@ def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
         np.ones(3),
     )
     corner = concatenate([FLOOR, wall])
-    camera = OrthographicCamera(0.7, math.pi, 1e-3)
+    camera = OrthographicCamera(40.1, 180.0, 1e-3)
     settings = ImageSettings(1, 1, shadows=True)
     gloss = Gloss(1.0, 0.0, strength)
     [operator] = operators_of(corner, [camera], settings, Harmonics(6), gloss)
@@ -498,7 +500,7 @@ def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
 
     light, solid_angles = hemisphere(24)
     surface = WhiteSurface(1.0, 0.0, strength)
-    radiance = surface.reflectance(math.cos(0.7), light) * light[:, 2] * solid_angles
+    radiance = surface.reflectance(math.cos(math.radians(40.1)), light) * light[:, 2] * solid_angles
     is_visible = light[:, 0] < 0
     assert found == pytest.approx(radiance[is_visible].sum(), rel=0.02)
 

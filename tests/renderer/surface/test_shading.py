@@ -5,7 +5,6 @@ classifier sees: shading, the box filter, the background, the clamp and the
 encoding. Differences are taken at fixed visibility.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -96,9 +95,9 @@ def dented_icosahedron(face_count: int = 20) -> Mesh:
     return patchwork(shape.vertices, shape.faces[:face_count])
 
 
-IN_FRONT = OrthographicCamera(1.0, 0.4, 2.2)
-BEHIND = OrthographicCamera(math.pi - 1.0, 0.4 + math.pi, 2.2)
-CLOSE = PerspectiveCamera(1.0, 0.4, 2.2, distance=1.8)
+IN_FRONT = OrthographicCamera(57.3, 22.9, 2.2)
+BEHIND = OrthographicCamera(122.7, 202.9, 2.2)
+CLOSE = PerspectiveCamera(57.3, 22.9, 2.2, distance=1.8)
 
 
 @dataclass(frozen=True)

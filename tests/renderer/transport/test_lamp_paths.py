@@ -28,8 +28,8 @@ from renderer.transport.rays import Rays, Surface
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizers import choose
 
-CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
-PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, fov=math.radians(35))
+CAMERA = OrthographicCamera(51.6, 22.9, 2.2)
+PROJECTOR = Projector(pixels=7, polar=28.6, azimuth=91.7, distance=3.0, fov=35.0)
 LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
 DISCS = replace(LAMPS, radius=0.3)
 TWO_DISCS = replace(DISCS, positions=LAMPS.positions[:2])
@@ -147,7 +147,7 @@ def test_the_gradient_by_the_light_is_the_adjoint_of_the_radiance(basis):
 def test_a_screen_at_the_origin_shows_the_pattern_upright_and_with_its_brightness():
     """The projector is at the camera, so each pixel of the white screen is one of the pattern."""
     distance = 3.0
-    fov = 2 * math.atan(CAMERA.width / 2 / distance)
+    fov = 2 * math.degrees(math.atan(CAMERA.width / 2 / distance))
     projector = Projector(4, CAMERA.polar, CAMERA.azimuth, distance, fov)
     right, up, _ = CAMERA.axes()
     corners = 3 * np.array([-right - up, right - up, right + up, up - right])
@@ -320,7 +320,7 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
 def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
     monkeypatch, batch, make_mesh
 ):
-    basis = SumBasis((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8)))
+    basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
     monkeypatch.setattr(lamp_paths, "SMALL", 0)
     sparse = operator_of(mesh, basis, samples=2)
@@ -341,7 +341,7 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(
     monkeypatch,
 ):
-    basis = SumBasis((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8)))
+    basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     monkeypatch.setattr(lamp_paths, "SMALL", 0)
     sparse = operator_of(ball(), basis, samples=2)
     assert len(sparse.nonzero) == len(HARMONICS.nonzero)

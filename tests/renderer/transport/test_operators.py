@@ -1,6 +1,5 @@
 """Operators of single views, compared with plain operations and central differences."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +52,10 @@ def test_the_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
 
 
 def test_a_mesh_at_the_upper_right_is_in_the_last_pixel_of_the_first_row():
-    """From the +x side at the polar angle π/2, z is up and y is to the right."""
+    """From the +x side at the polar angle 90°, z is up and y is to the right."""
     corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
     mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-    camera = OrthographicCamera(math.pi / 2, 0, 2.0)
+    camera = OrthographicCamera(90.0, 0, 2.0)
     assert operator_of(mesh, camera, ImageSettings(4, 2)).pixels.tolist() == [3]
 
 

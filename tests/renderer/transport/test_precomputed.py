@@ -103,7 +103,7 @@ CONVEX = {
 @pytest.mark.parametrize("bounces", [0, 2])
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
 def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh, bounces):
-    camera = OrthographicCamera(1.0, 0.3, 2.2)
+    camera = OrthographicCamera(57.3, 17.2, 2.2)
     direct = operator_of(mesh, camera, shadows=False)
     shadowed = operator_of(mesh, camera, bounces=bounces)
     assert torch.equal(shadowed.transfer, direct.transfer)

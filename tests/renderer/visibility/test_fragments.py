@@ -15,8 +15,8 @@ from renderer.visibility.rasterizers import choose
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")
-CAMERA = OrthographicCamera(1.0, 0.4, 2.2)
-CAMERAS = [CAMERA, OrthographicCamera(2.5, -2.0, 1.6)]
+CAMERA = OrthographicCamera(57.3, 22.9, 2.2)
+CAMERAS = [CAMERA, OrthographicCamera(143.2, -114.6, 1.6)]
 
 
 def dented_sphere() -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +182,7 @@ def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
     vertices, faces = dented_sphere()
     mesh = (3 * vertices, faces)
     settings = ImageSettings(8, 2)
-    camera = OrthographicCamera(1.0, 0.4, 8.0)
+    camera = OrthographicCamera(57.3, 22.9, 8.0)
     inside = fragments_of(mesh, settings, camera, closed=True)
     assert (inside.facing == -1).any()
     whole = fragments_of(mesh, settings, camera)

@@ -17,7 +17,7 @@ from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 
 SIZE = 64
-FAR, NEAR = OrthographicCamera(1.1, 0.4, 2.8), PerspectiveCamera(1.1, 0.4, 2.8, 0.1, -0.05, distance=4.0)
+FAR, NEAR = OrthographicCamera(63.0, 22.9, 2.8), PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)
 LIGHT = 0.4 * load_light("grace").double()
 SCANS = Path(__file__).parents[4] / "shared" / "data" / "meshes"
 
@@ -130,7 +130,7 @@ def test_a_growing_square_gains_its_perimeter_times_the_jump(meshes, expected):
     """In even light; its corners move outwards by one each, and its area grows by its perimeter of 8 · 0.5."""
     mesh, light = concatenate(meshes), ambient(torch.full((3,), 0.6 / math.pi).double())
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
-    camera = OrthographicCamera(0.0, 0.3, 2.0)
+    camera = OrthographicCamera(0.0, 17.2, 2.0)
     image = rendered(mesh, camera, 8, 32, light=light, vertices=vertices, background=0.1, albedo_scale=1.0)
     (gradient,) = torch.autograd.grad(image[0].sum(), vertices)
     growth = (gradient[:4] * torch.from_numpy(mesh.vertices[:4]).sign())[:, :2].sum()
@@ -186,7 +186,7 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
     """In even light an image's sum is that of the triangles' colors times their areas; most of the edges are inner."""
     mesh, albedo = colored_plane(9)
     points, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
-    camera, light = OrthographicCamera(0.0, 0.3, 2.0), ambient(torch.full((3,), 1 / math.pi).double())
+    camera, light = OrthographicCamera(0.0, 17.2, 2.0), ambient(torch.full((3,), 1 / math.pi).double())
     moved = points.clone().requires_grad_()
     total = ((albedo.sum(1) - 3 * 0.3) * triangle_areas(moved, faces)).sum() * (size / camera.width) ** 2
     (expected,) = torch.autograd.grad(total, moved)

@@ -1,6 +1,5 @@
 """The attack command: from its configuration to scenes, and its text."""
 
-import math
 from unittest.mock import Mock
 
 import pytest
@@ -41,7 +40,7 @@ def attacked(*arguments: str, classifier: Classifier | None = None) -> AttackRes
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
     several = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "scene.azimuth=30"
     result = attacked(*several, "attack.allow_negative=true", "attack.max_steps=0")
-    cameras = orbit_cameras(3, 2.0, math.pi / 2, math.pi / 6)
+    cameras = orbit_cameras(3, 2.0, 90.0, 30.0)
     assert result.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
     assert result.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(gray)] * 3 for gray in [0.2, 0.6] * 3]
     assert torch.equal(result.problem.scene.lights, probe("grace").expand(6, -1, -1))

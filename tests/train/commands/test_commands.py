@@ -159,7 +159,7 @@ def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
 @pytest.mark.slow
 def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
     """A cup in front of noise, at another place than the image's middle: rendered and scored as photographed."""
-    camera, light = OrthographicCamera(1.0, 0.5, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
+    camera, light = OrthographicCamera(57.3, 28.6, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
     light[0] += 0.2  # no negative radiance
     mesh, size = renderer.normalize(renderer.solid("cup")), 192
     behind = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)).double()
@@ -183,7 +183,7 @@ def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, ca
     command = shlex.split(output.splitlines()[-1])
     settings = attack_command.read(command[1:])
     assert not settings.renderer.shadows and settings.label == "orange"  # as it was fitted
-    scene, angles = settings.scene, [math.radians(angle) for angle in (settings.scene.polar, settings.scene.azimuth)]
+    scene, angles = settings.scene, (settings.scene.polar, settings.scene.azimuth)
     [found], background = renderer.orbit_cameras(1, scene.width, *angles), read_image(scene.backgrounds[0], 64)
     shown = renderer.render(mesh, found, load_light(scene.light), 64, background, samples=4, encoding="srgb")[0]
     differ = (shown - background).abs().amax(0)

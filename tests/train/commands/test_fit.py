@@ -102,8 +102,8 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
     side = MARGIN * photograph(here, mesh, camera, radiance, encoding)
     arguments = [f"mesh={name}", "photograph=photo.png", "mask=mask.png", "out=fitted", f"encoding={encoding}"]
     if isinstance(camera, PerspectiveCamera):
-        angle = 2 * math.atan(math.tan(camera.angle / 2) * side)
-        arguments.append(f"fov={math.degrees(angle)}")
+        angle = 2 * math.degrees(math.atan(math.tan(math.radians(camera.angle) / 2) * side))
+        arguments.append(f"fov={angle}")
     capsys.readouterr()
     assert call("fit", *arguments) == 0
     output = capsys.readouterr().out
@@ -124,9 +124,9 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
     assert float(((found - true).norm(dim=1) / true.norm(dim=1)).max()) < 0.07
     scene = attack_command.read(command[1:]).scene
     if determined:
-        angles = math.radians(scene.polar), math.radians(scene.azimuth)
         toward = torch.from_numpy(camera.eye()[:3])
-        cosine = OrthographicCamera(*angles, scene.width).axes()[2] @ (toward / toward.norm()).numpy()
+        found = OrthographicCamera(scene.polar, scene.azimuth, scene.width)
+        cosine = found.axes()[2] @ (toward / toward.norm()).numpy()
         assert cosine > math.cos(math.radians(1.5))
 
 
@@ -136,7 +136,7 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(call, tmp_pa
     pytest.importorskip("mitsuba")
     mesh = tmp_path / "pear.glb"
     export_mesh(renderer.normalize(textured("pear")), mesh)
-    camera = PerspectiveCamera(1.2, 0.7, 3.0, 0.2, -0.1, distance=5.0)
+    camera = PerspectiveCamera(68.8, 40.1, 3.0, 0.2, -0.1, distance=5.0)
     check_fit(call, capsys, tmp_path, str(mesh), camera, unclipped(generated_map()), encoding, determined=True)
 
 
@@ -154,6 +154,6 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(call, tmp_pa
 def test_camera_and_light_of_a_path_traced_scan_are_found(call, tmp_path, capsys, name, light, determined):
     """The shape of a golf ball does not determine the camera."""
     pytest.importorskip("mitsuba")
-    camera = PerspectiveCamera(1.1, 1.0, 3.0, 0.2, -0.1, distance=6.0)
+    camera = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
     radiance = unclipped(read_panorama(DATA / "hdri" / f"{light}.npy"))
     check_fit(call, capsys, tmp_path, str(DATA / "meshes" / name), camera, radiance, "srgb", determined)
