@@ -88,7 +88,11 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "radiance": (torch.rand(8, 16, 3), lambda x: harmonics.project(x, 2)),
     "coefficients": (LIGHT, lambda x: harmonics.rotate(x, torch.eye(3))),
     "rotation": (torch.eye(3).roll(1, 0), lambda x: harmonics.rotate(LIGHT, x)),
-    "zenith": (torch.tensor([15.0, 30.0]), lambda x: skylight.coefficients(x, 30.0, 3.0).float()),
+    # Arrays and lists are converted to radians in float64, as a float64 tensor is.
+    "zenith": (
+        torch.tensor([15.0, 30.0], dtype=torch.float64),
+        lambda x: skylight.coefficients(x, 30.0, 3.0),
+    ),
     "light of a scene": (
         LIGHT,
         lambda x: render_scene(augment.build_scene([(MESH, "a")], SIZE, light=x, samples=1)),
@@ -116,4 +120,4 @@ def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):
     torch.manual_seed(0)
     expected = call(tensor)
     torch.manual_seed(0)
-    torch.testing.assert_close(call(convert(tensor)), expected, rtol=2e-6, atol=4e-6)
+    torch.testing.assert_close(call(convert(tensor)), expected, rtol=1e-6, atol=1e-7)
