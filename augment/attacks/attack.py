@@ -48,7 +48,7 @@ from renderer.validation import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# In place of a target class.
+# This name stands in place of a target class.
 LEAST_LIKELY = "least_likely"
 # Pixels per side of the ball that shows the light.
 BALL_SIZE = 96
@@ -283,7 +283,8 @@ def _attack(
     settings.require_parameters()
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
-    warn_of_changed_light(scene, problem.scene)
+    # The warning names the line that calls `attack`.
+    warn_of_changed_light(scene, problem.scene, stacklevel=4)
     model = preprocessed_model(settings, classifier)
 
     images_before = problem.images(problem.start)
@@ -325,7 +326,7 @@ def _attack(
     )
 
 
-def warn_of_changed_light(given: Scene, physical: Scene) -> None:
+def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) -> None:
     """Warn if making light physical changes its irradiance by more than 5 %.
 
     The change is the rms error of irradiance over normals and channels,
@@ -335,6 +336,8 @@ def warn_of_changed_light(given: Scene, physical: Scene) -> None:
     Args:
         given: The scene before `AttackSettings.problem`.
         physical: The scene of that problem.
+        stacklevel: Number of calls from `warnings.warn` to the line that the
+            warning names, as there.
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
@@ -344,7 +347,7 @@ def warn_of_changed_light(given: Scene, physical: Scene) -> None:
         problem = "the light is negative in places, and without that its irradiance is off by"
         advice = "a higher degree is closer, and allow_negative=True leaves the light"
         message = f"{problem} {error:.0%} (rms) in {harmonics}: {advice} as it is"
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(message, stacklevel=stacklevel)
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from augment.attacks.parameter_settings import PARAMETER_NAMES
 from augment.losses import adversarial_cost
 from renderer.errors import InputError
 from renderer.light.nonnegative import project_nonnegative
+from renderer.light.presets import directional
 
 SHARED = {"views": 2, "shared": True}
 
@@ -118,3 +119,16 @@ def test_misclassified_examples_and_impossible_targets_are_refused_in_one_senten
             augment.attack(by_color, scene(label), target, force=True)
     with pytest.raises(InputError, match="name what to attack: one or more of lighting, "):
         augment.attack(by_color, scene("orange"), settings=augment.AttackSettings())
+
+
+def test_the_warning_of_changed_light_names_the_line_that_attacks(by_color):
+    """A directional light of degree 6 is negative on its far side."""
+    light = directional(torch.tensor([0.0, 0.0, 1.0]), torch.ones(3))
+    scene = augment.build_scene([("solid:orange", "orange")], by_color.size, light=light)
+    settings = augment.AttackSettings(
+        lighting=augment.StepSettings(), max_steps=1, allow_negative=False
+    )
+    with pytest.warns(UserWarning) as warnings:
+        augment.attack(by_color, scene, settings=settings, force=True)
+    changed = [warning for warning in warnings if "irradiance" in str(warning.message)]
+    assert [warning.filename for warning in changed] == [__file__]
