@@ -31,7 +31,7 @@ def attach(
         >>> attach("renderer", renderer.__file__)[2][0]
         'Camera'
     """
-    modules = _read_stub(file.removesuffix("c") + "i")
+    modules = _read_stub(f"{file}i")
     names = sorted(modules)
 
     def get_attribute(name: str) -> object:

@@ -337,20 +337,20 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
 
 def _as_list(key: str, value: str, is_text: bool) -> str:
     """Write the override of a list, whose one member is the value unless this is a list."""
+    if not value or value.startswith("["):
+        return f"{key}={value}"
     try:
         parsed = OverridesParser.create().parse_override(f"{key}={value}").value()
-    except HydraException:
-        # Hydra refuses some paths. It explains what is wrong with a list.
-        is_list = value.startswith("[")
-        return f"{key}={value}" if is_list else f"{key}=[{quoted(value)}]"
+    except HydraException:  # Hydra refuses some paths.
+        return f"{key}=[{quoted(value)}]"
     if isinstance(parsed, str) or (is_text and isinstance(parsed, int | float)):
         # A name in quotes keeps them.
-        if not value:
-            return f"{key}="
         member = value if value[0] in QUOTES else quoted(value)
-        return f"{key}=[{member}]"
-    is_member = isinstance(parsed, dict | int | float)
-    return f"{key}=[{value}]" if is_member else f"{key}={value}"
+    elif isinstance(parsed, dict | int | float):
+        member = value
+    else:  # It is null or a sweep.
+        return f"{key}={value}"
+    return f"{key}=[{member}]"
 
 
 def quoted(text: str) -> str:

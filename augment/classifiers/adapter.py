@@ -241,15 +241,6 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     return tuple(as_list(name, classes, str, "a list of the names of the classes, in the order of the logits"))
 
 
-def require_classifier(name: str, value: object) -> None:
-    """Check that an argument is a `Classifier`.
-
-    Raises:
-        InputError: If it is of another type, such as a bare network.
-    """
-    require_kind(name, value, Classifier, "augment.Classifier(network, size, classes) or augment.load_classifier(...)")
-
-
 class Normalized(nn.Module):
     """A network behind its own normalization: takes images (N, 3, H, W), RGB in [0, 1], as (x − mean) / std.
 
