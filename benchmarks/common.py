@@ -5,6 +5,7 @@ Run a benchmark as a module in the root of the repository:
     python -m benchmarks.renderer
 """
 
+import argparse
 import csv
 import json
 import os
@@ -30,6 +31,36 @@ MIN_TIMED_SECONDS = 2e-3
 # A comparison stops after this many seconds, but not before MIN_ROUNDS.
 MAX_COMPARISON_SECONDS = 20.0
 MIN_ROUNDS = 3
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """Make a parser with the options of the benchmarks of the renderer.
+
+    Args:
+        description: Text of --help.
+
+    Returns:
+        The parser, with --sizes and --rounds.
+    """
+    parser = argparse.ArgumentParser(
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add(
+        "--sizes",
+        type=int,
+        nargs="+",
+        default=[32, 224],
+        help="pixels per side of the images",
+    )
+    add(
+        "--rounds",
+        type=int,
+        default=21,
+        help="number of rounds, in which all settings take turns",
+    )
+    return parser
 
 
 def medians(

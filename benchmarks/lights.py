@@ -37,6 +37,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from benchmarks import common
 from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, times_in_turn
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.geometry.mesh import Mesh, concatenate, normalize, subdivide
@@ -457,31 +458,15 @@ def render_with_mitsuba(mesh: Mesh, size: int, case: Case, light: Tensor) -> Mit
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = common.make_parser(__doc__)
     add = parser.add_argument
     add("--csv", type=Path, default=Path("lights.csv"), help="file of the results")
     add("--mitsuba", action="store_true", help="compare with Mitsuba 3, too")
-    add(
-        "--sizes",
-        type=int,
-        nargs="+",
-        default=[32, 224],
-        help="pixels per side of the images",
-    )
     add(
         "--vertices",
         type=int,
         default=4000,
         help="smallest number of vertices of the cup",
-    )
-    add(
-        "--rounds",
-        type=int,
-        default=21,
-        help="number of rounds, in which all settings take turns",
     )
     add(
         "--steps-only",

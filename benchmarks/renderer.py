@@ -35,7 +35,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks import scene
+from benchmarks import common, scene
 from benchmarks.common import Row, machine, medians, write_csv
 from benchmarks.peer import Peer
 from benchmarks.savings import measure_savings
@@ -466,33 +466,17 @@ def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
 
 def make_parser() -> argparse.ArgumentParser:
     """Make the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = common.make_parser(__doc__)
     add = parser.add_argument
     add("--out", type=Path, default=Path("docs"), help="folder of the results")
     add("--mitsuba", action="store_true", help="time Mitsuba 3, too, which needs LLVM")
     add("--rasterizer", choices=RASTERIZERS, default="auto")
     add("--device", default="cpu", help="cpu or cuda")
     add(
-        "--sizes",
-        type=int,
-        nargs="+",
-        default=[32, 224],
-        help="pixels per side of the images",
-    )
-    add(
         "--subdivisions",
         type=int,
         default=5,
         help="subdivisions of the icosahedron; 5 make 10,242 vertices",
-    )
-    add(
-        "--rounds",
-        type=int,
-        default=21,
-        help="number of rounds, in which all settings take turns",
     )
     add(
         "--step-sizes",

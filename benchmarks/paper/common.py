@@ -21,6 +21,7 @@ from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings
 from augment.attacks.attack import logits_of
+from augment.random_streams import generator
 from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, load_object
 from augment.settings import ObjectSettings
@@ -121,6 +122,11 @@ def make_parser(study: str | None, description: str | None) -> argparse.Argument
     add("--seed", type=int, default=0)
     add("--threads", type=int, default=1, help="number of threads on the CPU")
     return parser
+
+
+def add_examples(parser: argparse.ArgumentParser) -> None:
+    """Add the option --examples, which `subjects_with_views` reads, to a parser."""
+    parser.add_argument("--examples", type=int, default=20, help="number of views of each mesh")
 
 
 def prepare(
@@ -299,6 +305,22 @@ def random_views(count: int, draws: torch.Generator) -> list[View]:
         camera = OrthographicCamera(POLAR, azimuth, WIDTHS[width])
         views.append(View(camera, GRAYS[gray]))
     return views
+
+
+def subjects_with_views(setup: Setup) -> Iterator[tuple[SceneObject, list[View]]]:
+    """Draw --examples views of each subject that the classifier recognizes.
+
+    Args:
+        setup: What the benchmark works on.
+
+    Yields:
+        Each subject with its views.
+    """
+    options = setup.options
+    for subject in setup.subjects:
+        draws = generator(options.seed, subject.name)
+        views = clean_correct_views(subject, setup.classifier, options.examples, draws)
+        yield subject, views
 
 
 def clean_correct_views(

@@ -171,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = common.make_parser("norm_balls", __doc__)
     parser.add_argument("--spaces", nargs="+", choices=RADII, default=list(RADII))
-    parser.add_argument("--examples", type=int, default=20, help="number of views of each mesh")
+    common.add_examples(parser)
     parser.add_argument(
         "--steps",
         type=int,
@@ -181,9 +181,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     setup = common.prepare(parser, argv, common.VERTICES)
     options = setup.options
     classifier = setup.classifier
-    for subject in setup.subjects:
-        draws = generator(options.seed, subject.name)
-        views = common.clean_correct_views(subject, classifier, options.examples, draws)
+    for subject, views in common.subjects_with_views(setup):
         scenes = [
             common.make_scene(subject, classifier.size, part) for part in common.batches(views)
         ]

@@ -12,7 +12,6 @@ import torch
 from augment import AttackSettings, Classifier
 from augment.attacks.descent import Goal, descend
 from augment.attacks.problem import build_problem
-from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.common import Row
 from benchmarks.paper import common
@@ -56,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         argv: Words of the command line. None takes those of the process.
     """
     parser = common.make_parser("run_time", __doc__)
-    parser.add_argument("--examples", type=int, default=20, help="number of views of each mesh")
+    common.add_examples(parser)
     parser.add_argument(
         "--steps",
         type=int,
@@ -66,9 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     setup = common.prepare(parser, argv, common.VERTICES)
     options = setup.options
     settings = common.attack_settings("lighting", options.steps)
-    for subject in setup.subjects:
-        draws = generator(options.seed, subject.name)
-        views = common.clean_correct_views(subject, setup.classifier, options.examples, draws)
+    for subject, views in common.subjects_with_views(setup):
         for view in views:
             record = measure_attack(subject, setup.classifier, view, settings)
             common.append(options.out, record)
