@@ -1,4 +1,4 @@
-"""Does a classifier survive a change of light, and how is it made to?
+"""Test whether a classifier survives a change of light, and harden it if it does not.
 
     import norm_balls as nb
 

@@ -65,8 +65,9 @@ class StepSettings(Settings):
 class SkylightSettings(StepSettings):
     """Attack on the sun and the air of a clear sky, and where it starts.
 
-    The radius and the steps count the zenith and the azimuth in the unit `sun`, and the turbidity in
-    the unit 4. With the default of `sun`, a radius of 0.1 is 5.7 degrees and 0.4 of turbidity.
+    A radius of 1 allows a change of the zenith angle and of the azimuth by `sun` degrees, and a
+    change of the turbidity by 4. With the default of `sun`, a radius of 0.1 allows changes by 5.7
+    degrees and by 0.4. Step sizes have the same units.
     """
 
     zenith: float = setting(45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90)

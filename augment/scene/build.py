@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from augment.attacks.settings import AttackSettings
     from augment.settings import VariationSettings
 
+# What a label must be, for errors.
 LABEL = "the name of a class, or its index"
 # What a mesh is given as: a file, solid:NAME or a mesh.
 Shown = str | Path | Mesh

@@ -51,10 +51,10 @@ def coefficients(
 ) -> Tensor:
     """Compute the light of a daylight sky.
 
-    The result has analytic first derivatives by the parameters, per degree for
-    the angles. Its error is at
-    most 7e-5 of the norm of the coefficients (4e-4 in haze with the sun on the
-    horizon, where the coefficients are smallest). The error of the derivatives
+    The result has analytic first derivatives by the parameters. Those by the
+    angles are per degree. The error of the result is at most 7e-5 of the norm of
+    the coefficients (4e-4 in haze with the sun on the horizon, where the
+    coefficients are smallest). The error of the derivatives
     is at most 0.1 % by zenith and azimuth and 0.5 % by turbidity, and two to
     three times as large at the ends of the domain.
 
