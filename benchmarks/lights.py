@@ -42,12 +42,12 @@ from benchmarks.common import Row, quartiles_of_ratio, record, relative_error, t
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.geometry.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.geometry.shapes import solid
-from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
+from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.transport import precomputed, rays
 from renderer.transport.operators import TransferOperator, build_operators

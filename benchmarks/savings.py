@@ -15,7 +15,7 @@ from benchmarks.steps import LightStep
 from renderer import rendering
 from renderer.geometry.mesh import Mesh
 from renderer.light.basis import COEFFICIENTS, DEGREE
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 
 Call = Callable[[], object]
 

@@ -20,11 +20,11 @@ from benchmarks import reference
 from benchmarks.common import Row, relative_error
 from renderer.camera import OrthographicCamera
 from renderer.geometry.mesh import Mesh
-from renderer.io.mitsuba import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import DEGREE, Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import probe
+from renderer.mitsuba_scene import DIFFERENTIABLE, load, mitsuba, mitsuba_map, shape
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.transport.operators import TransferOperator, build_operators

@@ -8,7 +8,7 @@ from torch import Tensor
 from benchmarks import reference
 from benchmarks.scene import BACKGROUND, Result, View, VisibleSurface
 from renderer.image import tonemap
-from renderer.surface import shading
+from renderer.shading import shading
 from renderer.transport.operators import TransferOperator
 from renderer.visibility.fragments import Fragments
 

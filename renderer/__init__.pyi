@@ -21,7 +21,7 @@ from renderer.rendering import light_sphere as light_sphere
 from renderer.rendering import precompute_transfer as precompute_transfer
 from renderer.rendering import render as render
 from renderer.settings import ImageSettings as ImageSettings
-from renderer.surface.gloss import Gloss as Gloss
+from renderer.shading.gloss import Gloss as Gloss
 from renderer.transport.operator_stacks import TransferOperators as TransferOperators
 from renderer.transport.operators import TransferOperator as TransferOperator
 

@@ -20,8 +20,8 @@ from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split
 from renderer.light.harmonics import degree_of
 from renderer.settings import DEFAULT_SAMPLES, RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
+from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import face_albedo, surface_albedo
-from renderer.surface.gloss import Gloss
 from renderer.transport.operator_stacks import TransferOperators
 from renderer.transport.operators import build_operators
 from renderer.transport.precomputed import build_transport

@@ -16,8 +16,8 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import decode
 from renderer.light.basis import SplitLight
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss
-from renderer.surface.shading import glossy_radiance, normals_in_sight, radiance
+from renderer.shading.gloss import Gloss, SampleGloss, sample_gloss
+from renderer.shading.shading import glossy_radiance, normals_in_sight, radiance
 from renderer.transport.lamp_paths import LocalLightView
 from renderer.transport.rays import Rays
 from renderer.visibility.fragments import Fragments

@@ -29,15 +29,15 @@ from renderer.image import to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.files import write_whole
 from renderer.io.images import gray_or_image, read_numbers, write_image, write_numbers
-from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
-from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.light_files import read_light, save_light
 from renderer.light.local_lights import LOCAL_LIGHTS
 from renderer.light.presets import load_light
+from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
+from renderer.surface.texture_bake import with_added_albedo
 from renderer.validation import as_folder
 from renderer.visibility.rasterizers import Rasterizer, choose
 

@@ -24,8 +24,8 @@ from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
-from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
 from renderer.io.tiles import Tile, draw_grid, tiles_of
+from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.rendering import light_sphere
 from renderer.validation import as_folder, as_list, require_kind
 from renderer.visibility.rasterizers import Rasterizer

@@ -22,10 +22,10 @@ from augment.scene.scene import Scene
 from renderer.geometry.mesh import select_faces
 from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
+from renderer.light.highlights import degree_for, highlight_error
 from renderer.light.presets import load_light
 from renderer.settings import MIN_ROUGHNESS
-from renderer.surface.gloss import Gloss, smoothest
-from renderer.surface.microfacets import degree_for, highlight_error
+from renderer.shading.gloss import Gloss, smoothest
 
 if TYPE_CHECKING:
     from augment.settings import VarnishSettings

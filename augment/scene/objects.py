@@ -13,7 +13,7 @@ from augment.settings import MeshSettings, ObjectSettings, PropSettings, require
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, concatenate, normalize, select_faces, subdivide
 from renderer.geometry.shapes import solid
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 
 # The smallest distance from the middle of a table to its sides, in world units.
 MIN_TABLE_REACH = 1.2

@@ -23,8 +23,8 @@ from renderer.geometry.mesh import Mesh
 from renderer.light.basis import Basis, split_light
 from renderer.settings import ImageSettings
 from renderer.shaded_view import PixelRadiance, ShadedView
+from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import painted_albedo, surface_albedo
-from renderer.surface.gloss import Gloss
 from renderer.transport.lamp_paths import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface

@@ -26,7 +26,7 @@ from renderer.io.images import SUFFIXES, read_image
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.harmonics import degree_of
 from renderer.light.presets import directional, load_light
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 from renderer.transport.rays import Rays
 from renderer.vectors import rotation_matrices
 

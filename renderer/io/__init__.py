@@ -1,1 +1,1 @@
-"""Meshes, images and whole scenes as files, in and out."""
+"""Files of meshes and images, in and out."""

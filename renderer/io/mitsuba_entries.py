@@ -2,7 +2,7 @@
 
 A scene is a dictionary as `mitsuba.load_dict` takes it, except for two kinds of
 value. A to_world transform is an array (4, 4). An image is an array (H, W, 3)
-under "bitmap", or the name of a file under "filename". `renderer.io.mitsuba`
+under "bitmap", or the name of a file under "filename". `renderer.mitsuba_scene`
 loads and writes such scenes.
 """
 

@@ -24,8 +24,8 @@ from renderer.light.harmonics import (
     require_degree,
     rotate,
 )
+from renderer.light.highlights import window_without_ringing
 from renderer.light.light_files import read_light
-from renderer.surface.microfacets import window_without_ringing
 from renderer.validation import as_path
 
 # Coefficients of three light probes, as RGB rows in the order L00, L1-1, L10,
@@ -93,7 +93,7 @@ def load_light(
             coefficients, or 6 for any other light.
         roughness: Roughness in [0, 1] of the smoothest surface that the light
             shines on. If it is given, a map is truncated by
-            `renderer.surface.microfacets.window_without_ringing`, which changes maps
+            `renderer.light.highlights.window_without_ringing`, which changes maps
             whose highlights would ring.
 
     Returns:

@@ -1,1 +1,1 @@
-"""How a surface reflects light: albedo, diffuse shading and gloss."""
+"""What surfaces are made of: albedo, textures, and the reflectance of rough materials."""

@@ -289,7 +289,7 @@ def painted_albedo(
 
     The scaled albedo of the mesh is changed at corners and texels, as in
     `changed_albedo`, and interpolated afterwards. Image files can therefore
-    store the changed albedo (see `renderer.io.texture_bake`). The result is
+    store the changed albedo (see `renderer.surface.texture_bake`). The result is
     differentiable with respect to `added` and `hue`.
 
     Args:

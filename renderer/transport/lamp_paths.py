@@ -15,7 +15,7 @@ from torch import Tensor
 from renderer.geometry.mesh import Mesh
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss, at_samples
+from renderer.shading.gloss import Gloss, at_samples
 from renderer.transport.rays import NO_FACE, Rays, Surface
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments

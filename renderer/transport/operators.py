@@ -4,7 +4,7 @@ Before clamping, the radiance of every pixel is linear in the coefficients U of
 the light (the paper's appendix B.2): radiance = Uᵀ T. The transfer matrix T is
 computed once for a mesh and a camera, and multiplied with every light. T
 contains the box filter, the texture and the albedo exactly. It also contains
-gloss (`renderer.surface.gloss`), and shadows and bounces (the package
+gloss (`renderer.shading.gloss`), and shadows and bounces (the package
 `renderer.transport`).
 
 Shapes use these letters: an operator has P covered pixels and K coefficients
@@ -33,8 +33,8 @@ from renderer.image import as_background, background_term, composite, encode, en
 from renderer.light import harmonics
 from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, LocalPart
 from renderer.settings import ImageSettings
+from renderer.shading.gloss import Gloss, SampleGloss, at_samples
 from renderer.surface.albedo import shared_albedo, surface_albedo
-from renderer.surface.gloss import Gloss, SampleGloss, at_samples
 from renderer.transport.lamp_paths import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface

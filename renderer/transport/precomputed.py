@@ -36,8 +36,8 @@ from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, refine
 from renderer.light.basis import Basis, Harmonics
 from renderer.settings import ImageSettings
+from renderer.shading.gloss import SampleGloss, at_samples
 from renderer.surface.albedo import surface_albedo
-from renderer.surface.gloss import SampleGloss, at_samples
 from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
 from renderer.visibility.fragments import Fragments

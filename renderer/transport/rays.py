@@ -25,8 +25,8 @@ from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import face_normals
 from renderer.light.harmonics import per_degree
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
-from renderer.surface.shading import normals_in_sight, smooth_normals
+from renderer.shading.gloss import Gloss, SampleGloss, sample_gloss, toward_camera
+from renderer.shading.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
 

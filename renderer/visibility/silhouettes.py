@@ -1,6 +1,6 @@
 """Gradients of images by the positions of surfaces and silhouettes in them.
 
-`renderer.surface.shading` differentiates the shading of samples and holds fixed which
+`renderer.shading.shading` differentiates the shading of samples and holds fixed which
 face a sample shows. This module adds the gradient that is missing there: of an
 image by where the surfaces lie in it.
 

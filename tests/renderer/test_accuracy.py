@@ -29,8 +29,8 @@ from renderer.light.basis import Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import ambient
 from renderer.settings import ImageSettings
+from renderer.shading.shading import radiance
 from renderer.surface.albedo import surface_albedo
-from renderer.surface.shading import radiance
 from renderer.transport import rays
 from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface
@@ -274,7 +274,7 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarr
 
 
 def by_geometry(setup: Setup) -> Errors:
-    """Image and its gradient by the vertices, through `renderer.surface.shading`."""
+    """Image and its gradient by the vertices, through `renderer.shading.shading`."""
     view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
     fragments, upstream = setup.fragments(), random_upstream(len(view.pixels))
     image = radiance(fragments, vertices, light, surface_albedo(setup.mesh, fragments, "linear"))

@@ -14,12 +14,12 @@ from renderer.geometry.normals import face_normals, vertex_normals
 from renderer.image import tonemap
 from renderer.light.harmonics import basis, project, rotate
 from renderer.settings import ImageSettings
-from renderer.surface.albedo import face_albedo, surface_albedo
-from renderer.surface.shading import (
+from renderer.shading.shading import (
     irradiance,
     normals_in_sight,
     radiance,
 )
+from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.transport.operators import build_operators
 from renderer.visibility.fragments import build_fragments
 from renderer.visibility.rasterizers import choose

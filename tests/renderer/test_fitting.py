@@ -10,10 +10,10 @@ import renderer
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fitting import FINAL_GRID, LEAST_RADIANCE, _nonnegative_light, fit_scene
-from renderer.io.mitsuba import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import basis
 from renderer.light.presets import load_light
+from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
 
 FAR = OrthographicCamera(51.6, 114.6, 3.0, 0.2, -0.1)

@@ -19,8 +19,8 @@ from oracles import mesh_of
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh, normalize
 from renderer.geometry.shapes import solid
-from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.light.environment import write_map
+from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.transport import rays
 from renderer.transport.operators import build_operators

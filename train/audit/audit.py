@@ -22,8 +22,8 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.io.files import write_whole
-from renderer.io.mitsuba import mitsuba
 from renderer.light.presets import UNIFORM, load_light
+from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.audit import audit_page as page
 from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers

@@ -19,7 +19,7 @@ from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, normalize
 from renderer.geometry.shapes import solid
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 from renderer.visibility.rasterizers import choose
 
 OTHERS = {"skylight", "projector", "lamps", "positions", "pose"}  # each has a test of its own

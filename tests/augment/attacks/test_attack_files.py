@@ -14,10 +14,10 @@ from augment.attacks.attack import AttackResult
 from augment.attacks.attack_files import LINES, SIDE, _captions, figure
 from augment.attacks.checks import warnings
 from renderer.io.meshes import load_mesh
-from renderer.io.mitsuba import mitsuba_map
 from renderer.io.tiles import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
 from renderer.light.presets import load_light
+from renderer.mitsuba_scene import mitsuba_map
 
 CLASSES = ("orange", "lime", "sky", "night")
 

@@ -17,9 +17,9 @@ from renderer.geometry.shapes import solid
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import quadrature
+from renderer.light.highlights import degree_for
 from renderer.light.presets import directional, load_light, probe
-from renderer.surface.gloss import Gloss, smoothest
-from renderer.surface.microfacets import degree_for
+from renderer.shading.gloss import Gloss, smoothest
 
 MATTE, OPTIONS = ("solid:pear", "pear"), {"samples": 1, "rasterizer": "numpy"}
 EVERYWHERE = MaterialSettings()  # without a radius, down to a roughness of 0.2

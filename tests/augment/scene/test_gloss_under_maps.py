@@ -18,7 +18,7 @@ from renderer.light.environment import read_map, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.presets import mean_luminance, probe
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 from renderer.transport.operators import build_operators
 from renderer.transport.rays import Surface
 from renderer.visibility.fragments import build_fragments

@@ -25,9 +25,9 @@ from renderer.errors import InputError
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
+from renderer.light.highlights import degree_for
 from renderer.light.presets import ambient, probe
 from renderer.settings import ImageSettings
-from renderer.surface.microfacets import degree_for
 from renderer.transport.operators import build_operators
 from renderer.visibility.rasterizers import choose
 

@@ -9,7 +9,6 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.shapes import sphere
-from renderer.io.mitsuba import SCENE, write_mitsuba_scene
 from renderer.light.basis import (
     Harmonics,
     SumBasis,
@@ -19,6 +18,7 @@ from renderer.light.basis import (
 from renderer.light.environment import read_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
+from renderer.mitsuba_scene import SCENE, write_mitsuba_scene
 from renderer.settings import ImageSettings
 
 # The three lights have 9, 2 and 9 coefficients.

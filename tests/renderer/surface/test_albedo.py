@@ -11,13 +11,13 @@ from scipy.ndimage import map_coordinates
 
 from renderer.camera import OrthographicCamera
 from renderer.geometry.mesh import Mesh
-from renderer.io.texture_bake import with_added_albedo
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import (
     face_albedo,
     painted_albedo,
     surface_albedo,
 )
+from renderer.surface.texture_bake import with_added_albedo
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import choose
 

@@ -11,14 +11,14 @@ import trimesh
 from oracles import draw, draw_uniform, mesh_of
 from torch import Tensor
 
+from renderer import mitsuba_scene
 from renderer.camera import OrthographicCamera
 from renderer.geometry.mesh import Mesh, concatenate
-from renderer.io import mitsuba
-from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
+from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.transport import lamp_paths
@@ -118,7 +118,7 @@ def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypat
     Most pixels are therefore equal up to the float32 rays, and all pixels are
     equal on average. Discs have little noise with 1,024 rays.
     """
-    monkeypatch.setattr(mitsuba, "SAMPLES", sample_count)
+    monkeypatch.setattr(mitsuba_scene, "SAMPLES", sample_count)
     light = 2 * draw_uniform(basis.size, 3, seed=1)
     found = canvas(operator_of(make_mesh(), basis), light)
     expected = mitsuba_image(tmp_path, make_mesh(), basis, light)

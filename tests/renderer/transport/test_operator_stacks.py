@@ -17,7 +17,7 @@ from renderer.geometry.mesh import Mesh
 from renderer.light.basis import HARMONICS, Basis, SumBasis
 from renderer.light.projector import Projector
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 from renderer.transport.operator_stacks import TransferOperators
 from renderer.transport.operators import build_operators
 from renderer.visibility.rasterizers import choose

@@ -20,10 +20,10 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_image
-from renderer.io.mitsuba import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.light.environment import read_panorama, to_map, write_map
 from renderer.light.harmonics import equirectangular, project
 from renderer.light.presets import load_light
+from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.settings import ImageSettings
 from scripts.attack import main as attack_command
 

@@ -24,11 +24,11 @@ from renderer.geometry.shapes import HARD_NEGATIVES
 from renderer.image import decode, encode
 from renderer.io.files import write_whole
 from renderer.io.images import read_image, write_image
-from renderer.io.mitsuba import Part, load, mitsuba, shape, split_parts
 from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
 from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
+from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from train.command_settings import LabSettings
 from train.data.photographs import DESCRIPTION, FOREIGN, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION

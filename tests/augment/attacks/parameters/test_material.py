@@ -21,8 +21,8 @@ from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.shapes import sphere
 from renderer.settings import MIN_ROUGHNESS
+from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import changed_albedo
-from renderer.surface.gloss import Gloss
 
 ONE = torch.zeros(1, dtype=torch.int64)
 UNITS = torch.tensor([0.3, 0.2, 0.5, np.deg2rad(40)])

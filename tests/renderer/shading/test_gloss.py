@@ -23,7 +23,6 @@ from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.geometry.shapes import solid, sphere
-from renderer.io.mitsuba import load, mitsuba, mitsuba_map, shape
 from renderer.io.mitsuba_entries import environment, integrator, sensor_of
 from renderer.light.basis import (
     Basis,
@@ -33,19 +32,16 @@ from renderer.light.basis import (
     SplitLight,
 )
 from renderer.light.harmonics import bands, basis, lambertian_factors
+from renderer.light.highlights import AMPLITUDE, degree_for, highlight_window
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
+from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
-from renderer.surface.gloss import Gloss, SampleGloss
-from renderer.surface.microfacets import (
-    AMPLITUDE,
-    degree_for,
-    highlight_window,
-    reflectance,
-)
+from renderer.shading.gloss import Gloss, SampleGloss
+from renderer.surface.microfacets import reflectance
 from renderer.transport.lamp_paths import local_radiance
 from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.rays import Rays

@@ -21,9 +21,9 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, tonemap
 from renderer.light.harmonics import DIFFUSE_DEGREE, nonzero_coefficients
 from renderer.settings import ImageSettings
-from renderer.surface import shading
+from renderer.shading import shading
+from renderer.shading.shading import radiance
 from renderer.surface.albedo import surface_albedo
-from renderer.surface.shading import radiance
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import choose
 

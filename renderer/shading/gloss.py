@@ -1,7 +1,7 @@
 """Gloss (specular reflection) of surfaces in the terms of glTF 2.0.
 
 A surface has roughness, metallic m and strength s (glTF's `specularFactor`), and
-an albedo ρ. Its specular reflection has two parts, both of `renderer.surface.microfacets`.
+an albedo ρ. Its specular reflection has two parts, both of `renderer.shading.lobes`.
 A dielectric one with the factor (1 - m) s is white. A metallic one with the
 factor m has the color of the metal: it is Schlick's approximation with
 F0 = ρ and F90 = 1. The reflected radiance per irradiance is
@@ -40,19 +40,9 @@ from renderer.errors import InputError, require_bounded
 from renderer.geometry.mesh import Mesh, require_mesh
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.settings import MIN_ROUGHNESS
+from renderer.shading.lobes import ViewFrame, along, coat_albedo, coat_bands, coat_mean, lobe_functions
 from renderer.surface.albedo import Texture, sample_textures
-from renderer.surface.microfacets import (
-    DIELECTRIC,
-    EDGE,
-    SCHLICK,
-    ViewFrame,
-    along,
-    coat_albedo,
-    coat_bands,
-    coat_mean,
-    lobe_functions,
-    reflectance,
-)
+from renderer.surface.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
 from renderer.validation import as_tensor, require_flag
 from renderer.vectors import unit
 from renderer.visibility.fragments import Fragments
@@ -186,7 +176,7 @@ class SampleGloss(NamedTuple):
 
         Returns:
             The colored and the white lobe, in the M functions of
-            `renderer.surface.microfacets.lobe_functions`, shape (M, S) each. The colored
+            `renderer.shading.lobes.lobe_functions`, shape (M, S) each. The colored
             lobe is None if no sample is metallic.
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)

@@ -38,8 +38,8 @@ from torch.autograd.function import once_differentiable
 from renderer.errors import require_bounded
 from renderer.geometry.normals import FEW, area_vectors, vertex_normals
 from renderer.light import harmonics
-from renderer.surface.gloss import SampleGloss, at_samples, toward_camera
-from renderer.surface.microfacets import along, coat_bands
+from renderer.shading.gloss import SampleGloss, at_samples, toward_camera
+from renderer.shading.lobes import along, coat_bands
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
 
@@ -116,7 +116,7 @@ def glossy_radiance(
         light: SH coefficients of any degree, shape (K, 3).
         albedo: Linear albedo at the samples, shape (S, 3).
         normals: Normals of the vertices, as for `radiance`.
-        gloss: Gloss at the samples (`renderer.surface.gloss`).
+        gloss: Gloss at the samples (`renderer.shading.gloss`).
 
     Returns:
         Radiance, weighted with coverage, shape (3, P), in the dtype of the

@@ -12,18 +12,18 @@ from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh, normalize
-from renderer.io.mitsuba import (
+from renderer.light.environment import write_map
+from renderer.light.harmonics import basis
+from renderer.light.presets import load_light
+from renderer.mitsuba_scene import (
     SCENE,
     mitsuba,
     mitsuba_map,
     render_mitsuba_scene,
     write_mitsuba_scene,
 )
-from renderer.light.environment import write_map
-from renderer.light.harmonics import basis
-from renderer.light.presets import load_light
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import Gloss
+from renderer.shading.gloss import Gloss
 from renderer.transport.operators import (
     TransferOperator,
     build_operators,

@@ -40,12 +40,12 @@ from renderer.image import decode, encode, to_bytes
 from renderer.io.files import write_whole
 from renderer.io.images import write_image
 from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_of
-from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
-from renderer.surface.microfacets import coat_mean
+from renderer.shading.lobes import coat_mean
+from renderer.surface.texture_bake import with_added_albedo
 
 # Name of the scene file in its folder.
 SCENE = "scene.xml"

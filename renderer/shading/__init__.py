@@ -1,0 +1,1 @@
+"""How a surface reflects light: diffuse shading, gloss and its lobes."""
