@@ -1,3 +1,5 @@
+from augment.attack_settings import AttackSettings as AttackSettings
+from augment.attack_settings import EOTSettings as EOTSettings
 from augment.attacks.adversary import Adversary as Adversary
 from augment.attacks.adversary import reload as reload
 from augment.attacks.attack import AttackResult as AttackResult
@@ -6,15 +8,13 @@ from augment.attacks.attack_files import save as save
 from augment.attacks.checks import check as check
 from augment.attacks.checks import success_by_radius as success_by_radius
 from augment.attacks.checks import transfer as transfer
-from augment.attacks.parameter_settings import MaterialSettings as MaterialSettings
-from augment.attacks.parameter_settings import ParameterSettings as ParameterSettings
-from augment.attacks.parameter_settings import PoseSettings as PoseSettings
-from augment.attacks.parameter_settings import SkylightSettings as SkylightSettings
-from augment.attacks.parameter_settings import StepSettings as StepSettings
-from augment.attacks.settings import AttackSettings as AttackSettings
-from augment.attacks.settings import EOTSettings as EOTSettings
 from augment.classifiers import Classifier as Classifier
 from augment.classifiers import load_classifier as load_classifier
+from augment.parameter_settings import MaterialSettings as MaterialSettings
+from augment.parameter_settings import ParameterSettings as ParameterSettings
+from augment.parameter_settings import PoseSettings as PoseSettings
+from augment.parameter_settings import SkylightSettings as SkylightSettings
+from augment.parameter_settings import StepSettings as StepSettings
 from augment.scene.build import build_scene as build_scene
 from augment.scene.conditions import Conditions as Conditions
 from augment.scene.conditions import Example as Example

@@ -1,7 +1,7 @@
 """Settings of scenes, their variation and the augmentation service.
 
 This module imports neither torch nor NumPy; see `renderer.settings`. The settings of attacks are
-in `augment.attacks.settings`.
+in `augment.attack_settings`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.attacks.parameter_settings import StepSettings
-from augment.attacks.settings import AttackSettings
+from augment.attack_settings import AttackSettings
+from augment.parameter_settings import StepSettings
 from renderer.errors import FACTOR, InputError, describe, is_number, require_choice
 from renderer.settings import (
     MAX_DEGREE,

@@ -34,7 +34,7 @@ from torch import Tensor, nn
 
 import augment
 import renderer
-from augment.attacks.settings import EOTSettings
+from augment.attack_settings import EOTSettings
 from augment.scene.conditions import Conditions
 from renderer.light.presets import directional
 from renderer.light.skylight import coefficients as skylight

@@ -64,7 +64,7 @@ def test_no_import_leads_back_to_its_module():
     assert sorted(path, key=order.index) == path
 
 
-@pytest.mark.parametrize("package", ["renderer", "train"])
+@pytest.mark.parametrize("package", ALLOWED)
 def test_no_folder_of_a_package_imports_one_that_imports_it(package):
     folders: dict[str, set[str]] = {}
     for name, imported in imported_modules().items():

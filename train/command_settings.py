@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.attacks.settings import AttackSettings
+from augment.attack_settings import AttackSettings
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
 from renderer.errors import FACTOR, InputError, require_choice
 from renderer.settings import (

@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import preprocessed_model, stored
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier, class_index
 from augment.classifiers.plain_networks import (
     UNIT_RANGE,
@@ -29,6 +28,7 @@ from augment.classifiers.plain_networks import (
 )
 from augment.losses import logit_gap
 from augment.model_passes import BatchSize
+from augment.parameter_settings import StepSettings
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.conditions import Conditions

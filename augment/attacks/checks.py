@@ -23,10 +23,10 @@ from augment.attacks.attack import (
 )
 from augment.attacks.descent import Goal, descend
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
+from augment.parameter_settings import StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject

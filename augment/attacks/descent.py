@@ -46,8 +46,8 @@ from augment.random_streams import generator
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
+    from augment.attack_settings import AttackSettings
     from augment.attacks.problem import AttackProblem
-    from augment.attacks.settings import AttackSettings
 
 
 @dataclass(frozen=True)

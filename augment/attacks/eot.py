@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
 
-from augment.attacks.settings import AttackSettings, EOTSettings
+from augment.attack_settings import AttackSettings, EOTSettings
 from augment.random_streams import generator
 from renderer.image import clamp, to_bytes, to_unit
 

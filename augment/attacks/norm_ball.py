@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.attacks.parameter_settings import StepSettings
+from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import Ball, nearest_in_box
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.parameters.lighting import Lighting
 from augment.attacks.parameters.parameter import Parameter
-from augment.attacks.settings import AttackSettings
 from augment.progress import progress
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene

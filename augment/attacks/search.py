@@ -8,10 +8,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.attack import logits_of, source_labels
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import build_problem
-from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.progress import progress
 from augment.scene.scene import Scene

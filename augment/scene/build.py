@@ -29,7 +29,7 @@ from renderer.validation import as_list, as_tensor, require_flag, require_kind, 
 from renderer.visibility.rasterizers import choose
 
 if TYPE_CHECKING:
-    from augment.attacks.settings import AttackSettings
+    from augment.attack_settings import AttackSettings
     from augment.settings import VariationSettings
 
 # What a label must be, for errors.

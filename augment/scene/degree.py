@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from augment.attacks.parameter_settings import MaterialSettings
-from augment.attacks.parameters.material import ROUGHNESS, initial_surface
 from augment.memory import has_memory, operator_bytes
+from augment.parameter_settings import MaterialSettings
+from augment.scene.materials import ROUGHNESS, initial_materials
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.geometry.mesh import select_faces
@@ -117,8 +117,8 @@ def _reached_roughness(
     )
     if not is_varnished and not is_attacked:
         return MATTE
-    surface = initial_surface(item)
-    roughness = surface.face_gloss[surface.object_mask, ROUGHNESS]
+    materials = initial_materials(item)
+    roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
     if varnish is not None and is_varnished:
         roughness = torch.full_like(roughness, varnish.roughness[0])
     if material is not None and is_attacked and material.roughness:

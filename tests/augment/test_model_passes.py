@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import nn
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.settings import AttackSettings
 from augment.model_passes import warn_once
 
 SAID = "can't allocate memory: you tried", "CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"

@@ -16,14 +16,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from augment.attack_settings import NOISE_MARGIN, AttackSettings
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.checks import success_by_radius
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
-from augment.attacks.parameter_settings import SkylightSettings, StepSettings
 from augment.attacks.problem import AttackProblem, build_problem
-from augment.attacks.settings import NOISE_MARGIN, AttackSettings
 from augment.classifiers import Classifier
+from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.build import build_local_light

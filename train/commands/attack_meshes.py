@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.attack_files import LINES, require_renderers, save
@@ -18,7 +19,6 @@ from augment.attacks.checks import check, require_transferable, success_by_radiu
 from augment.attacks.descent import Goal
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.search import find_scene
-from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.losses import NO_CLASS
 from augment.random_streams import generator

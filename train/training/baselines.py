@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.attacks.norm_ball import project, sample, take_step
-from augment.attacks.parameter_settings import StepSettings
 from augment.losses import label_loss
 from augment.model_passes import as_found
+from augment.parameter_settings import StepSettings
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
 from renderer.light.ball import nearest_in_box

@@ -11,14 +11,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from augment.attacks.parameter_settings import PARAMETER_NAMES
+from augment.parameter_settings import PARAMETER_NAMES
 from renderer.errors import require_choice
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from augment.attacks.parameter_settings import StepSettings
     from augment.attacks.parameters.parameter import Parameter
+    from augment.parameter_settings import StepSettings
     from augment.scene.scene import Scene
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.mesh_parameter import MeshParameter
+from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 

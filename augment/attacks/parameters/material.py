@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.attacks.parameter_settings import MaterialSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.parameter_settings import MaterialSettings
 from augment.scene.conditions import Conditions
-from augment.scene.objects import SceneObject
+from augment.scene.materials import METALLIC, initial_materials
 from augment.scene.scene import Scene
 from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS
 
 # Positions among the four attack values of an example (`MATERIAL`): roughness,
-# metallic and strength together, roughness and metallic alone, and the hue.
+# metallic and strength together, and the hue.
 GLOSS = slice(0, 3)
-ROUGHNESS = 0
-METALLIC = 1
 HUE = slice(3, 4)
-
-# Roughness, metallic and strength of an object that neither reflects specularly
-# nor is metallic. `initial_surface` gives it to meshes without a gloss.
-MATTE = (1.0, 0.0, 0.0)
-# Roughness, metallic and strength with which `Material` starts to attack a
-# matte object.
-VARNISH = (0.5, 0.0, 1.0)
 
 # `Material` keeps average roughness, metallic and strength this far from 0 and
 # 1, because the renderer clamps there, which makes the gradient zero.
@@ -72,16 +63,16 @@ class Material(Parameter):
         self._unit = torch.where(attacked_mask, units, 1)
 
         # F is the number of faces of the largest mesh below.
-        surfaces = [initial_surface(item) for item in scene.objects]
-        averages = [surface.average() for surface in surfaces]
+        materials = [initial_materials(item) for item in scene.objects]
+        averages = [material.average() for material in materials]
         # Shape (objects, 3).
         self._average_gloss = torch.stack(averages).to(scene.lights)
-        if all(surface.is_uniform() for surface in surfaces):
+        if all(material.is_uniform() for material in materials):
             # A single row then stands for all faces, which saves memory.
-            surfaces = [surface.first_face() for surface in surfaces]
+            materials = [material.first_face() for material in materials]
         # Shapes (objects, F, 3) and (objects, F), or F = 1 for a single row.
-        face_gloss = _stack_padded([surface.face_gloss for surface in surfaces])
-        object_mask = _stack_padded([surface.object_mask for surface in surfaces])
+        face_gloss = _stack_padded([material.face_gloss for material in materials])
+        object_mask = _stack_padded([material.object_mask for material in materials])
         self._face_gloss = face_gloss.to(scene.lights)
         self._object_mask = object_mask.to(scene.lights)
 
@@ -163,58 +154,6 @@ class Material(Parameter):
 
     def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Specular material of the F faces of a mesh: an object, its props and its table.
-
-    Attributes:
-        face_gloss: Roughness, metallic and strength of each face, shape (F, 3).
-        object_mask: Mask of the faces that belong to the object itself,
-            shape (F,).
-    """
-
-    face_gloss: Tensor
-    object_mask: Tensor
-
-    def average(self) -> Tensor:
-        """Average roughness, metallic and strength over the object's faces, shape (3,)."""
-        return self.face_gloss[self.object_mask].mean(0)
-
-    def is_uniform(self) -> bool:
-        """Return whether all faces belong to the object and have the same material."""
-        has_same_gloss = (self.face_gloss == self.face_gloss[0]).all()
-        return bool(self.object_mask.all() and has_same_gloss)
-
-    def first_face(self) -> Surface:
-        """Select the first face, which stands for all faces of a uniform surface."""
-        return Surface(face_gloss=self.face_gloss[:1], object_mask=self.object_mask[:1])
-
-
-def initial_surface(item: SceneObject) -> Surface:
-    """Return the surface with which an attack on the material of an object starts.
-
-    It is the material of the mesh. If the object itself is matte, which means
-    that metallic and strength are zero on all its faces, it gets `VARNISH`.
-
-    Args:
-        item: The object, whose mesh has F faces.
-
-    Returns:
-        The material of all faces, and which faces are the object's own.
-    """
-    object_mask = torch.from_numpy(item.own_faces)
-    if item.mesh.gloss is None:
-        face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
-    else:
-        face_gloss = torch.from_numpy(item.mesh.gloss)
-    metallic_and_strength = face_gloss[object_mask, METALLIC:]
-    is_matte = not metallic_and_strength.any()
-    if is_matte:
-        varnish = face_gloss.new_tensor(VARNISH)
-        face_gloss = torch.where(object_mask[:, None], varnish, face_gloss)
-    return Surface(face_gloss=face_gloss, object_mask=object_mask)
 
 
 def _stack_padded(tensors: list[Tensor]) -> Tensor:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.parameter_settings import StepSettings
 from augment.scene.scene import Scene
 
 

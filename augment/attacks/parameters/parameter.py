@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.norm_ball import anywhere, project, sample, take_step
-from augment.attacks.parameter_settings import StepSettings
+from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 

@@ -12,8 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.attacks.parameter_settings import PoseSettings
 from augment.attacks.parameters.parameter import Parameter
+from augment.parameter_settings import PoseSettings
 from augment.scene.conditions import Conditions
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene

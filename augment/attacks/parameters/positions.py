@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.light_parameter import find_light
 from augment.attacks.parameters.parameter import Parameter
+from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 from renderer.light.lamps import Lamps

@@ -1,7 +1,7 @@
 """Attacks on the pattern of a projector."""
 
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters.light_parameter import LightParameter, find_light
+from augment.parameter_settings import StepSettings
 from augment.scene.scene import Scene
 
 

@@ -12,7 +12,7 @@ import torch
 
 import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.attacks.parameter_settings import PARAMETER_NAMES
+from augment.parameter_settings import PARAMETER_NAMES
 from augment.scene.conditions import Example
 from augment.scene.objects import SceneObject, on_ground, with_props
 from augment.scene.scene import Scene

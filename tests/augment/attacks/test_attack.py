@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.parameter_settings import PARAMETER_NAMES
 from augment.losses import adversarial_cost
+from augment.parameter_settings import PARAMETER_NAMES
 from renderer.errors import InputError
 from renderer.light.nonnegative import project_nonnegative
 from renderer.light.presets import directional

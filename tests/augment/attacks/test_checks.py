@@ -9,7 +9,7 @@ from torch import Tensor
 import augment
 from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
-from augment.attacks.parameter_settings import StepSettings
+from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 
 # ------------------------------------------------------------------------------------- checks

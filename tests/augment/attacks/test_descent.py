@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from augment.attack_settings import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import project, sample, scale_gradient
-from augment.attacks.parameter_settings import STEPS, StepSettings
-from augment.attacks.settings import AttackSettings
+from augment.parameter_settings import STEPS, StepSettings
 
 EPS = torch.finfo(torch.float64).eps
 PIXELS, DIMENSIONS = (3, 2, 2), 5

@@ -9,9 +9,9 @@ from PIL import Image
 from torch import Tensor, nn
 
 import augment
+from augment.attack_settings import EOTSettings
 from augment.attacks import eot
 from augment.attacks.eot import ExpectationOverTransformations, Rounded, as_jpeg
-from augment.attacks.settings import EOTSettings
 from augment.random_streams import generator
 
 

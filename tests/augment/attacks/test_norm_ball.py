@@ -11,7 +11,7 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from augment.attacks.norm_ball import project, sample, scale_gradient
-from augment.attacks.parameter_settings import NORMS, STEPS, StepSettings
+from augment.parameter_settings import NORMS, STEPS, StepSettings
 from renderer.errors import InputError
 from renderer.light.ball import nearest_in_box
 

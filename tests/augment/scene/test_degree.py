@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.parameter_settings import MaterialSettings
 from augment.attacks.parameters import make_parameter
+from augment.parameter_settings import MaterialSettings
 from augment.scene.build import build_scene
 from augment.scene.degree import Smoothest, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene

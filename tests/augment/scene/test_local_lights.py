@@ -6,9 +6,9 @@ import torch
 
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
-from augment.attacks.parameter_settings import StepSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import AttackProblem
+from augment.parameter_settings import StepSettings
 from augment.scene.build import build_local_light
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene

@@ -10,9 +10,9 @@ from PIL import Image
 
 import renderer
 from augment.attacks.adversary import Adversary, reload, write_adversary
-from augment.attacks.parameter_settings import SkylightSettings, StepSettings
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import AttackProblem
+from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.scene import relighting
 from augment.scene.build import build_scene, load_backgrounds
 from augment.scene.conditions import Conditions, Example

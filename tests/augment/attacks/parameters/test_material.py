@@ -12,9 +12,9 @@ import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.attack import final_images
 from augment.attacks.attack_files import render_again
-from augment.attacks.parameter_settings import MATERIAL
 from augment.attacks.parameters.material import Material
 from augment.attacks.problem import AttackProblem
+from augment.parameter_settings import MATERIAL
 from augment.scene.objects import SceneObject, on_ground
 from augment.scene.scene import Scene
 from renderer.errors import InputError

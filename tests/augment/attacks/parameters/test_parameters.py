@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
+from augment.attack_settings import AttackSettings
 from augment.attacks import norm_ball
 from augment.attacks.descent import DescentResult, Goal, descend
-from augment.attacks.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.problem import AttackProblem
-from augment.attacks.settings import AttackSettings
+from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
 from augment.scene import reshading
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene

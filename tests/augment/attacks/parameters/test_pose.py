@@ -12,9 +12,9 @@ from torch.nn.functional import pad
 
 import augment
 import renderer
-from augment.attacks.parameter_settings import POSE
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.problem import AttackProblem
+from augment.parameter_settings import POSE
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 

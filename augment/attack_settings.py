@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from augment.attacks.parameter_settings import PARAMETER_NAMES, ParameterSettings
+from augment.parameter_settings import PARAMETER_NAMES, ParameterSettings
 from renderer.errors import FACTOR, InputError
 from renderer.settings import Settings, setting
 
