@@ -113,9 +113,7 @@ def label_loss(
     for index in absent:
         logits_of_others[:, index] = -torch.inf
     complementary = logits.logsumexp(1) - logits_of_others.logsumexp(1)
-    cross_entropy = F.cross_entropy(
-        logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing
-    )
+    cross_entropy = F.cross_entropy(logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing)
     return torch.where(labels < 0, complementary, cross_entropy)
 
 
@@ -171,9 +169,7 @@ def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     Returns:
         The divergence of each image, shape (N,).
     """
-    terms = F.kl_div(
-        logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True
-    )
+    terms = F.kl_div(logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True)
     return terms.sum(1)
 
 

@@ -45,7 +45,6 @@ class StepSettings(Settings):
 
     needs_noise_margin: ClassVar[bool] = False
 
-
     norm: str = setting("linf", "Norm of the ball.", choices=NORMS)
     radius: float | None = setting(
         None,

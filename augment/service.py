@@ -233,9 +233,7 @@ class AugmentationService:
         expected = "augment.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_seed("seed", seed)
-        expected = (
-            "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
-        )
+        expected = "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
         members = as_list("meshes", meshes, tuple | list, expected)
         for index, member in enumerate(members):
             if len(member) != 2:
@@ -331,9 +329,7 @@ class AugmentationService:
             values = as_tensor("state", values)
             if values.ndim != 2 or len(values) != len(self.labels):
                 counts = f"{len(values)} examples and the scene has {len(self.labels)}"
-                raise InputError(
-                    f"state: it continues {counts}; resume with the settings of the run"
-                )
+                raise InputError(f"state: it continues {counts}; resume with the settings of the run")
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
             remedy = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene: {remedy}")
@@ -371,9 +367,7 @@ class AugmentationService:
         _, diagnostics = self._classify(model, selected, labels)
         return Renders(selected, labels, diagnostics)
 
-    def _random(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
-    ) -> Renders:
+    def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         """Render random conditions. This process renders the examples with the indices in shard."""
         values = self._random_values(problem, number)
         images = self._gather(problem.images(values, shard)[:, 0], shard)
@@ -382,9 +376,7 @@ class AugmentationService:
         diagnostics |= _changes(problem, values)
         return Renders(images, self.labels, diagnostics, examples)
 
-    def _classify(
-        self, model: nn.Module, images: Tensor, labels: Tensor
-    ) -> tuple[Tensor, dict[str, float]]:
+    def _classify(self, model: nn.Module, images: Tensor, labels: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Classify up to `CLASSIFIED` evenly spaced images.
 
         Args:
@@ -409,9 +401,7 @@ class AugmentationService:
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(
-        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
-    ) -> Renders:
+    def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
         """Attack the examples. This process attacks the examples with the indices in shard."""
         attack = self.settings.attack
         goal = self._attack_goal().of(shard)
@@ -461,9 +451,7 @@ class AugmentationService:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
         diagnostics |= _changes(problem, result.values)
         is_new_success = success & ~result.success_before
-        examples = choose_attack_examples(
-            model, problem, result.values, is_new_success, self.labels
-        )
+        examples = choose_attack_examples(model, problem, result.values, is_new_success, self.labels)
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(self, part: Tensor, shard: Tensor) -> Tensor:

@@ -147,9 +147,7 @@ def solids(seed: int) -> list[str]:
         Names such as "solid:orange:2001".
     """
     oranges = [f"solid:{LABEL}:{seed + number}" for number in range(ORANGES)]
-    others = [
-        f"solid:{name}:{seed + number // OTHER_KINDS}" for number, name in enumerate(OTHER_SOLIDS)
-    ]
+    others = [f"solid:{name}:{seed + number // OTHER_KINDS}" for number, name in enumerate(OTHER_SOLIDS)]
     return oranges + others
 
 
@@ -211,10 +209,7 @@ def reporting_parts(
         slides: Pictures that the projector shows.
     """
     new_meshes = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
-    trained_meshes = [
-        {"mesh": files[name], "label": LABEL, "albedo_scale": scale}
-        for name, scale in TRAINED.items()
-    ]
+    trained_meshes = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in TRAINED.items()]
     seen_meshes = [*trained_meshes, *solids(0)]
     laboratory = {
         **UNSEEN,
@@ -466,9 +461,7 @@ def log_looks(arms: Sequence[Arm], folders: Sequence[Path], sides: Path, table: 
     networks = {run: network for arm in arms for run, network in arm.networks.items()}
     for run, network in networks.items():
         weights = content_hash(network.state_dict())[:12]
-        days = [
-            look["date"] for look in looks if look["table"] == table and look["weights"] == weights
-        ]
+        days = [look["date"] for look in looks if look["table"] == table and look["weights"] == weights]
         if days:
             print(f"{run} was looked at for {table!r} before, on {', '.join(days)}")
         shown = " ".join(folder.name for folder in folders)
@@ -598,9 +591,7 @@ def difference_rows(
         images with the same predicted class as by the first network of the
         reference: of all images, and of the negatives.
     """
-    differences = [
-        difference(scores.evaluations, reference.evaluations, ALL, metric) for metric in METRICS
-    ]
+    differences = [difference(scores.evaluations, reference.evaluations, ALL, metric) for metric in METRICS]
     yield [title, images, "all", *(format_interval(value, "+") for value in differences)]
     first_predictions = reference.predictions[0]
     same_class = []

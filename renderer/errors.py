@@ -131,8 +131,7 @@ def as_device(device: torch.device | str) -> torch.device:
     except (RuntimeError, AssertionError, TypeError) as error:
         # torch without CUDA raises AssertionError.
         raise InputError(
-            f"device={_short(device)} is not available here: "
-            "use cpu, or cuda on a machine with a GPU",
+            f"device={_short(device)} is not available here: use cpu, or cuda on a machine with a GPU",
             "device",
         ) from error
 

@@ -179,9 +179,7 @@ def fit_photograph(
     rows = np.flatnonzero(is_object.any(axis=1))
     columns = np.flatnonzero(is_object.any(axis=0))
     if not len(rows):
-        raise InputError(
-            "no object is found: give a mask that is white where it is, or a box around it"
-        )
+        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
@@ -321,15 +319,10 @@ def fit_scene(
     size = photograph.shape[-1]
     if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
-        raise InputError(
-            f"photograph and mask of shapes {given} do not fit: "
-            "give (3, size, size) and (size, size)"
-        )
+        raise InputError(f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)")
     covered = float(mask.sum())
     if covered < LEAST:
-        raise InputError(
-            f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object"
-        )
+        raise InputError(f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object")
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
     mask = mask.double()
@@ -411,9 +404,7 @@ class _Target(NamedTuple):
     options: _RenderOptions
 
     @staticmethod
-    def of(
-        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
-    ) -> _Target:
+    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions) -> _Target:
         """Resample a photograph (3, H, H) and a mask (H, H), and remove the background.
 
         Pixels on the border of the object show a mixture of object and background.
@@ -475,9 +466,7 @@ class _Target(NamedTuple):
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Return the squared error of each camera with its best light, smallest first."""
-        errors = [
-            (float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras
-        ]
+        errors = [(float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras]
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
@@ -577,9 +566,7 @@ class _Descent:
         return np.stack(columns, axis=1)
 
 
-def _light_of_channels(
-    squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int
-) -> tuple[Tensor, Tensor]:
+def _light_of_channels(squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int) -> tuple[Tensor, Tensor]:
     """Fit the light of the channel that the object shows best, and then of the other channels.
 
     The other channels are expected to resemble the first one, because the object

@@ -110,9 +110,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     try:
         module.set_variant(variant)
     except ImportError as error:
-        raise InputError(
-            f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})"
-        ) from error
+        raise InputError(f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})") from error
     # Mitsuba waits forever for an .exr file if it has a single thread.
     drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
@@ -247,9 +245,7 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
             colors=colors[is_in_part],
             texture=mesh.textures[texture_id] if has_texture else None,
             gloss=None if mesh.gloss is None else key[1:],
-            factors=mesh.gloss_textures[texture_id]
-            if has_texture and mesh.gloss_textures
-            else None,
+            factors=mesh.gloss_textures[texture_id] if has_texture and mesh.gloss_textures else None,
         )
         parts.append(part)
     return parts
@@ -406,9 +402,7 @@ def _local_emitters(
 class _PartWriter:
     """Writer of the files of one part: part_0.ply, texture_0.png, and so on."""
 
-    def __init__(
-        self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
-    ) -> None:
+    def __init__(self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> None:
         """Prepare to write a part.
 
         Args:

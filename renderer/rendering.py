@@ -218,9 +218,7 @@ def precompute_transfer(
     return TransferOperators(operators)
 
 
-def light_sphere(
-    light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS
-) -> Tensor:
+def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
     """Render a white diffuse ball in a light, to show the light as an image.
 
     The ball has radius 1 and lies at the origin, so that the image also shows

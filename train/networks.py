@@ -42,9 +42,7 @@ STD = (0.25, 0.25, 0.25)
 CLASSIFIER = "classifier"
 # Arguments of architectures of torchvision. Auxiliary classifiers would return
 # several outputs.
-_OPTIONS = {
-    name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")
-}
+_OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
 
 
 class WideResNet(nn.Module):
@@ -301,9 +299,7 @@ def _require_logits(network: nn.Module, class_count: int, size: int) -> None:
         raise ValueError(f"it returned {tuple(logits.shape)} for 2 images")
 
 
-def describe(
-    network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any
-) -> dict[str, Any]:
+def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
     """Describe a network, so that it can be used without the configuration of its run.
 
     The description is stored with the weights.

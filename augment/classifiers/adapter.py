@@ -288,9 +288,7 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
             return int(text)
         indices = f"indices go from 0 to {len(classes) - 1}"
         raise InputError(f"{subject}: the label {text} is not a class: {indices}")
-    raise InputError(
-        f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
-    )
+    raise InputError(f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}")
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:

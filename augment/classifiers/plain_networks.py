@@ -75,9 +75,7 @@ def as_classifier(
                 "leave them out, because a Classifier has its own"
             )
         return network
-    require_kind(
-        "classifier", network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
-    )
+    require_kind("classifier", network, Callable, "a torch.nn.Module, a function to logits, or a Classifier")
     names = None if classes is None else as_class_names("classes", classes)
     if isinstance(network, nn.Module) and network.training:
         raise InputError("classifier is a network in training mode: call its eval() first")
@@ -85,8 +83,7 @@ def as_classifier(
     count = _count_outputs(function, size, device)
     if names is not None and len(names) != count:
         raise InputError(
-            f"classes has {len(names)} names, and the network returns {count} outputs: "
-            "give one name per output"
+            f"classes has {len(names)} names, and the network returns {count} outputs: give one name per output"
         )
     name = type(network).__name__
     return Classifier(function, size, names or [str(index) for index in range(count)], name)

@@ -52,10 +52,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     source = weights or published.url
     if model.startswith("densenet"):
         # The published files are older than the rule that a module's name holds no dot.
-        state = {
-            re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
-            for key, value in state.items()
-        }
+        state = {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
     return fill(build_torchvision(model, None, published), state, source)
 
 

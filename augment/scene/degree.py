@@ -107,14 +107,10 @@ def reached_gloss(
     return least
 
 
-def _reached_roughness(
-    item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None
-) -> float:
+def _reached_roughness(item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None) -> float:
     """Return the lowest roughness that a variation and an attack give to an object's own faces."""
     is_varnished = varnish is not None and any(varnish.strength)
-    is_attacked = material is not None and any(
-        (material.roughness, material.metallic, material.strength)
-    )
+    is_attacked = material is not None and any((material.roughness, material.metallic, material.strength))
     if not is_varnished and not is_attacked:
         return MATTE
     materials = initial_materials(item)

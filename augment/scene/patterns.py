@@ -151,9 +151,7 @@ def random_colors(draws: Tensor) -> Tensor:
     return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]
 
 
-def draw_patterns(
-    count: int, size: int, draws: torch.Generator, points: Tensor | None = None
-) -> Tensor:
+def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor | None = None) -> Tensor:
     """Draw patterns of random colors, at random angles, scales and positions.
 
     Args:

@@ -101,9 +101,7 @@ class FrozenTransport:
         canvas[..., surface.fragments.pixels] = change
         self.views[camera] = FrozenView(canvas.to(albedo), _sum_by_pixel(fragments, albedo))
 
-    def radiance(
-        self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
-    ) -> Tensor:
+    def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
         """Compute the added radiance of a view, differentiable in albedo and light.
 
         Args:
@@ -260,9 +258,7 @@ class Reshading:
         if self.settings.global_illumination:
             # A camera that is being attacked changes in every call.
             is_kept = camera is fixed_camera
-            indirect = _IndirectLight(
-                self, example, number, fixed_camera, fragments, positions, is_kept
-            ).radiance
+            indirect = _IndirectLight(self, example, number, fixed_camera, fragments, positions, is_kept).radiance
         shares_normals = not is_moved and self.settings.normals == "smooth"
         shown = ShadedView(
             mesh=item.mesh,
@@ -291,9 +287,7 @@ class Reshading:
         """Return the normals (V, 3) of an unmoved object, which all its views share."""
         return torch.from_numpy(self.objects[number].mesh.vertex_normals).to(self.like.device)
 
-    def transport_near(
-        self, example: int, number: int, camera: Camera, vertices: np.ndarray
-    ) -> FrozenTransport:
+    def transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """Find shadows and bounces of a shape near the one of an example, or compute them.
 
         Args:
@@ -324,9 +318,7 @@ class Reshading:
         """Compute the shadows and bounces of an object's mesh, whose vertices may be moved."""
         return FrozenTransport(mesh, self.settings, self.objects[number].albedo_scale, self.basis)
 
-    def _rasterize(
-        self, number: int, camera: Camera, vertices: np.ndarray
-    ) -> tuple[Fragments, Tensor]:
+    def _rasterize(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """Return the samples of an object with these vertices, and their albedo (S, 3)."""
         item = self.objects[number]
         [fragments] = build_fragments(
@@ -366,9 +358,7 @@ class _IndirectLight:
 
     def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
         """Return the added radiance (3, P), with albedo (S, 3), in light (K, 3)."""
-        frozen = self.reshading.transport_near(
-            self.example, self.number, self.camera, self.positions
-        )
+        frozen = self.reshading.transport_near(self.example, self.number, self.camera, self.positions)
         added = frozen.radiance(self.camera, self.fragments, albedo, light)
         if not self.is_kept:
             del frozen.views[self.camera]

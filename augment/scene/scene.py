@@ -134,9 +134,7 @@ class Scene:
         count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
         require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
         self._relighting = self._build_relighting()
-        self._reshading = Reshading(
-            self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
-        )
+        self._reshading = Reshading(self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light)
 
     def _seeing(self, example: Example) -> Example:
         """Return an example whose cameras have a depth range that holds the whole object."""
@@ -193,9 +191,7 @@ class Scene:
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [
             Example(number, view, background)
-            for number, view, background in product(
-                range(len(objects)), views, range(len(backgrounds))
-            )
+            for number, view, background in product(range(len(objects)), views, range(len(backgrounds)))
         ]
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
@@ -286,9 +282,7 @@ class Scene:
         """
         return Conditions(self.lights[self._as_examples(examples)])
 
-    def render(
-        self, conditions: Conditions, examples: Int[Tensor, " A"]
-    ) -> Float[Tensor, "A V 3 size size"]:
+    def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
         """Render examples from their views, differentiable in the conditions.
 
         Args:
@@ -359,9 +353,7 @@ class Scene:
             light = light.repeat_interleave(self.views, dim=0)
         return self._relighting.layers(light, images)
 
-    def _under_moved_lamps(
-        self, light: Tensor, positions: Tensor, examples: Tensor
-    ) -> Iterator[Layer]:
+    def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
         """Give the layers of all other light by operators, and add the lamps image by image."""
         where, lamps = next(part for part in self.basis.local_lights if part.basis.is_movable)
         other_light = light.clone()

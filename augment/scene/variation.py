@@ -40,9 +40,7 @@ WALL_DISTANCES = (1.8, 8.0)
 MAX_LIGHT_ANGLE = 70.0
 
 
-def vary(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False
-) -> Scene:
+def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
     """Draw the examples of a scene anew around its own examples.
 
     All views of one example are moved in the same way.
@@ -73,9 +71,7 @@ def vary(
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
-            raise InputError(
-                "tables are for one view of objects that stand on none: leave ground out, or tables"
-            )
+            raise InputError("tables are for one view of objects that stand on none: leave ground out, or tables")
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _vary_geometry(scene, settings, draws, once, is_on_table)
@@ -108,10 +104,7 @@ def _vary_geometry(
         index_of_view = {view: index for index, view in enumerate(dict.fromkeys(views))}
         objects = [scene.objects[number] for number, _ in index_of_view]
         changed["objects"] = _draw_objects(objects, settings, draws)
-        examples = [
-            replace(example, object=index_of_view[view])
-            for example, view in zip(examples, views, strict=True)
-        ]
+        examples = [replace(example, object=index_of_view[view]) for example, view in zip(examples, views, strict=True)]
     # For images in one lighting, transfer operators are worth their cost only where the
     # alternative is to trace rays.
     needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
@@ -146,9 +139,7 @@ def _draw_cameras(
     return examples
 
 
-def _move_camera(
-    camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
-) -> Camera:
+def _move_camera(camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]) -> Camera:
     """Zoom by a factor, shift by (right, up) in image widths, and turn by (polar, azimuth)."""
     width = camera.width / scale
     right, up = shift
@@ -183,9 +174,7 @@ def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Gen
     """Read images (count, 3, size, size), drawn with repetition from all files below a folder."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
-        raise InputError(
-            f"backgrounds={folder} holds no image: give a folder of .jpg or .png files"
-        )
+        raise InputError(f"backgrounds={folder} holds no image: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
     images = [read_image(files[index], size) for index in progress(chosen, "reading backgrounds")]
     return torch.stack(images)
@@ -268,9 +257,7 @@ class _DrawnLights:
         return replace(self, environment=environment)
 
 
-def _vary_lighting(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
-) -> Scene:
+def _vary_lighting(scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor) -> Scene:
     """Draw the lighting of all examples, light their backgrounds, and draw the camera effects."""
     exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
     examples = [
@@ -330,10 +317,7 @@ def _draw_directional(
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     is_chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     angles = _draw_pairs(MAX_LIGHT_ANGLE, len(scene), draws)
-    cameras = [
-        _turn_camera(example.cameras[0], *turn)
-        for example, turn in zip(scene.examples, angles, strict=True)
-    ]
+    cameras = [_turn_camera(example.cameras[0], *turn) for example, turn in zip(scene.examples, angles, strict=True)]
     directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
     # No light comes from below a table. A direction from there is mirrored.
     grounds = [scene.objects[example.object].ground for example in scene.examples]
@@ -348,9 +332,7 @@ def _draw_directional(
     )
 
 
-def _draw_background_albedo(
-    scene: Scene, settings: VariationSettings, draws: torch.Generator
-) -> Tensor:
+def _draw_background_albedo(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
     """Return the linear albedo (E, 1 or 3, size, size) of all backgrounds, in random colors."""
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]

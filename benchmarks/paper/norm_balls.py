@@ -182,9 +182,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = setup.options
     classifier = setup.classifier
     for subject, views in common.subjects_with_views(setup):
-        scenes = [
-            common.make_scene(subject, classifier.size, part) for part in common.batches(views)
-        ]
+        scenes = [common.make_scene(subject, classifier.size, part) for part in common.batches(views)]
         for space in options.spaces:
             draws = generator(options.seed, subject.name, space)
             for radius in RADII[space]:

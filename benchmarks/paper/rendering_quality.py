@@ -59,8 +59,7 @@ def measure_confidences(
         if made_count > max(100, renders) / common.MIN_CORRECT_FRACTION:
             counts = f"{correct_count} of {made_count} renders of {subject.name}"
             raise InputError(
-                f"{classifier.name} classifies only {counts} correctly. "
-                "Choose another mesh, label or classifier."
+                f"{classifier.name} classifies only {counts} correctly. Choose another mesh, label or classifier."
             )
         azimuth = 360 * float(torch.rand((), generator=draws))
         width = common.WIDTHS[len(rows) % len(common.WIDTHS)]

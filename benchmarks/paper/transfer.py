@@ -175,8 +175,7 @@ def measure_networks(
             predictions = {}
             for network, problem in zip(networks, problems, strict=True):
                 predictions[network.name] = {
-                    state: common.predict(network, problem.images(values))
-                    for state, values in states.items()
+                    state: common.predict(network, problem.images(values)) for state, values in states.items()
                 }
             record = {
                 "kind": kind,
@@ -223,9 +222,7 @@ def measure_views(
                 "set": set_index,
                 "kind": kind,
                 "attacked": view_count,
-                "predictions": predict_in_views(
-                    subject, classifier, settings, states, unseen_views
-                ),
+                "predictions": predict_in_views(subject, classifier, settings, states, unseen_views),
             }
             common.append(options.out, record)
 

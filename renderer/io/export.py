@@ -74,9 +74,7 @@ def export_mesh(
         require_range("first", first, 0, len(mesh.faces))
     normals_of_corners = corner_normals(mesh.vertices, mesh.faces, normals)
     if path.suffix.lower() != ".glb":
-        raise InputError(
-            f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
-        )
+        raise InputError(f"{path} cannot be written as a mesh: choose a file name that ends in .glb")
     content = _glb(mesh, normals_of_corners, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -121,9 +119,7 @@ class _PartSurface:
     gloss: list[float]
 
 
-def _write_part(
-    mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
-) -> "trimesh.Trimesh":
+def _write_part(mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray) -> "trimesh.Trimesh":
     """Convert the faces of a part to a mesh of trimesh, with y up.
 
     Args:

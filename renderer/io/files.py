@@ -18,9 +18,7 @@ TEMPORARY = ".pnb-*.tmp"
 
 
 @contextmanager
-def replacing(
-    path: str | Path, durable: bool = False, previous: Path | None = None
-) -> Iterator[Path]:
+def replacing(path: str | Path, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
     """Give a temporary path to write to, and move the file to `path` at the end of the block.
 
     If the block raises an error, the temporary file is removed, and the old

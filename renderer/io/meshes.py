@@ -102,13 +102,9 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     mesh = _merge_vertices(concatenate(placed))
     # The nodes of a scene may move vertices out of range. NaN fails the comparison.
     if not (np.abs(mesh.vertices) <= LARGEST).all():
-        raise InputError(
-            f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again"
-        )
+        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
-        raise InputError(
-            f"{path} has a surface of zero area: give a mesh with faces of some extent"
-        )
+        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
@@ -160,9 +156,7 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
         raise InputError(f"{path} cannot be read as a mesh: {in_one_line(error)}") from error
 
 
-def _read_parts(
-    path: Path, suffix: str, linear: bool, gloss: bool
-) -> list[tuple[Mesh, np.ndarray]]:
+def _read_parts(path: Path, suffix: str, linear: bool, gloss: bool) -> list[tuple[Mesh, np.ndarray]]:
     """Read the parts of a file of a known format, or raise any error."""
     content = path.read_bytes()
     tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
@@ -228,9 +222,7 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
 def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
     """Read a scene, or raise `ValueError` if trimesh leaves out a part of the surface."""
     with _recorded_omissions() as omissions:
-        scene = trimesh.load(
-            io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False
-        )
+        scene = trimesh.load(io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False)
     if suffix == "obj" and b"mtllib" in content:
         unknown = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
         for name in unknown:
@@ -342,9 +334,7 @@ def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> 
     # The positions take the place of missing texture coordinates. They are floats.
     uvs = tree["accessors"][attributes.get("TEXCOORD_0", attributes["POSITION"])]
     if uvs["componentType"] != FLOAT:
-        raise ValueError(
-            "texture coordinates that are not floating-point numbers are not supported"
-        )
+        raise ValueError("texture coordinates that are not floating-point numbers are not supported")
 
 
 def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> bool:
@@ -367,10 +357,7 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
         used_textures.append(metallic_roughness.get("metallicRoughnessTexture") or {})
     for texture in used_textures:
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
-            raise ValueError(
-                "a texture has a second set of coordinates or is transformed, "
-                "which is not supported"
-            )
+            raise ValueError("a texture has a second set of coordinates or is transformed, which is not supported")
     return bool(color_textures)
 
 

@@ -161,8 +161,7 @@ def read_panorama(path: str | Path) -> Tensor:
     minimum = radiance.min()
     if minimum < -NEGATIVE * radiance.max():
         raise InputError(
-            f"environment map {path} has negative radiance, down to {minimum:.3g}: "
-            "clip the map at 0 and save it again"
+            f"environment map {path} has negative radiance, down to {minimum:.3g}: clip the map at 0 and save it again"
         )
     return radiance.clamp(min=0)
 
@@ -213,9 +212,7 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
-        raise InputError(
-            f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels"
-        )
+        raise InputError(f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels")
     return array, names
 
 

@@ -31,9 +31,7 @@ _DAMAGED_FILE_ERRORS = (
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
-def save_light(
-    path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS
-) -> None:
+def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
     """Write a light to a .json file.
 
     `read_light` reads the same float32 numbers back, to the bit.

@@ -122,10 +122,7 @@ class Gloss:
             require_bounded(**{name: values})
             has_shape = values.shape in ((), (1,), (faces,))
             if not has_shape or not (values.min() >= 0 and values.max() <= 1):
-                raise InputError(
-                    f"gloss: {name} of shape {tuple(values.shape)}: "
-                    f"give one number or {faces}, in [0, 1]"
-                )
+                raise InputError(f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]")
             checked.append(values.reshape(-1))
         return checked
 
@@ -252,9 +249,7 @@ class SampleGloss(NamedTuple):
         leaving = self.entering((normals * toward).sum(1))
         return (1 - self.metallic) * leaving / (1 - self.strength * coat_mean(self.roughness))
 
-    def transfer(
-        self, normals: Tensor, toward: Tensor, degree: int
-    ) -> tuple[Tensor | None, Tensor, ViewFrame]:
+    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, ViewFrame]:
         """Compute the specular radiance per unit of each coefficient of environment light.
 
         The coefficients are those in the axes of the view. The result is
@@ -306,9 +301,7 @@ def smoothest(mesh: Mesh) -> float:
     """
     if mesh.gloss is None:
         return 1.0
-    factors = [
-        np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures
-    ]
+    factors = [np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures]
     # The last factor is that of faces without a texture, whose index is -1.
     factors.append(1.0)
     factor_of_face = np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
@@ -331,9 +324,7 @@ def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
     return values if len(values) == 1 else values[samples]
 
 
-def sample_gloss(
-    mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
-) -> SampleGloss | None:
+def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -> SampleGloss | None:
     """Look up the gloss at the samples of a view.
 
     The result is differentiable in a given gloss. A warning is issued if

@@ -308,9 +308,7 @@ class Angle(NamedTuple):
 
     def for_columns(self, coefficients: Tensor) -> Angle:
         """Return an angle of shape () in shape (1,), on the device and in the dtype given."""
-        return Angle(
-            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
-        )
+        return Angle(sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients))
 
 
 def _rotate_about_x(vectors: Components, angle: Angle) -> Components:

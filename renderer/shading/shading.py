@@ -329,9 +329,9 @@ class _IrradiancePolynomial:
         Only the tangential part of the slope has a meaning.
         """
         # The monomials have no name, so that their memory is released at once.
-        slope = torch.addmm(
-            self.linear, self.even, harmonics.monomials(directions, self.degree - 1)
-        ).unflatten(0, (3, COLORS))
+        slope = torch.addmm(self.linear, self.even, harmonics.monomials(directions, self.degree - 1)).unflatten(
+            0, (3, COLORS)
+        )
         # The value is constant + n · linear + p(n). The loop below adds
         # n · slope / d = p(n) + n · linear / d, so 1 - 1/d of the linear term is left.
         linear = self.linear.view(3, COLORS).T

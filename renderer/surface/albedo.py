@@ -74,9 +74,7 @@ class Texture:
         return Texture(height=height, width=width, look_up=look_up)
 
 
-def surface_albedo(
-    mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
-) -> Tensor:
+def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
     """Compute the albedo of a mesh: the interpolated corner color times the texture.
 
     Colors and texels are decoded before they are interpolated.
@@ -159,9 +157,7 @@ def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
     blocks = []
     # Blocks of BLOCK points limit the memory.
     for block in uvs.split(BLOCK, dim=1):
-        weighted = [
-            weight * texture.look_up(texel) for weight, texel in _surrounding_texels(texture, block)
-        ]
+        weighted = [weight * texture.look_up(texel) for weight, texel in _surrounding_texels(texture, block)]
         blocks.append(reduce(torch.add, weighted))
     return torch.cat(blocks, dim=1)
 

@@ -114,9 +114,7 @@ def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) ->
     if not (mesh.texture_ids >= 0).all():
         # A face without a texture has the full corner color.
         return largest_corner
-    largest_texel = max(
-        (float(linear_values[texture.max()]) for texture in mesh.textures), default=1.0
-    )
+    largest_texel = max((float(linear_values[texture.max()]) for texture in mesh.textures), default=1.0)
     return largest_corner * largest_texel
 
 

@@ -66,9 +66,7 @@ class TransferOperators(Sequence[TransferOperator]):
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
             if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                raise InputError(
-                    "operators differ in image settings, basis of light or dtype: give equal ones"
-                )
+                raise InputError("operators differ in image settings, basis of light or dtype: give equal ones")
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
@@ -205,9 +203,7 @@ class TransferOperators(Sequence[TransferOperator]):
         views = zip(self, lights, background, strict=True)
         return torch.stack([operator.image(light, behind) for operator, light, behind in views])
 
-    def _stacked_images(
-        self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]
-    ) -> Tensor:
+    def _stacked_images(self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]) -> Tensor:
         """Render lights (V, *B, coefficients, 3), one stack of operators after the other.
 
         The background has the shape (3, size, size) or that of the images.
@@ -260,9 +256,7 @@ class InPlace(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, covered, strict=True):
             # index_copy_ takes twice as long as scatter_ on a CPU.

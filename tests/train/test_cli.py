@@ -139,9 +139,7 @@ def test_a_run_is_resumed_by_its_folder_alone(call, tmp_path, stopped):
     assert call("train", f"run={whole}", *begun) == 0
     for arm in (".", "none"):
         states = [torch.load(run / arm / LAST, weights_only=True) for run in (stopped, whole)]
-        assert states[0]["epoch"] == 2 and content_hash(states[0]["model"]) == content_hash(
-            states[1]["model"]
-        )
+        assert states[0]["epoch"] == 2 and content_hash(states[0]["model"]) == content_hash(states[1]["model"])
         assert (stopped / arm / "photographs" / "summary.json").is_file()
     assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0  # an arm by itself
     assert not (stopped / "none" / "none").exists()

@@ -95,9 +95,7 @@ def run_audit(settings: AuditSettings) -> Path:
         if plan.folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
-            _write_folder(
-                renders, lambda folder: write_laboratory(replace(laboratory, out=str(folder)))
-            )
+            _write_folder(renders, lambda folder: write_laboratory(replace(laboratory, out=str(folder))))
         for key in plan.networks:
             plan.measure(key, out / key)
         names = {key: network.name for key, network in plan.networks.items()}

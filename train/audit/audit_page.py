@@ -63,10 +63,7 @@ def write_audit_page(
         for name, path in paths.items()
     }
     correct = {name: read_json(path / RECOGNIZED) for name, path in paths.items()}
-    counts = {
-        name: {kind: read_json(path / f"{kind}.json") for kind in KINDS}
-        for name, path in paths.items()
-    }
+    counts = {name: {kind: read_json(path / f"{kind}.json") for kind in KINDS} for name, path in paths.items()}
     transfers = {}
     if len(paths) > 1:
         transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
@@ -92,9 +89,7 @@ def write_audit_page(
     )
 
 
-def _attack_pictures(
-    paths: Mapping[str, Path], counts: Mapping[str, Mapping[str, Any]]
-) -> dict[str, list[Picture]]:
+def _attack_pictures(paths: Mapping[str, Path], counts: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Picture]]:
     """Read the pictures of one adversary of each network, by kind of lighting."""
     pictures: dict[str, list[Picture]] = {kind: [] for kind in KINDS}
     for name, path in paths.items():
@@ -230,9 +225,7 @@ class _ScoredImage(NamedTuple):
     prediction: Prediction
 
 
-def _worst(
-    label: str, folders: Mapping[str, Path], scored: Predictions
-) -> dict[str, list[Picture]]:
+def _worst(label: str, folders: Mapping[str, Path], scored: Predictions) -> dict[str, list[Picture]]:
     """Make two galleries for each network, by title.
 
     The first one has the images of the label with the lowest log-odds. The

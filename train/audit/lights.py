@@ -220,9 +220,7 @@ def adversaries(
     """
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
-    limits: dict[str, Any] = {
-        kind: settings_class("linf", radius, "sign", radius / STEPS_PER_RADIUS)
-    }
+    limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", radius / STEPS_PER_RADIUS)}
     if further:
         limits |= {"max_steps": FURTHER, "margin": FACTOR}
     else:

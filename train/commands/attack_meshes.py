@@ -322,9 +322,7 @@ def build_attacked(
         )
 
 
-def load_targets(
-    settings: AttackExperimentSettings, attacked: Classifier, device: torch.device
-) -> TransferTargets:
+def load_targets(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> TransferTargets:
     """Load the classifiers and the meshes to which adversaries are transferred.
 
     Args:

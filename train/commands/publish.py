@@ -67,9 +67,7 @@ def _without_folder(text: str) -> str:
     return Path(text).name if text.startswith("/") else text
 
 
-def _calibrate(
-    network: Classifier, folder: str, label: Any, false_positive_rate: float
-) -> list[dict[str, Any]]:
+def _calibrate(network: Classifier, folder: str, label: Any, false_positive_rate: float) -> list[dict[str, Any]]:
     """Choose the threshold of each label on a folder of photographs, and print it."""
     # The thresholds are those of the published weights, which have 16 bits.
     network.half().float()

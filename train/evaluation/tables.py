@@ -48,11 +48,7 @@ class Table:
     @property
     def known(self) -> "Table":
         """Without the columns in which every cell is unknown, "-"."""
-        kept = [
-            index
-            for index in range(len(self.header))
-            if any(row[index] != "-" for row in self.rows)
-        ]
+        kept = [index for index in range(len(self.header)) if any(row[index] != "-" for row in self.rows)]
         rows = [[row[index] for index in kept] for row in self.rows]
         return Table(self.title, [self.header[index] for index in kept], rows)
 
@@ -65,10 +61,7 @@ class Table:
             if len(parts[-1]) > 1 and _width([*parts[-1], column]) > room:
                 parts.append([first])
             parts[-1].append(column)
-        tables = (
-            "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True))
-            for part in parts
-        )
+        tables = ("\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True)) for part in parts)
         return "\n\n".join(filter(None, [self.title and f"{self.title}:", *tables]))
 
 

@@ -102,9 +102,7 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool) -> list[str]:
     rates = []
     for steps, rate in checks["success_by_steps"].items():
         rates.append(f"{_both_rates(rate, rates_without_noise[steps], has_noise)} in {steps}")
-    search = _both_rates(
-        checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise
-    )
+    search = _both_rates(checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise)
     return [
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
@@ -129,9 +127,7 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
     if has_noise:
         count = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
         without_noise = f" ({count} without noise)"
-    by_margin = [
-        line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]
-    ]
+    by_margin = [line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]]
     largest = 255 * max(line["largest_difference"] for line in numbers)
     mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
     return (

@@ -195,12 +195,7 @@ def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
     heads = {arm: group[0].run for arm, group in arms.items()}
     given = [arm for arm, run in heads.items() if run.arm != INITIAL]
     starts = {arm: run.before.settings for arm, run in heads.items() if run.before}
-    pairs = [
-        (arm, base)
-        for arm, start in starts.items()
-        for base in arms
-        if heads[base].settings == start
-    ]
+    pairs = [(arm, base) for arm, start in starts.items() for base in arms if heads[base].settings == start]
     return pairs + [(arm, given[0]) for arm in given[1:]]
 
 
@@ -317,20 +312,10 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     """`run_tables` and `overall_differences` by images as Markdown, and the paths of the contact sheets."""
     arms = arms_of(runs)
     groups = by_images(arms)
-    tables = run_tables(arms, groups) + [
-        overall_differences(read_evaluations(group)) for group in groups.values()
-    ]
-    sheets = [
-        f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs
-    ]
-    legend = "; ".join(
-        f"{arm}: {renders}" for arm, renders in ARMS.items() if arm in {run.arm for run in runs}
-    )
-    return "\n\n".join(
-        filter(
-            None, [*(str(table.known) for table in tables if table.rows), legend, "\n".join(sheets)]
-        )
-    )
+    tables = run_tables(arms, groups) + [overall_differences(read_evaluations(group)) for group in groups.values()]
+    sheets = [f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs]
+    legend = "; ".join(f"{arm}: {renders}" for arm, renders in ARMS.items() if arm in {run.arm for run in runs})
+    return "\n\n".join(filter(None, [*(str(table.known) for table in tables if table.rows), legend, "\n".join(sheets)]))
 
 
 def format_comparison(
@@ -362,13 +347,9 @@ def format_comparison(
     folders = [next(iter(group.values()))[0].folder for group in compared]
     if len(folders) > 1:
         advice = "score both networks on the same folder with pnb-evaluate"
-        raise InputError(
-            f"{folders[1]} has other photographs or sources than {folders[0]}: {advice}"
-        )
+        raise InputError(f"{folders[1]} has other photographs or sources than {folders[0]}: {advice}")
     if not folders and photographs != PHOTOGRAPHS:
-        raise InputError(
-            f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files"
-        )
+        raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
     for group in compared:
         overall = f"all but {', '.join(exclude)}" if exclude else "all"
         evaluations = read_evaluations(group, exclude, by)

@@ -87,9 +87,7 @@ def style(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(
-    arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch"
-) -> Picture | None:
+def curves(arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch") -> Picture | None:
     """Plot a quantity over epochs or rounds, with a line for each seed of an arm.
 
     Args:
@@ -116,9 +114,7 @@ def curves(
     return _plot(lambda axes: _draw_curves(axes, lines_of_arm, x_title), title, alt)
 
 
-def _draw_curves(
-    axes: "Axes", lines_of_arm: Mapping[str, list[list[tuple[float, float]]]], x_title: str
-) -> None:
+def _draw_curves(axes: "Axes", lines_of_arm: Mapping[str, list[list[tuple[float, float]]]], x_title: str) -> None:
     """Draw the lines of each arm in its color; the first one is named in the legend."""
     for index, (arm, lines) in enumerate(lines_of_arm.items()):
         name: str | None = arm

@@ -74,10 +74,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         seconds=summary.seconds_table(drawn),
         photographs=[scores_section(title, group) for title, group in groups.items()],
         renders={arm: _pictures(run, "epoch", "Renders") for arm, run in trained.items()},
-        examples={
-            arm: _pictures(run, "attacks", "Renders before and after")
-            for arm, run in trained.items()
-        },
+        examples={arm: _pictures(run, "attacks", "Renders before and after") for arm, run in trained.items()},
         attacks=found.attacks,
         shown=[_attack(attack) for attack in found.attacks[:MOST_ATTACKS]],
     )
@@ -122,9 +119,7 @@ def write_page(out: Path, body: str, **content: Any) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(
-        loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options
-    )
+    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
     environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
     environment.filters |= {
         "fraction": fraction,
@@ -171,26 +166,16 @@ def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | Non
     """The attack's success in each round of renders of a run, or in each epoch of one with a round per epoch."""
     rates = []
     for line in epochs:
-        rounds = sorted(
-            {int(name[6 : name.index("/")]) for name in line if name.startswith("round_")}
-        )
-        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [
-            attack_success(line, "augment/")
-        ]
+        rounds = sorted({int(name[6 : name.index("/")]) for name in line if name.startswith("round_")})
+        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [attack_success(line, "augment/")]
     return rates
 
 
 def _pictures(run: RunSummary, name: str, title: str) -> list[Picture]:
     """A run's images renders/NAME_EPOCH.png of its first, middle and last epoch with any."""
-    numbers = [
-        (path.stem.rpartition("_")[2], path)
-        for path in (run.folder / "renders").glob(f"{name}_*.png")
-    ]
+    numbers = [(path.stem.rpartition("_")[2], path) for path in (run.folder / "renders").glob(f"{name}_*.png")]
     files = evenly(sorted((int(number), path) for number, path in numbers if number.isdigit()), 3)
-    images = [
-        plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}")
-        for n, path in files
-    ]
+    images = [plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}") for n, path in files]
     return [image for pictures in images for image in pictures]
 
 
@@ -205,9 +190,7 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     """How the test accuracy of each arm compares with that of the network that it began with."""
     sentences = []
     for arm, group in arms.items():
-        if bases := [
-            run.before.accuracy for run in group if run.before and run.before.accuracy is not None
-        ]:
+        if bases := [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]:
             after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
             images = group[0].config.get("test_images", "the test images")
             sentences.append(f"{arm}: accuracy went from {before:.1%} to {after:.1%}, on {images}.")

@@ -91,9 +91,7 @@ class PhotographScores:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point
         if has_several:
-            entries["by_label"] = {
-                label: _published(metrics) for label, metrics in self.by_label.items()
-            }
+            entries["by_label"] = {label: _published(metrics) for label, metrics in self.by_label.items()}
         return entries
 
 
@@ -104,9 +102,7 @@ def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
 
 def _published(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
     """Convert metrics to entries that a published network carries."""
-    return {
-        name: {} if estimate is None else asdict(estimate) for name, estimate in metrics.items()
-    }
+    return {name: {} if estimate is None else asdict(estimate) for name, estimate in metrics.items()}
 
 
 @dataclass(frozen=True)
@@ -699,8 +695,6 @@ def _walk(folder: Path) -> Iterator[Path]:
         is_run = bool(names & of_run)
         if is_run:
             # os.walk goes on in the folders that this list keeps.
-            below[:] = [
-                name for name in below if name != BEFORE and not (path / name / SUMMARY).is_file()
-            ]
+            below[:] = [name for name in below if name != BEFORE and not (path / name / SUMMARY).is_file()]
         if is_run or names & of_others or names >= {CONFIG, "train.log"}:
             yield path

@@ -238,9 +238,7 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
     return merged, shlex.join(dict.fromkeys(words))
 
 
-def require_same_run(
-    folder: Path, settings: ExperimentSettings, finished: bool = False
-) -> DictConfig:
+def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> DictConfig:
     """Check that a training run in a folder has given settings and input files.
 
     A run that is not finished may get more epochs and another evaluation.

@@ -56,9 +56,7 @@ def load_network(name: str, weights: str | Path | None = None) -> Classifier:
     return load_classifier(name, weights)
 
 
-def load_run(
-    run: str | Path, weights: str | Path | None = None, model: str | None = None
-) -> Classifier:
+def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:
     """Load the network that a run selected.
 
     Args:
@@ -180,9 +178,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
         path: The safetensors file. Its metadata tell the architecture and other facts.
         state: The checkpoint.
     """
-    metadata = {
-        key: json.dumps(state[key], ensure_ascii=False) for key in PUBLISHED_FACTS if key in state
-    }
+    metadata = {key: json.dumps(state[key], ensure_ascii=False) for key in PUBLISHED_FACTS if key in state}
     weights = {}
     for name, value in state["model"].items():
         weights[name] = value.half().contiguous() if value.is_floating_point() else value

@@ -125,9 +125,7 @@ def test_the_warning_of_changed_light_names_the_line_that_attacks(by_color):
     """A directional light of degree 6 is negative on its far side."""
     light = directional(torch.tensor([0.0, 0.0, 1.0]), torch.ones(3))
     scene = augment.build_scene([("solid:orange", "orange")], by_color.size, light=light)
-    settings = augment.AttackSettings(
-        lighting=augment.StepSettings(), max_steps=1, allow_negative=False
-    )
+    settings = augment.AttackSettings(lighting=augment.StepSettings(), max_steps=1, allow_negative=False)
     with pytest.warns(UserWarning) as warnings:
         augment.attack(by_color, scene, settings=settings, force=True)
     changed = [warning for warning in warnings if "irradiance" in str(warning.message)]

@@ -443,9 +443,7 @@ class FloorUnderSky:
     def __init__(self, gloss: Gloss) -> None:
         node, weight = legendre.leggauss(24)
         cosines = torch.from_numpy((node + 1) / 2)
-        cameras = [
-            OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines
-        ]
+        cameras = [OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines]
         operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
         rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
         self.transfer = torch.stack(rows)
@@ -718,10 +716,7 @@ class GlossyView:
             "metallic": (face_count,),
             "strength": (face_count,),
         }
-        uniform = {
-            name: 0.3 + 0.5 * draw_uniform(*size, seed=seed)
-            for seed, (name, size) in enumerate(shapes.items())
-        }
+        uniform = {name: 0.3 + 0.5 * draw_uniform(*size, seed=seed) for seed, (name, size) in enumerate(shapes.items())}
         vertices = torch.from_numpy(self.mesh.vertices)
         return {
             "environment": positive_light(6),
@@ -765,9 +760,7 @@ def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-13), name
 
 
-@pytest.mark.parametrize(
-    "options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str
-)
+@pytest.mark.parametrize("options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str)
 def test_an_operator_gives_the_images_of_render(options):
     mesh = normalize(solid("cup"))
     light = positive_light(6).float()
@@ -808,9 +801,7 @@ def test_the_parts_of_a_joined_mesh_keep_their_gloss():
     pear = Gloss(0.3).on(solid("pear"))
     gloss = concatenate([pear, solid("table")]).gloss
     pear_gloss, table_gloss = np.split(gloss, [len(pear.faces)])
-    np.testing.assert_array_equal(
-        pear_gloss, np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1))
-    )
+    np.testing.assert_array_equal(pear_gloss, np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1)))
     np.testing.assert_array_equal(table_gloss, np.tile([1, 0, 0], (len(table_gloss), 1)))
 
 

@@ -106,9 +106,7 @@ def given(monkeypatch, tmp_path) -> dict:
     }.items():
         monkeypatch.setattr(audit, name, value)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
-    monkeypatch.setattr(
-        audit, "load_network", lambda name, weights=None: {"a": brightness(0.5), "b": chance()}[name]
-    )
+    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: {"a": brightness(0.5), "b": chance()}[name])
     meshes = {
         "meshes": ["solid:orange:0"],
         "look_alikes": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
@@ -166,9 +164,7 @@ def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_render
         (tmp_path / "lab" / label).mkdir(parents=True)
         Image.new("RGB", (8, 8), "black" if label == "orange" else "white").save(tmp_path / "lab" / label / "a.png")
     folders = {"look_alikes": [], "laboratory": str(tmp_path / "lab"), "out": str(tmp_path / "ready")}
-    monkeypatch.setattr(
-        audit, "load_network", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name])
-    )
+    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name]))
     monkeypatch.setattr(
         audit, "transfers", lambda *arguments: {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}
     )

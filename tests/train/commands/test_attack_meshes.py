@@ -76,9 +76,7 @@ def test_a_scene_is_searched_for_and_given_as_overrides():
     ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
     assert name == "solid:orange:0" and result.clean_correct.all()
     assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
-    with pytest.raises(
-        InputError, match=r"^attack\.force=.* 1 of 1 images of solid:orange:0 are .* before any attack"
-    ):
+    with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images of solid:orange:0 are .* before any attack"):
         attacked("scene.search=0", classifier=classifier)
 
 

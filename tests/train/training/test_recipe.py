@@ -49,9 +49,7 @@ def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
     return (q * (q / p).log()).sum()
 
 
-@pytest.mark.parametrize(
-    "name, value", [("learning_rate", math.nan), ("distillation", 1.0), ("ema_decay", -0.1)]
-)
+@pytest.mark.parametrize("name, value", [("learning_rate", math.nan), ("distillation", 1.0), ("ema_decay", -0.1)])
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(InputError, match=rf"\b{name}\b"):
         TrainSettings(**{name: value})
@@ -176,9 +174,7 @@ def test_an_augmentation_leaves_model_and_random_state_alone(name, images, model
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
-def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(
-    name, images, model, monkeypatch
-):
+def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(name, images, model, monkeypatch):
     same = images[:1].expand(6, -1, -1, -1)
     whole = Baseline(name, model, 0).apply(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1

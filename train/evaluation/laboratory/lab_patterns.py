@@ -137,10 +137,7 @@ def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
     size = np.array(image.shape[:2])[:, None, None]
     # (x, y) in [-1, 1] become rows and columns, in pixels.
     places = (points.flip(0).numpy() + 1) / 2 * size - 0.5
-    channels = [
-        map_coordinates(channel, places, order=order, mode="reflect")
-        for channel in np.moveaxis(image, -1, 0)
-    ]
+    channels = [map_coordinates(channel, places, order=order, mode="reflect") for channel in np.moveaxis(image, -1, 0)]
     return torch.from_numpy(np.stack(channels))
 
 
@@ -166,9 +163,7 @@ FAMILIES = {
 TWO_COLORED = ("gradient", "stripes", "checkers")
 
 
-def draw_pattern(
-    family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()
-) -> np.ndarray:
+def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Draw a pattern of random colors, at a random angle, scale and position.
 
     Args:

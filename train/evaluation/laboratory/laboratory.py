@@ -99,9 +99,7 @@ def _scale_albedo(albedo: np.ndarray, factor: float) -> np.ndarray:
     return np.clip(factor * albedo, 0, 1).astype(np.float32)
 
 
-def path_traced(
-    parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int
-) -> np.ndarray:
+def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
     """Render an object with the path tracer of Mitsuba 3.
 
     Each light source is rendered alone, and the images are added. With all
@@ -168,9 +166,7 @@ def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
 
 def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """Rotate and scale the object, set it on the table, and make a Mitsuba shape of each part."""
-    positions_by_part = [
-        (shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts
-    ]
+    positions_by_part = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
     lowest = min(positions[:, 2].min() for positions in positions_by_part)
     shapes = []
     for part, positions in zip(parts, positions_by_part, strict=True):
@@ -213,9 +209,7 @@ def write_laboratory(settings: LabSettings) -> int:
             Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
-    subjects = [
-        read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))
-    ]
+    subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
     paths = [Path(path) for path in settings.environments]
     environments = {path.stem: _read_environment(path) for path in paths}
     groups = _group_subjects(subjects, label_names(settings.label))
@@ -267,9 +261,7 @@ def _clear(out: Path, overwrite: bool) -> None:
         raise InputError(f"{fault}: {advice}")
 
 
-def _write_render(
-    out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int
-) -> str:
+def _write_render(out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int) -> str:
     """Render a mesh in a setup, write the image, and return its path relative to the folder."""
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)

@@ -117,9 +117,7 @@ def draw_shots(
         yield shot
 
 
-def _scale_environment(
-    radiance: np.ndarray, brightness: float, rng: np.random.Generator
-) -> np.ndarray:
+def _scale_environment(radiance: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
     """Rotate a map (H, W, 3) about the vertical axis, and scale it to a brightness of a white surface that faces up."""
     directions, solid_angles = equirectangular(*radiance.shape[:2])
     weights = directions[..., 2].clamp(min=0) * solid_angles

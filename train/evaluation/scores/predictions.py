@@ -116,9 +116,7 @@ class Predictor:
         require_whole("size", self.size)
         require_range("size", self.size, 1, MAX_SIZE)
 
-    def predict(
-        self, folder: Path, label: Label, skip_unreadable: bool = False
-    ) -> FolderPredictions:
+    def predict(self, folder: Path, label: Label, skip_unreadable: bool = False) -> FolderPredictions:
         """Predict the classes of all photographs of a folder.
 
         Args:
@@ -137,9 +135,7 @@ class Predictor:
         folder = as_folder("folder", folder)
         labels = label_names(label)
         found = find_photographs(folder, self.classes, label)
-        photographs, images, unreadable = load_photographs(
-            folder, found, self.size, skip_unreadable
-        )
+        photographs, images, unreadable = load_photographs(folder, found, self.size, skip_unreadable)
         logits = compute_logits(self.model, images, len(self.classes), self.device)
         return FolderPredictions(
             folder=folder,
@@ -161,37 +157,26 @@ def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]
     return digest.hexdigest()
 
 
-def compute_logits(
-    model: Model, images: torch.Tensor, classes: int, device: str | torch.device
-) -> torch.Tensor:
+def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str | torch.device) -> torch.Tensor:
     """The model's logits, (N, classes) float32 on the CPU, for images (N, 3, H, W) uint8 sRGB.
 
     A module is called in eval mode and left in its own. InputError: logits of another shape, NaN or infinite, or of one
     class.
     """
     if classes < 2:
-        raise InputError(
-            "the model has a single class, whose odds are infinite: evaluate one with other classes, too"
-        )
+        raise InputError("the model has a single class, whose odds are infinite: evaluate one with other classes, too")
     with (
         eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(),
         torch.inference_mode(),
     ):
         call = NetworkCall("model")
-        batches = [
-            call(model, to_unit(batch.to(device)))
-            for batch in progress(images.split(BATCH), "predictions")
-        ]
+        batches = [call(model, to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
         logits = torch.cat(batches).float().cpu()
     if logits.shape != (shape := (len(images), classes)):
         advice = "evaluate a checkpoint that was trained on these classes"
-        raise InputError(
-            f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}"
-        )
+        raise InputError(f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}")
     if not logits.isfinite().all():
-        raise InputError(
-            "the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged"
-        )
+        raise InputError("the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged")
     return logits
 
 
@@ -211,9 +196,7 @@ def predict(
     for label in labels:
         studied = classes.index(label)
         odds = log_odds(logits.double(), studied).tolist()
-        for photograph, by_class, places, score in zip(
-            photographs, probabilities, ranks, odds, strict=True
-        ):
+        for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
             best, true = places.index(1), (None, None)
             if photograph.label in classes:
                 index = classes.index(photograph.label)

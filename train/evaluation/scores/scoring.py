@@ -182,9 +182,7 @@ def evaluate_photographs(
     return scores
 
 
-def score(
-    answers: FolderPredictions, by: str = "source", points: Sequence[OperatingPoint] = ()
-) -> Scores:
+def score(answers: FolderPredictions, by: str = "source", points: Sequence[OperatingPoint] = ()) -> Scores:
     """Score predictions for photographs.
 
     Fractions have 95% Wilson intervals. The AUC and the recall at a
@@ -304,13 +302,7 @@ def choose_operating_points(
     exact_rate = Fraction(str(rate))
     points = []
     for name in answers.labels:
-        log_odds = np.array(
-            [
-                item.log_odds
-                for item in answers.predictions
-                if item.label == name and not item.positive
-            ]
-        )
+        log_odds = np.array([item.log_odds for item in answers.predictions if item.label == name and not item.positive])
         count = len(log_odds)
         if count * exact_rate < 1:
             fault = f"folder={folder} has {count} images of other things than {name}"
