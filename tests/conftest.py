@@ -1,4 +1,4 @@
-"""What tests of several packages use."""
+"""Fixtures of tests of several packages."""
 
 import logging
 import signal
@@ -17,10 +17,11 @@ from renderer.visibility.rasterizers import Rasterizer
 
 @pytest.fixture(autouse=True, scope="session")
 def one_thread() -> Iterator[None]:
-    """Computes with one thread, here and in the processes that tests start.
+    """Compute with one thread, here and in the processes that tests start.
 
-    Images and networks are so small that threads would wait for each other. The last bits of a factorization by NumPy
-    or SciPy also depend on the number of threads.
+    Images and networks are so small that threads would wait for each other.
+    The last bits of a factorization by NumPy or SciPy also depend on the number
+    of threads.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -32,21 +33,42 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def interrupts() -> None:
-    """SIGINT reaches the processes that tests start, even if the tests run in the background of a shell."""
+    """Let SIGINT reach the processes that tests start.
+
+    A shell that runs the tests in the background ignores the signal.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")
 def cache_home(tmp_path_factory) -> Iterator[None]:
-    """Not the user's; commands that tests start inherit it."""
+    """Keep caches apart from the user's, also in commands that tests start."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("caches")))
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def no_network() -> Iterator[None]:
+    """Refuse connections of this process to other machines."""
+    connect = socket.socket.connect
+
+    def refuse(self, address):
+        is_local = self.family == socket.AF_UNIX or address[0] == "localhost"
+        assert is_local or ip_address(address[0]).is_loopback, f"a test connects to {address}"
+        return connect(self, address)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket.socket, "connect", refuse)
+        yield
+
+
 @pytest.fixture
 def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
-    """`python -m train`, or another command, within this process, from another folder: the exit status."""
+    """Return a function that runs a command and returns its exit status.
+
+    The command runs within this process, in the temporary folder of the test.
+    """
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
@@ -60,7 +82,8 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
         return 0
 
     yield command
-    for handler in logging.root.handlers:  # Hydra's write to what was the output here
+    # Hydra's handlers write to a stream that pytest closes after the test.
+    for handler in logging.root.handlers:
         if handler not in handlers:
             handler.close()
     logging.root.handlers[:] = handlers
@@ -68,28 +91,13 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 
 @pytest.fixture
 def rasterized(monkeypatch) -> list[int]:
-    """The number of views of every call to a back end, in order."""
-    calls = []
+    """Return a list that grows by the number of views with each rasterization."""
+    view_counts = []
     rasterize = Rasterizer.rasterize
 
     def counted(self, points, faces, resolution, closed=False):
-        calls.append(len(points))
+        view_counts.append(len(points))
         return rasterize(self, points, faces, resolution, closed=closed)
 
     monkeypatch.setattr(Rasterizer, "rasterize", counted)
-    return calls
-
-
-@pytest.fixture(autouse=True, scope="session")
-def no_network() -> Iterator[None]:
-    """Nothing that a test does within this process reaches beyond the machine."""
-    connect = socket.socket.connect
-
-    def refuse(self, address):
-        local = self.family == socket.AF_UNIX or address[0] == "localhost" or ip_address(address[0]).is_loopback
-        assert local, f"{address} was asked for without the user's word"
-        return connect(self, address)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(socket.socket, "connect", refuse)
-        yield
+    return view_counts

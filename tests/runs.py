@@ -1,4 +1,4 @@
-"""How tests make training runs: by the steps that `python -m train` takes."""
+"""Training runs of tests, made by the steps that `python -m train` takes."""
 
 from pathlib import Path
 
@@ -10,21 +10,28 @@ from train.training.run import Run
 
 
 def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:
-    """Make a run and load it. Without data, the settings name them."""
+    """Make a run and load it. Without data, it loads those of the settings."""
     initial = load_initial(settings)
-    run = Run(settings, data or load_data(settings, initial.size if initial else None), folder, initial)
+    if data is None:
+        data = load_data(settings, initial.size if initial else None)
+    run = Run(settings, data, folder, initial)
     run.load()
     return run
 
 
 def finish(run: Run) -> dict[str, float]:
-    """Train and score a run that was loaded; return its scores."""
+    """Train and score a loaded run, and return its scores."""
     run.fit()
     scores = run.score()
     run.export()
     return scores
 
 
-def completed_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> dict[str, float]:
-    """Make, train and score a run; return its scores."""
-    return finish(loaded_run(settings, folder, data))
+def completed_run(
+    settings: ExperimentSettings,
+    folder: Path,
+    data: DataSet | None = None,
+) -> dict[str, float]:
+    """Make, train and score a run, and return its scores."""
+    run = loaded_run(settings, folder, data)
+    return finish(run)

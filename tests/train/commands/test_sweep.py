@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.train.helpers import read_markdown
 from train import __main__ as command
 from train.commands import sweep
 from train.commands.sweep import format_sweep
@@ -229,7 +230,7 @@ def sweep_process(folder: Path, *overrides: str) -> subprocess.Popen:
 
 
 @pytest.mark.slow
-def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path, read_markdown):
+def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     overrides = [f"data.path={tiny_npz}", "train.learning_rate=0.05,-1", "launcher=joblib", "hydra.launcher.n_jobs=2"]
     assert sweep_process(tmp_path / "sweep", *overrides).wait(300) == 1

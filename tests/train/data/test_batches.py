@@ -4,108 +4,164 @@ import torch.nn.functional as F
 from scipy.stats import binomtest, chisquare
 
 from train.data import batches
-from train.data.batches import PADDING, Round, TrainingImages, crop_and_flip, rounds_of_epoch, training_batches
+from train.data.batches import (
+    PADDING,
+    Round,
+    TrainingImages,
+    crop_and_flip,
+    rounds_of_epoch,
+    training_batches,
+)
 from train.data.sets import Split
 
 
 def noise(*shape: int) -> torch.Tensor:
-    return torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator)
 
 
-def epoch_round(images: int, epoch: int) -> Round:
-    return Round(epoch, epoch, torch.arange(images))
+def epoch_round(image_count: int, epoch: int) -> Round:
+    return Round(epoch, epoch, torch.arange(image_count))
 
 
 def numbered(images: torch.Tensor) -> TrainingImages:
-    """All images of a split, without renders; each image's row is its label."""
+    """Make training images without renders, each labeled with its row."""
     split = Split(images, torch.arange(len(images)))
     return TrainingImages(split, split.labels, split[:0])
 
 
+def gray_images(count: int) -> torch.Tensor:
+    """Make images of 8 × 8 pixels whose values are their rows."""
+    values = torch.arange(count, dtype=torch.uint8)
+    return values.view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
+
+
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
-@pytest.mark.parametrize("flipped", [False, True])
-def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flipped):
+@pytest.mark.parametrize("is_flipped", [False, True])
+def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_flipped):
     height, width = shape
     images = noise(3, 3, height, width)
-    steps = range(-PADDING, PADDING + 1)
-    shifts = torch.tensor([(down, right) for down in steps for right in steps]).T
-    chosen = torch.arange(shifts.shape[1]) % len(images)
-    cropped = crop_and_flip(images, chosen, shifts, torch.full((len(chosen),), flipped))
+    steps = torch.arange(-PADDING, PADDING + 1)
+    shifts = torch.cartesian_prod(steps, steps)
+    rows = torch.arange(len(shifts)) % len(images)
+    flips = torch.full((len(rows),), is_flipped)
+
+    cropped = crop_and_flip(images, rows, shifts.T, flips)
+
     padded = F.pad(images.double(), (PADDING,) * 4, mode="reflect").to(torch.uint8)
-    for image, row, (down, right) in zip(cropped, chosen, shifts.T, strict=True):
-        top, left = PADDING + down, PADDING + right
+    for image, row, (down, right) in zip(cropped, rows, shifts, strict=True):
+        top = PADDING + down
+        left = PADDING + right
         expected = padded[row, :, top : top + height, left : left + width]
-        assert torch.equal(image, expected.flip(2) if flipped else expected)
+        if is_flipped:
+            expected = expected.flip(2)
+        assert torch.equal(image, expected)
 
 
-@pytest.mark.parametrize("size, most, count", [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)])
-def test_shifts_and_flips_are_all_drawn_about_equally_often(size, most, count):
-    middle, places = size // 2, torch.arange(size, dtype=torch.uint8)
-    pixels = torch.stack([*torch.meshgrid(places, places, indexing="ij"), torch.zeros(size, size, dtype=torch.uint8)])
-    shown = training_batches(numbered(pixels.expand(count, -1, -1, -1)), 300, 0, epoch_round(count, 0))
-    around = torch.cat([images[:, :2, middle, middle - 1 : middle + 2] for images, *_ in shown]).long()
-    flipped = around[:, 1, 0] > around[:, 1, 2]
-    assert binomtest(int(flipped.sum()), count).pvalue > 1e-4
-    rows, columns = around[..., 1].T - middle + most
-    counts = (rows * (2 * most + 1) + columns).bincount()
-    assert len(counts) == (2 * most + 1) ** 2 and chisquare(counts).pvalue > 1e-4
+@pytest.mark.parametrize(
+    ("size", "largest_shift", "count"), [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)]
+)
+def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift, count):
+    # The first two channels of a pixel are its row and its column.
+    places = torch.arange(size, dtype=torch.uint8)
+    pixel_rows, pixel_columns = torch.meshgrid(places, places, indexing="ij")
+    image = torch.stack([pixel_rows, pixel_columns, torch.zeros_like(pixel_rows)])
+    data = numbered(image.expand(count, -1, -1, -1))
+
+    middle = size // 2
+    centers = []
+    for images, *_ in training_batches(data, 300, 0, epoch_round(count, 0)):
+        centers.append(images[:, :2, middle, middle - 1 : middle + 2].long())
+    center = torch.cat(centers)  # (count, 2, 3): the middle pixel and its two neighbors
+
+    is_flipped = center[:, 1, 0] > center[:, 1, 2]
+    assert binomtest(int(is_flipped.sum()), count).pvalue > 1e-4
+    down, right = center[..., 1].T - middle + largest_shift
+    shift_count = 2 * largest_shift + 1
+    occurrences = (down * shift_count + right).bincount()
+    assert len(occurrences) == shift_count**2
+    assert chisquare(occurrences).pvalue > 1e-4
+
+
+def mirrored_rows(epoch: int) -> torch.Tensor:
+    """Return for each of 40 images whether the epoch shows it mirrored."""
+    ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
+    shown = training_batches(numbered(ramp), 40, 0, epoch_round(40, epoch), "alternating")
+    ((images, labels, _),) = shown
+    is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
+    return is_flipped[labels.argsort()]
 
 
 def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
-    ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
-
-    def mirrored(epoch: int) -> torch.Tensor:
-        """By image."""
-        ((images, labels, _),) = training_batches(numbered(ramp), 40, 0, epoch_round(40, epoch), "alternating")
-        flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
-        return flipped[labels.argsort()]
-
-    first, second, third = (mirrored(epoch) for epoch in range(3))
-    assert torch.equal(first, ~second) and torch.equal(first, third)
+    first = mirrored_rows(epoch=0)
     assert 0 < first.sum() < 40
+    assert torch.equal(mirrored_rows(epoch=1), ~first)
+    assert torch.equal(mirrored_rows(epoch=2), first)
 
 
-def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
-    plain = numbered(torch.arange(100, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 3, 8, 8))
-    epoch = list(training_batches(plain, 7, 0, epoch_round(100, 0)))
-    assert [len(labels) for _, labels, _ in epoch] == [7] * 15
-    order = torch.cat([labels for _, labels, _ in epoch]).tolist()
-    assert sorted(order[:100]) == list(range(100)) and order[100:] == order[:5]
-    for images, labels, _ in epoch:
-        assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
-        assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
-    ((_, labels, _),) = training_batches(
-        numbered(plain.split.images[:3]), 7, 0, epoch_round(3, 0)
-    )  # a batch has every image several times
-    assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
+def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():
+    shown = training_batches(numbered(gray_images(100)), 7, 0, epoch_round(100, 0))
+    labels = [labels for _, labels, _ in shown]
+    assert [len(batch) for batch in labels] == [7] * 15
+    order = torch.cat(labels).tolist()
+    assert sorted(order[:100]) == list(range(100))
+    assert order[100:] == order[:5]
+
+
+def test_images_keep_their_labels():
+    for images, labels, _ in training_batches(numbered(gray_images(20)), 7, 0, epoch_round(20, 0)):
+        assert images.dtype == torch.uint8
+        assert torch.equal(images, gray_images(20)[labels])
+
+
+def test_a_batch_larger_than_the_data_repeats_the_images_in_order():
+    ((_, labels, _),) = training_batches(numbered(gray_images(3)), 7, 0, epoch_round(3, 0))
+    assert labels.tolist() == [*labels[:3], *labels[:3], labels[0]]
 
 
 @pytest.mark.parametrize("flips", ["random", "alternating"])
 @pytest.mark.parametrize("images_at_once", [1, 20])
-def test_an_epoch_goes_on_from_any_batch_as_if_one_split_held_its_rows_and_renders(monkeypatch, flips, images_at_once):
-    split, rows = Split(noise(90, 3, 8, 8), torch.arange(90)), torch.arange(0, 90, 2)
+def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_rows_and_renders(
+    monkeypatch, flips, images_at_once
+):
+    split = Split(noise(90, 3, 8, 8), torch.arange(90))
+    rows = torch.arange(0, 90, 2)
     renders = Split(255 - noise(5, 3, 8, 8), torch.arange(-5, 0))
+    separate = TrainingImages(split, rows, renders)
     mixed = numbered(torch.cat([split.images[rows], renders.images]))
+    mixed_labels = torch.cat([rows, renders.labels])
     whole = list(training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
+
     monkeypatch.setattr(batches, "CHUNK_BYTES", images_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
-        rest = list(training_batches(TrainingImages(split, rows, renders), 8, 0, epoch_round(50, 1), flips, first))
-        assert len(rest) == len(whole) - first
-        for (images, labels, rendered), (expected, numbers, _) in zip(rest, whole[first:], strict=True):
-            assert torch.equal(images, expected) and torch.equal(rendered, numbers >= 45)
-            assert torch.equal(labels, torch.cat([rows, renders.labels])[numbers])
+        continued = training_batches(separate, 8, 0, epoch_round(50, 1), flips, first)
+        for batch, expected in zip(continued, whole[first:], strict=True):
+            images, labels, is_render = batch
+            expected_images, mixed_rows, _ = expected
+            assert torch.equal(images, expected_images)
+            assert torch.equal(is_render, mixed_rows >= len(rows))
+            assert torch.equal(labels, mixed_labels[mixed_rows])
 
 
-def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
-    rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, every=20)
-    assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
-    rows = [part.rows.tolist() for part in rounds]
-    assert [len(part) for part in rows] == [27, 27, 17]
-    assert all(part == sorted(part) and part[-7:] == list(range(100, 107)) for part in rows)
-    images = [row for part in rows for row in part[:-7]]
-    assert len(set(images)) == 50 and max(images) < 100
-    (first,), (second,) = (rounds_of_epoch(100, 0, 0, epoch, 50, None) for epoch in (0, 1))
-    assert first.rows.tolist() != second.rows.tolist()
-    for images_per_epoch in (5000, None):
+class TestRounds:
+    def test_divide_the_images_of_an_epoch_and_each_has_all_renders(self):
+        rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, every=20)
+        assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
+        images = []
+        for part, image_count in zip(rounds, [20, 20, 10], strict=True):
+            rows = part.rows.tolist()
+            assert rows == sorted(rows)
+            assert rows[image_count:] == list(range(100, 107))
+            images += rows[:image_count]
+        assert len(set(images)) == 50
+
+    def test_have_other_images_in_another_epoch(self):
+        (first,) = rounds_of_epoch(100, 0, 0, 0, 50, None)
+        (second,) = rounds_of_epoch(100, 0, 0, 1, 50, None)
+        assert first.rows.tolist() != second.rows.tolist()
+
+    @pytest.mark.parametrize("images_per_epoch", [5000, None])
+    def test_have_everything_if_an_epoch_is_not_shorter_than_the_data(self, images_per_epoch):
         (everything,) = rounds_of_epoch(98, 2, 0, 3, images_per_epoch, None)
-        assert (everything.number, everything.epoch, everything.rows.tolist()) == (3, 3, list(range(100)))
+        assert (everything.number, everything.epoch) == (3, 3)
+        assert everything.rows.tolist() == list(range(100))

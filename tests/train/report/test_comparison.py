@@ -1,4 +1,6 @@
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from shutil import copytree
 
@@ -6,6 +8,7 @@ import numpy as np
 import pytest
 
 from renderer.errors import InputError
+from tests.train.helpers import read_markdown
 from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import pool
 from train.evaluation.scores.predictions import Prediction, write_predictions
@@ -13,173 +16,312 @@ from train.report.comparison import format_comparison, format_table
 from train.report.report_page import write_report
 from train.report.summary import summarize
 
+# Scores of oranges and scores of other things, by source.
+Scores = dict[str | None, tuple[Sequence[float], Sequence[float]]]
+
+STUDIO_AND_WEB: Scores = {
+    "studio": ([1, 1, 1, 1], []),
+    "web": ([1, -1, -1, -1, -1], [-2, 3]),
+    None: ([1, -1], []),
+}
+
 
 def prediction(index: int, label: str, source: str | None, score: float) -> Prediction:
-    """Of a network that predicts orange above a score of 0."""
-    orange = score > 0
-    photograph = Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
-    right = orange == (label == "orange")
-    rank = (1 if right else 2) if label == "orange" else None
+    """Make the prediction of a network that predicts orange if the score is positive."""
+    is_predicted_orange = score > 0
+    is_right = is_predicted_orange == (label == "orange")
+    true_rank = None
+    if label == "orange":
+        true_rank = 1 if is_right else 2
     return Prediction(
-        photograph, "orange", "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score
+        photograph=Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source),
+        label="orange",
+        predicted="orange" if is_predicted_orange else "pear",
+        probability=0.5,
+        true_probability=None,
+        true_rank=true_rank,
+        label_probability=0.5,
+        label_rank=1 if is_predicted_orange else 2,
+        log_odds=score,
     )
 
 
+def predictions_of(scores: Scores) -> list[Prediction]:
+    predictions = []
+    for source, (oranges, others) in scores.items():
+        for label, group in (("orange", oranges), ("other_lime", others)):
+            for score in group:
+                predictions.append(prediction(len(predictions), label, source, score))
+    return predictions
+
+
 @pytest.fixture
-def scored_run(tmp_path, made_up_run, monkeypatch):
-    """Makes a finished run with scores: by source, those of oranges and of other things."""
+def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
+    """Return a function that makes the folder of a finished run with scores."""
+    # No test looks at a figure.
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
 
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)  # no test looks at figures
-
-    def make(arm: str, scores: dict[str | None, tuple], *overrides: str, name: str = "photographs") -> Path:
-        kinds = [
-            (label, source, score)
-            for source, pair in scores.items()
-            for label, group in zip(("orange", "other_lime"), pair, strict=True)
-            for score in group
-        ]
-        predictions = [prediction(index, *kind) for index, kind in enumerate(kinds)]
-        images = {"images": str([item.photograph for item in predictions]), "label": "orange"}
-        summaries = {name: pool(predictions).metrics.to_summary() | images}
-        folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
+    def make(arm: str, scores: Scores, *overrides: str, name: str = "photographs") -> Path:
+        predictions = predictions_of(scores)
+        summary = pool(predictions).metrics.to_summary()
+        summary["images"] = str([item.photograph for item in predictions])
+        summary["label"] = "orange"
+        run_count = len(list(tmp_path.iterdir()))
+        folder = made_up_run(tmp_path / str(run_count), arm, {name: summary}, *overrides)
         write_predictions(folder / name / "predictions.csv", predictions)
         return folder
 
     return make
 
 
-def compare(read_markdown, folders: list[Path], exclude=(), **keys) -> dict[str, list[list[str]]]:
-    return read_markdown(format_comparison([summarize(folder) for folder in folders], exclude, **keys))
-
-
-ARMS = ["random", "adversarial"]
-STUDIO_AND_WEB = {"studio": ([1, 1, 1, 1], []), "web": ([1, -1, -1, -1, -1], [-2, 3]), None: ([1, -1], [])}
-
-
-def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made_up_run, tmp_path, read_markdown):
-    other = {**STUDIO_AND_WEB, "web": ([4, 4, 4, -1, -1], [-2, 3])}
-    folders = [scored_run("none", STUDIO_AND_WEB), scored_run("adversarial", other, "seed=1")]
-    tables = compare(read_markdown, [*folders, made_up_run(tmp_path / "c", "random")], ["studio"])
-    assert [row[:2] for row in tables["by source"][1:]] == [
-        [source, arm] for source in ("all but studio", "studio", "web") for arm in ("none", "adversarial")
-    ]
-    values = [[cell.partition(" ")[0] for cell in row[2:]] for row in tables["by source"][1:]]
-    assert [row[0] for row in values] == ["0.286", "0.571", "1.000", "1.000", "0.200", "0.600"]
-    # the studio has nothing to rank oranges against
-    assert [row[2] for row in values] == ["0.500", "0.714", "-", "-", "0.500", "0.800"]
-    assert "adversarial minus none (1 and 1 seeds)" in tables
-    seconds = tables["seconds per epoch"]
-    assert seconds[1] == ["none", "7.50", "0.75", "4.50", "1.50", "0.75", "0.38", "7.00"]
-
-
-def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_markdown):
-    folders = [scored_run(arm, STUDIO_AND_WEB, name="lab") for arm in ("none", "random")]
-    assert "random minus none (1 and 1 seeds, paired)" not in compare(read_markdown, folders)
-    assert "random minus none (1 and 1 seeds, paired)" in compare(read_markdown, folders, photographs="lab")
-    with pytest.raises(InputError, match=r"^photographs=lib: no run has a sub-folder of that name"):
-        compare(read_markdown, folders, photographs="lib")
-    with pytest.raises(InputError, match="exclude: no photograph is of source 'stdio'; the sources are studio, web"):
-        compare(read_markdown, folders, ["stdio"], photographs="lab")
-
-
-def test_only_scores_on_the_same_images_share_a_table_or_plot(scored_run, tmp_path, read_markdown):
-    """Two arms on four images, and a third network on two others in a sub-folder of the same name."""
-    runs = [scored_run(arm, {"web": ([1, -1], scores)}) for arm, scores in [("none", [0, 2]), ("random", [0, -2])]]
-    runs.append(scored_run("adversarial", {"web": ([1], [0])}))
-    text = write_report(runs, tmp_path / "out").read_text()
-    assert re.findall(r'alt="ROC; AUC: ([^"]*)"', text) == ["none 0.250, random 0.750", "adversarial 1.000"]
-    assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
-    assert text.count("<p>photographs, 2 of orange and 2 of other things, none and random: ") == 1
-    tables = read_markdown(format_table([summarize(folder) for folder in runs]))
-    arms = {title: [row[0] for row in table[1:]] for title, table in tables.items() if title.startswith("photographs")}
-    assert list(arms.values()) == [["none", "random"], ["adversarial"]]
-
-
-def test_a_hardened_network_is_compared_with_the_one_it_began_with_and_with_others_from_there(
-    scored_run, tmp_path, read_markdown
-):
-    """The first network is scored by each run that begins with it, and once by pnb-evaluate."""
-    base = scored_run("none", {"web": ([1, -1, -1, -1], [0, 2])}) / "photographs"
-    oranges = {"random": [1, 1, -1, -1], "adversarial": [1, 1, 1, 1]}
-    folders = [scored_run(arm, {"web": (oranges[arm], [0, 2])}, "train.init_from=base") for arm in ARMS]
-    for folder in folders:
-        copytree(base, folder / "before" / "photographs")
-        lines = (folder / "metrics.jsonl").read_text()
-        added = lines.replace('"test/epoch"', '"test/accuracy_before": 0.5, "test/epoch"')
-        (folder / "metrics.jsonl").write_text(added)
-    tables = compare(read_markdown, folders)
-    assert [row[:3] for row in tables[""][1:]] == [
-        ["the initial network", "", "0.500"],
-        *([a, "0", "0.765"] for a in ARMS),
-    ]
-    differences = [(title.partition(" (")[0], table[1][1][:6]) for title, table in tables.items() if "minus" in title]
-    initial = "minus the initial network"
-    expected = [(f"random {initial}", "+0.250"), (f"adversarial {initial}", "+0.750")]
-    assert differences == [*expected, ("adversarial minus random", "+0.500")]
-    text = write_report(folders, tmp_path / "out").read_text()
-    assert "from 50.0% to 76.5%" in text and ", the initial network and random: " in text
-    copytree(base, alone := tmp_path / "scores" / "base")
-    tables = compare(read_markdown, [alone, folders[1]])
-    assert tables["adversarial minus scores/base (1 and 1 seeds, paired)"][1][1].startswith("+0.750")
-
-
-def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):
-    first = scored_run("none", STUDIO_AND_WEB)
-    second = scored_run("random", {**STUDIO_AND_WEB, "wob": STUDIO_AND_WEB["web"], "web": ((), ())})
-    with pytest.raises(InputError, match=f"{second}/photographs has other photographs or sources than {first}"):
-        compare(read_markdown, [first, second])
-
-
-def read_difference(cell: str) -> tuple[float, float, float]:
-    return tuple(map(float, re.fullmatch(r"([+-][\d.]+) \[([+-][\d.]+), ([+-][\d.]+)\]", cell).groups()))
+def compare(folders: list[Path], exclude=(), **options) -> dict[str, list[list[str]]]:
+    """Read the tables that compare the runs in some folders."""
+    summaries = [summarize(folder) for folder in folders]
+    return read_markdown(format_comparison(summaries, exclude, **options))
 
 
 @pytest.fixture
-def arms(scored_run) -> tuple[list[Path], list[np.ndarray], list[np.ndarray]]:
-    """Three seeds of two arms on 60 oranges and 40 others: scores (arm, seed, image) of either kind."""
-    generator = np.random.default_rng(0)
-    images = [generator.normal(1, 1, (1, 1, 60)), generator.normal(0, 1, (1, 1, 40))]  # easy and hard images
-    shift = np.array([0.0, 0.5])[:, None, None] + generator.normal(0, 0.2, (1, 3, 1))  # arm, and a seed's luck
-    oranges, others = (image + shift + generator.normal(0, 0.3, (2, 3, image.shape[2])) for image in images)
+def compared_sources(scored_run, made_up_run, tmp_path) -> dict[str, list[list[str]]]:
+    """Compare two scored runs and one without scores, with the studio left out of the total."""
+    better_on_web = STUDIO_AND_WEB | {"web": ([4, 4, 4, -1, -1], [-2, 3])}
     folders = [
-        scored_run(arm, {"web": (oranges[row, seed], others[row, seed])}, f"seed={seed}")
-        for row, arm in enumerate(("none", "random"))
-        for seed in range(3)
+        scored_run("none", STUDIO_AND_WEB),
+        scored_run("adversarial", better_on_web, "seed=1"),
+        made_up_run(tmp_path / "without_scores", "random"),
     ]
-    return folders, oranges, others
+    return compare(folders, ["studio"])
 
 
-def auc(oranges: np.ndarray, others: np.ndarray) -> float:
-    return (oranges[:, None] > others).mean()  # no two scores are equal
+def test_a_comparison_shows_every_source_and_the_total_without_an_excluded_one(compared_sources):
+    _, *rows = compared_sources["by source"]
+    assert [row[:2] for row in rows] == [
+        ["all but studio", "none"],
+        ["all but studio", "adversarial"],
+        ["studio", "none"],
+        ["studio", "adversarial"],
+        ["web", "none"],
+        ["web", "adversarial"],
+    ]
+    recalls = [row[2].partition(" ")[0] for row in rows]
+    assert recalls == ["0.286", "0.571", "1.000", "1.000", "0.200", "0.600"]
+    # The studio has nothing to rank oranges against.
+    aucs = [row[4].partition(" ")[0] for row in rows]
+    assert aucs == ["0.500", "0.714", "-", "-", "0.500", "0.800"]
 
 
-def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_bootstrap_written_out(arms, read_markdown):
-    """The loop draws images and seeds one replicate at a time; 0.02 is the chance of 1,000 of them."""
-    folders, oranges, others = arms
-    tables = compare(read_markdown, folders)
-    header, pooled, web = tables["random minus none (3 and 3 seeds, paired)"]
+def test_runs_of_other_seeds_are_compared_without_pairs(compared_sources):
+    assert "adversarial minus none (1 and 1 seeds)" in compared_sources
+
+
+def test_a_comparison_shows_the_mean_seconds_of_the_phases_of_an_epoch(compared_sources):
+    _, first, *_ = compared_sources["seconds per epoch"]
+    assert first == ["none", "7.50", "0.75", "4.50", "1.50", "0.75", "0.38", "7.00"]
+
+
+class TestAnotherFolderOfPhotographs:
+    @pytest.fixture
+    def folders(self, scored_run) -> list[Path]:
+        return [scored_run(arm, STUDIO_AND_WEB, name="lab") for arm in ("none", "random")]
+
+    def test_is_compared_by_its_name_alone(self, folders):
+        title = "random minus none (1 and 1 seeds, paired)"
+        assert title not in compare(folders)
+        assert title in compare(folders, photographs="lab")
+
+    def test_is_refused_if_no_run_has_it(self, folders):
+        with pytest.raises(InputError, match=r"^photographs=lib: no run has"):
+            compare(folders, photographs="lib")
+
+    def test_excludes_only_sources_that_it_has(self, folders):
+        with pytest.raises(InputError, match=r"exclude: .*'stdio'.* studio, web"):
+            compare(folders, ["stdio"], photographs="lab")
+
+
+@pytest.fixture
+def runs_on_two_sets(scored_run) -> list[Path]:
+    """Make two arms scored on the same four images, and a third one scored on two others."""
+    return [
+        scored_run("none", {"web": ([1, -1], [0, 2])}),
+        scored_run("random", {"web": ([1, -1], [0, -2])}),
+        scored_run("adversarial", {"web": ([1], [0])}),
+    ]
+
+
+def test_only_scores_on_the_same_images_share_a_plot(runs_on_two_sets, tmp_path):
+    text = write_report(runs_on_two_sets, tmp_path / "out").read_text()
+    plots = re.findall(r'alt="ROC; AUC: ([^"]*)"', text)
+    assert plots == ["none 0.250, random 0.750", "adversarial 1.000"]
+    assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
+    shared = "<p>photographs, 2 of orange and 2 of other things, none and random: "
+    assert text.count(shared) == 1
+
+
+def test_only_scores_on_the_same_images_share_a_table(runs_on_two_sets):
+    text = format_table([summarize(folder) for folder in runs_on_two_sets])
+    arms = []
+    for title, (_, *rows) in read_markdown(text).items():
+        if title.startswith("photographs"):
+            arms.append([row[0] for row in rows])
+    assert arms == [["none", "random"], ["adversarial"]]
+
+
+class TestAHardenedNetwork:
+    @pytest.fixture
+    def initial(self, scored_run) -> Path:
+        """Score the network that the runs start from with one of four oranges right."""
+        return scored_run("none", {"web": ([1, -1, -1, -1], [0, 2])}) / "photographs"
+
+    @pytest.fixture
+    def hardened(self, scored_run, initial) -> list[Path]:
+        """Make two runs that start from the network, with its scores before training."""
+        oranges = {"random": [1, 1, -1, -1], "adversarial": [1, 1, 1, 1]}
+        folders = []
+        for arm, scores in oranges.items():
+            folder = scored_run(arm, {"web": (scores, [0, 2])}, "train.init_from=base")
+            copytree(initial, folder / "before" / "photographs")
+            log = folder / "metrics.jsonl"
+            before = '"test/accuracy_before": 0.5, "test/epoch"'
+            log.write_text(log.read_text().replace('"test/epoch"', before))
+            folders.append(folder)
+        return folders
+
+    def test_stands_in_one_table_with_the_network_it_started_from(self, hardened):
+        _, *rows = compare(hardened)[""]
+        assert [row[:3] for row in rows] == [
+            ["the initial network", "", "0.500"],
+            ["random", "0", "0.765"],
+            ["adversarial", "0", "0.765"],
+        ]
+
+    def test_is_compared_with_the_network_it_started_from_and_with_the_other_run(self, hardened):
+        recall_differences = {}
+        for title, table in compare(hardened).items():
+            if "minus" in title:
+                pair = title.partition(" (")[0]
+                recall_differences[pair] = table[1][1][:6]
+        assert recall_differences == {
+            "random minus the initial network": "+0.250",
+            "adversarial minus the initial network": "+0.750",
+            "adversarial minus random": "+0.500",
+        }
+
+    def test_has_a_report_with_the_accuracy_before(self, hardened, tmp_path):
+        text = write_report(hardened, tmp_path / "out").read_text()
+        assert "from 50.0% to 76.5%" in text
+        assert ", the initial network and random: " in text
+
+    def test_is_compared_with_a_folder_of_scores(self, initial, hardened, tmp_path):
+        folder = copytree(initial, tmp_path / "scores" / "base")
+        tables = compare([folder, hardened[1]])
+        first_row = tables["adversarial minus scores/base (1 and 1 seeds, paired)"][1]
+        assert first_row[1].startswith("+0.750")
+
+
+def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run):
+    first = scored_run("none", STUDIO_AND_WEB)
+    renamed = STUDIO_AND_WEB | {"wob": STUDIO_AND_WEB["web"], "web": ((), ())}
+    second = scored_run("random", renamed)
+    with pytest.raises(InputError, match=f"{second}/photographs has other .* than {first}"):
+        compare([first, second])
+
+
+@dataclass
+class TwoArms:
+    """Runs of two arms with three seeds each, scored on 60 oranges and 40 other things.
+
+    Attributes:
+        folders: Run folders, all seeds of the first arm first.
+        oranges: Scores by arm, seed and orange, shape (2, 3, 60).
+        others: Scores by arm, seed and other thing, shape (2, 3, 40).
+    """
+
+    folders: list[Path]
+    oranges: np.ndarray
+    others: np.ndarray
+
+
+@pytest.fixture
+def arms(scored_run) -> TwoArms:
+    """Score two arms, of which the second one is better, on images of unlike difficulty."""
+    generator = np.random.default_rng(0)
+    easy_oranges = generator.normal(1, 1, (1, 1, 60))
+    easy_others = generator.normal(0, 1, (1, 1, 40))
+    arm_shift = np.array([0.0, 0.5])[:, None, None]
+    shift = arm_shift + generator.normal(0, 0.2, (1, 3, 1))  # Each seed has its own shift.
+    oranges = easy_oranges + shift + generator.normal(0, 0.3, (2, 3, 60))
+    others = easy_others + shift + generator.normal(0, 0.3, (2, 3, 40))
+    folders = []
+    for row, arm in enumerate(("none", "random")):
+        for seed in range(3):
+            scores = {"web": (oranges[row, seed], others[row, seed])}
+            folders.append(scored_run(arm, scores, f"seed={seed}"))
+    return TwoArms(folders, oranges, others)
+
+
+def mean_auc(oranges: np.ndarray, others: np.ndarray) -> float:
+    """Average the AUC over seeds. No two scores are equal.
+
+    Args:
+        oranges: Scores by seed and orange.
+        others: Scores by seed and other thing.
+    """
+    return (oranges[:, :, None] > others[:, None, :]).mean()
+
+
+def differences(oranges: np.ndarray, others: np.ndarray) -> list[float]:
+    """Subtract the mean recall and the mean AUC of the first arm from those of the second."""
+    recall = (oranges > 0).mean(axis=(1, 2))
+    auc = [mean_auc(oranges[arm], others[arm]) for arm in (0, 1)]
+    return [recall[1] - recall[0], auc[1] - auc[0]]
+
+
+def bootstrap(arms: TwoArms, replicate_count: int) -> np.ndarray:
+    """Return 95 % intervals of the differences in recall and in AUC, shape (2, 2).
+
+    The loop draws seeds and images one replicate at a time.
+    """
+    generator = np.random.default_rng(1)
+    replicates = []
+    for _ in range(replicate_count):
+        seeds = generator.integers(3, size=3)
+        orange_rows = generator.integers(60, size=60)
+        other_rows = generator.integers(40, size=40)
+        oranges = arms.oranges[:, seeds][:, :, orange_rows]
+        others = arms.others[:, seeds][:, :, other_rows]
+        replicates.append(differences(oranges, others))
+    return np.quantile(replicates, (0.025, 0.975), axis=0).T
+
+
+def read_interval(cell: str) -> tuple[float, float, float]:
+    """Read the difference and the two ends of its interval."""
+    number = r"([+-][\d.]+)"
+    difference, low, high = re.fullmatch(rf"{number} \[{number}, {number}\]", cell).groups()
+    return float(difference), float(low), float(high)
+
+
+def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(arms):
+    tables = compare(arms.folders)
+    header, total, web = tables["random minus none (3 and 3 seeds, paired)"]
     assert header[:4] == ["source", "recall", "FPR", "AUC"]
-    assert web[0] == "web" and pooled == ["all", *web[1:]]
+    assert web[0] == "web"
+    assert total == ["all", *web[1:]]
 
-    generator, drawn = np.random.default_rng(1), []
-    for _ in range(1000):
-        seeds, orange, other = (generator.integers(n, size=n) for n in (3, 60, 40))
-        recall = (oranges[:, seeds][:, :, orange] > 0).mean(axis=(1, 2))
-        ranked = [[auc(oranges[arm, s, orange], others[arm, s, other]) for s in seeds] for arm in (0, 1)]
-        drawn.append((recall[1] - recall[0], np.mean(ranked[1]) - np.mean(ranked[0])))
-    intervals = np.quantile(drawn, (0.025, 0.975), axis=0).T
-    values = [
-        (oranges[1] > 0).mean() - (oranges[0] > 0).mean(),
-        np.mean([auc(oranges[1, seed], others[1, seed]) - auc(oranges[0, seed], others[0, seed]) for seed in range(3)]),
+    values = differences(arms.oranges, arms.others)
+    intervals = bootstrap(arms, 1000)
+    for cell, value, interval in zip((web[1], web[3]), values, intervals, strict=True):
+        difference, low, high = read_interval(cell)
+        assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.
+        # With 1,000 replicates, the ends vary by chance by up to 0.02.
+        assert (low, high) == pytest.approx(tuple(interval), abs=0.02)
+
+
+def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run):
+    folders = [
+        scored_run("none", STUDIO_AND_WEB),
+        scored_run("random", STUDIO_AND_WEB, "augment.random_light.radius=1.5"),
+        scored_run("random", STUDIO_AND_WEB),
     ]
-    for cell, value, reference in zip((web[1], web[3]), values, intervals, strict=True):
-        difference, low, high = read_difference(cell)
-        assert difference == pytest.approx(value, abs=5.1e-4)  # printed to three digits
-        assert (low, high) == pytest.approx(tuple(reference), abs=0.02)
-
-
-def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run, read_markdown):
-    radii = [["augment.random_light.radius=1.5"], []]
-    folders = [scored_run("none", STUDIO_AND_WEB), *(scored_run("random", STUDIO_AND_WEB, *radius) for radius in radii)]
-    titles = set(compare(read_markdown, folders))
-    assert {f"random, random light radius={r} minus none (1 and 1 seeds, paired)" for r in (1.5, None)} <= titles
+    titles = set(compare(folders))
+    for radius in (1.5, None):
+        group = f"random, random light radius={radius}"
+        assert f"{group} minus none (1 and 1 seeds, paired)" in titles

@@ -3,6 +3,7 @@ from dataclasses import asdict
 import pytest
 
 from renderer.errors import InputError
+from tests.train.helpers import read_markdown
 from train.evaluation.tables import format_interval, fraction
 from train.report.comparison import format_table
 from train.report.summary import summarize
@@ -16,7 +17,7 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
         summarize(tmp_path)
 
 
-def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_path, made_up_run, read_markdown):
+def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_path, made_up_run):
     """0.2, 0.4 and 0.9 have the mean 0.5 and, by hand, the standard deviation √((0.09 + 0.01 + 0.16) / 2) = 0.361."""
     settings = {2: ["seed=0"], 4: ["seed=1"], 9: ["seed=2"], 5: ["seed=0", "train.epochs=9"]}
     runs = []

@@ -20,6 +20,7 @@ from augment.scene.build import build_scene
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from tests.runs import completed_run, finish, loaded_run
+from tests.train.helpers import read_markdown
 from train.data import batches
 from train.data.load import load_data
 from train.report.comparison import format_table
@@ -245,7 +246,7 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
     assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
 
 
-def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(tiny, tmp_path, read_markdown, monkeypatch):
+def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(tiny, tmp_path, monkeypatch):
     """On renders of other instances before other backgrounds. The run is stopped within its first epoch and resumed;
     the network that it begins with knows neither class. Tables and page have a row for both and one for each."""
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
