@@ -1,4 +1,37 @@
-"""What tests of several modules of training read and draw."""
+"""What tests of several modules of training read and write."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from train.networks import WideResNet, describe
+from train.runs.checkpoint import BEST, save
+
+FIG_LIME_ORANGE = ["fig", "lime", "orange"]
+
+
+def save_untrained_network(folder: Path, size: int) -> None:
+    """Save a small network with random weights, as a run saves its best one.
+
+    Args:
+        folder: Folder of the network, which is created.
+        size: Size in pixels of the images that the network takes.
+    """
+    torch.manual_seed(0)
+    shape = {"depth": 10, "width": 1, "dropout": 0.0}
+    network = WideResNet(len(FIG_LIME_ORANGE), **shape)
+    architecture = describe(network, FIG_LIME_ORANGE, size=size, encoding="linear", **shape)
+    folder.mkdir()
+    save(folder / BEST, {"model": network.state_dict(), "architecture": architecture})
+
+
+def save_noise(path: Path, size: int, rng: np.random.Generator) -> None:
+    """Save a square image of noise, and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = rng.integers(0, 256, (size, size, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(path)
 
 
 def read_markdown(text: str) -> dict[str, list[list[str]]]:

@@ -1,5 +1,6 @@
-"""The commands' settings and outputs."""
+"""Settings and outputs of the commands."""
 
+import csv
 import json
 import math
 import re
@@ -22,181 +23,254 @@ from renderer.light.harmonics import equirectangular
 from renderer.light.light_files import save_light
 from renderer.light.presets import load_light
 from scripts.attack import main as attack_command
+from tests.train.helpers import save_noise, save_untrained_network
 from train import console
+from train.command import USER_ERROR
 from train.commands.experiment import logged_to
 from train.commands.fit import grab_cut
-from train.networks import WideResNet, describe
-from train.runs.checkpoint import BEST, save
 from train.runs.run_lock import LOCK, sole_writer
 from train.runs.saved_networks import load_run
 
-USER_ERROR = 2
-CLASSES = ["fig", "lime", "orange"]
+EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
+EVALUATE_CLASSIFIER = [*EVALUATE, "run=null"]
+EXPORT = ["light", "light=grace", "height=4"]
 
 
 @pytest.fixture
 def here(tmp_path) -> Path:
-    """A folder with a network for images of 64 pixels in 1.10, and photographs in 2024."""
-    torch.manual_seed(0)
-    network = WideResNet(len(CLASSES), 10, 1, 0.0)
-    described = describe(network, CLASSES, size=64, encoding="linear", depth=10, width=1, dropout=0.0)
-    (tmp_path / "1.10").mkdir()
-    save(tmp_path / "1.10" / BEST, {"model": network.state_dict(), "architecture": described})
+    """Make a folder with a network for images of 64 pixels in 1.10, and photographs in 2024."""
+    save_untrained_network(tmp_path / "1.10", size=64)
     rng = np.random.default_rng(0)
-    for name in ("2024/orange", "2024/other_\udcff"):
-        (tmp_path / name).mkdir(parents=True)
-        pixels = rng.integers(0, 256, (64, 64, 3)).astype(np.uint8)
-        Image.fromarray(pixels).save(tmp_path / name / "a.png")
+    for name in ("orange", "other_\udcff"):
+        save_noise(tmp_path / "2024" / name / "a.png", 64, rng)
     (tmp_path / "file").touch()
     return tmp_path
 
 
-EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
-EXPORT = ["light", "light=grace", "height=4"]
+class TestEvaluation:
+    @pytest.fixture
+    def scores(self, call, here, capsys) -> Path:
+        """Score photographs in folders whose names are numbers or not in UTF-8."""
+        assert call(*EVALUATE, "out=1e3") == 0
+        return here / "1e3"
+
+    def test_prints_how_many_photographs_were_scored(self, scores, capsys):
+        assert "1 images of orange, 1 of other things" in capsys.readouterr().out
+
+    def test_writes_its_files(self, scores):
+        assert {path.name for path in scores.iterdir()} == {
+            "predictions.csv",
+            "summary.json",
+            "contact_sheet.png",
+            "roc.csv",
+            "roc.png",
+            LOCK,
+        }
+        assert json.loads((scores / "summary.json").read_text())["size"] == 64
+
+    def test_writes_the_log_odds_of_the_network_for_each_photograph(self, scores, here):
+        with open(scores / "predictions.csv", encoding="utf-8", newline="") as file:
+            rows = {row["path"]: row for row in csv.DictReader(file)}
+        assert set(rows) == {"orange/a.png", r"other_\udcff/a.png"}
+        image = read_image(here / "2024" / "orange" / "a.png", 64)
+        with torch.no_grad():
+            fig, lime, orange = load_run(here / "1.10")(image[None])[0]
+        log_odds = float(orange - torch.logaddexp(fig, lime))
+        found = float(rows["orange/a.png"]["orange_log_odds"])
+        assert found == pytest.approx(log_odds, abs=1e-4)
+
+    def test_of_a_classifier_named_by_its_run_is_the_same(self, call, scores, here):
+        assert call(*EVALUATE_CLASSIFIER, "classifier=run:1.10", "out=classifier") == 0
+        same = (here / "classifier" / "predictions.csv").read_bytes()
+        assert (scores / "predictions.csv").read_bytes() == same
 
 
-def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_in_utf_8(call, here, capsys):
-    assert call(*EVALUATE, "out=1e3") == 0
-    assert "1 images of orange, 1 of other things" in capsys.readouterr().out
-    assert {path.name for path in (here / "1e3").iterdir()} == {
-        *("predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
-    }
-    assert json.loads((here / "1e3" / "summary.json").read_text())["size"] == 64
-    header, *rows = (here / "1e3" / "predictions.csv").read_text(encoding="utf-8").splitlines()
-    assert any(row.startswith(r"other_\udcff/a.png,") for row in rows)
-    (first,) = (row.split(",") for row in rows if row.startswith("orange/a.png,"))
-    image = np.asarray(Image.open(here / "2024" / "orange" / "a.png")).transpose(2, 0, 1).copy()
-    with torch.no_grad():
-        logits = load_run(here / "1.10")(torch.from_numpy(image)[None] / 255)[0]
-    log_odds = float(logits[2] - logits[:2].logsumexp(0))
-    assert float(first[header.split(",").index("orange_log_odds")]) == pytest.approx(log_odds, abs=1e-4)
-    assert call(*EVALUATE, "run=null", "classifier=run:1.10", "out=classifier") == 0  # as any other network
-    tables = [(here / out / "predictions.csv").read_bytes() for out in ("1e3", "classifier")]
-    assert tables[0] == tables[1]
+class TestExportOfALightThatIsNegativeInPlaces:
+    """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z)."""
+
+    @pytest.fixture(params=[".npy", ".exr", ".hdr"])
+    def radiance(self, request, call, here, capsys) -> torch.Tensor:
+        """Export the light as a map, and read the red channel of the file."""
+        light = torch.zeros(49, 3)
+        light[0] = math.sqrt(4 * math.pi)
+        light[2] = 2 * math.sqrt(4 * math.pi / 3)
+        save_light(here / "light.json", light)
+        name = f"map{request.param}"
+        assert call("light", "light=light.json", f"out={name}", "height=64") == 0
+        return read_panorama(here / name)[..., 0].double()
+
+    def test_is_a_map_of_the_same_flux_without_negative_radiance(self, radiance):
+        _, solid_angles = equirectangular(*radiance.shape)
+        flux = float((radiance * solid_angles).sum())
+        assert radiance.min() >= 0
+        assert flux == pytest.approx(4 * math.pi, rel=0.01)
+
+    def test_prints_the_error_of_the_irradiance(self, radiance, capsys):
+        """Compare with the error at 201 normals. The mean square irradiance is π² (1 + 16/27)."""
+        printed = re.search("irradiance is off by ([0-9.]+)%", capsys.readouterr().out)
+        directions, solid_angles = equirectangular(*radiance.shape)
+        height = torch.linspace(-1, 1, 201, dtype=torch.float64)
+        normals = torch.stack([(1 - height**2).sqrt(), 0 * height, height], dim=1)
+        cosines = (normals @ directions.flatten(0, 1).T).clamp(min=0)
+        irradiance = cosines @ (radiance * solid_angles).flatten()
+        error = (irradiance - math.pi * (1 + 4 / 3 * height)).square().mean().sqrt()
+        root_mean_square = math.pi * math.sqrt(1 + 16 / 27)
+        percent = 100 * float(error) / root_mean_square
+        assert float(printed[1]) == pytest.approx(percent, abs=0.5)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".exr", ".hdr"])
-def test_a_light_that_is_negative_in_places_is_exported_as_a_map_that_can_be_read(call, here, capsys, suffix):
-    """Light of radiance 1 + 2 z has the irradiance π (1 + 4/3 z), whose mean square is π² (1 + 16/27)."""
-    light = torch.zeros(49, 3)
-    light[0], light[2] = math.sqrt(4 * math.pi), 2 * math.sqrt(4 * math.pi / 3)
-    save_light(here / "light.json", light)
-    assert call("light", "light=light.json", f"out=map{suffix}", "height=64") == 0
-    printed = float(re.search("irradiance is off by ([0-9.]+)%", capsys.readouterr().out)[1])
-
-    radiance = read_panorama(here / f"map{suffix}")[..., 0].double()
-    directions, solid_angles = equirectangular(*radiance.shape)
-    assert radiance.min() >= 0
-    assert float((radiance * solid_angles).sum()) == pytest.approx(4 * math.pi, rel=0.01)
-    height = torch.linspace(-1, 1, 201, dtype=torch.float64)
-    normals = torch.stack([(1 - height**2).sqrt(), 0 * height, height], dim=1)
-    cosines = (normals @ directions.flatten(0, 1).T).clamp(min=0)
-    irradiance = cosines @ (radiance * solid_angles).flatten()
-    error = (irradiance - math.pi * (1 + 4 / 3 * height)).square().mean().sqrt()
-    assert printed == pytest.approx(100 * float(error) / (math.pi * math.sqrt(1 + 16 / 27)), abs=0.5)
-
-
-WRONG = [
-    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe must be true or false"),
-    ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear' is not a class of the model"),
-    ([*EVALUATE, "label=[]"], "label=[] must name a class, or several, each once"),
-    ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear' is not a class of the model"),
+MISTAKES = [
+    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable=maybe"),
+    ([*EVALUATE, "label=pear"], "label: classifier run:1.10: 'pear'"),
+    ([*EVALUATE, "label=[]"], "label=[]"),
+    ([*EVALUATE, "label=[fig,pear]"], "label: classifier run:1.10: 'pear'"),
     ([*EVALUATE, "classifier=python:own:build"], "give one network"),
-    ([*EVALUATE, "run=null", "classifier=python:own:build", "model=python:a:b"], "model=python:a:b is for"),
-    ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
-    ([*EVALUATE, "weights=b"], "weights=b is not for run:1.10"),
-    ([*EVALUATE, "out=file"], "out=file cannot be written to (Not a directory): choose another folder"),
-    (["compare"], "runs is not set: give runs=..."),
+    ([*EVALUATE_CLASSIFIER, "classifier=python:own:build", "model=python:a:b"], "model=python:a:b"),
+    ([*EVALUATE_CLASSIFIER, "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
+    ([*EVALUATE, "weights=b"], "weights=b"),
+    ([*EVALUATE, "out=file"], "out=file"),
+    (["compare"], "runs is not set"),
     (["compare", "runs=[a,b,./a]"], "runs names a twice"),
     (["compare", "runs=[2024]"], "2024 holds no finished run"),
-    (["compare", "--multirun"], "--multirun is not an option"),
+    (["compare", "--multirun"], "--multirun"),
     ([*EXPORT, "out=a.jpg"], "out: "),
-    (["publish", "run=1.10", "out=file/out"], "out=file/out cannot be written to"),
-    ([*EXPORT, "out=file/a.npy"], "out: environment map file/a.npy cannot be written: "),
-    (["lab", "out=file/out"], "out=file/out cannot be written to"),
+    (["publish", "run=1.10", "out=file/out"], "out=file/out"),
+    ([*EXPORT, "out=file/a.npy"], "out: environment map file/a.npy"),
+    (["lab", "out=file/out"], "out=file/out"),
 ]
 
 
-@pytest.mark.parametrize(("command", "message"), WRONG, ids=[" ".join([c[0], *c[-2:]]) for c, _ in WRONG])
-def test_a_mistake_is_one_line_and_status_2_before_the_work(call, here, capsys, command, message):
+@pytest.mark.parametrize(
+    ("command", "start"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
+)
+def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
+    call, here, capsys, command, start
+):
     before = sorted(here.rglob("*"))
     assert call(*command) == USER_ERROR
     printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith(f"error: {message}") and printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert printed.err.startswith(f"error: {start}")
+    assert printed.err.count("\n") == 1
     assert sorted(here.rglob("*")) == before
 
 
-@pytest.mark.parametrize("command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0])
+@pytest.mark.parametrize(
+    "command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0]
+)
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
     with sole_writer("out", here / "out"):
         assert call(*command, "out=out") == USER_ERROR
-    assert "error: out=out is being written by another process" in capsys.readouterr().err
+    assert "error: out=out " in capsys.readouterr().err
     assert not (here / "out").exists()
 
 
 def test_a_light_is_not_written_over_itself(call, here, capsys):
     assert call("light", "light=grace", "height=8", "out=a.npy") == 0
     (here / "b.npy").symlink_to("a.npy")
-    whole = (here / "a.npy").read_bytes()
+    before = (here / "a.npy").read_bytes()
     assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
-    assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
-    assert (here / "a.npy").read_bytes() == whole
+    assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself")
+    assert (here / "a.npy").read_bytes() == before
+
+
+def to_pixels(image: torch.Tensor) -> np.ndarray:
+    """Round an image (3, H, W) in [0, 1] to bytes (H, W, 3)."""
+    return (255 * image.permute(1, 2, 0)).round().byte().numpy()
 
 
 def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
-    [camera], light = renderer.orbit_cameras(1, 4.0), renderer.load_light("uniform")
-    shown = renderer.solid("orange"), camera, light, 96
-    behind = 0.2 + 0.1 * torch.rand(3, 96, 96, generator=torch.Generator().manual_seed(0))
-    image = renderer.render(*shown, behind, encoding="srgb")[0]
-    mask = grab_cut((255 * image.permute(1, 2, 0)).byte().numpy(), [10, 10, 86, 86]) > 0
-    exact = (renderer.render(*shown, 0.0)[0].amax(0) > 0).numpy()
-    assert (mask & exact).sum() > 0.95 * (mask | exact).sum()
-    for box in ([10, 10, 10, 86], [0, 0, 97, 96], [1, 2, 3]):
-        with pytest.raises(InputError, match=r"is not \[left, top, right, bottom\] within 96 × 96 pixels"):
-            grab_cut(np.zeros((96, 96, 3), np.uint8), box)
+    (camera,) = renderer.orbit_cameras(1, 4.0)
+    shown = renderer.solid("orange"), camera, renderer.load_light("uniform"), 96
+    generator = torch.Generator().manual_seed(0)
+    background = 0.2 + 0.1 * torch.rand(3, 96, 96, generator=generator)
+    image = renderer.render(*shown, background, encoding="srgb")[0]
+    is_object = (renderer.render(*shown, 0.0)[0].amax(0) > 0).numpy()
+    is_found = grab_cut(to_pixels(image), [10, 10, 86, 86]) > 0
+    intersection = (is_found & is_object).sum()
+    union = (is_found | is_object).sum()
+    assert intersection > 0.95 * union
+
+
+@pytest.mark.parametrize("box", [[10, 10, 10, 86], [0, 0, 97, 96], [1, 2, 3]])
+def test_grab_cut_refuses_a_box_outside_the_image(box):
+    with pytest.raises(InputError, match="within 96 × 96 pixels"):
+        grab_cut(np.zeros((96, 96, 3), np.uint8), box)
+
+
+FIT = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48", "bounces=0"]
+
+
+@pytest.fixture
+def photographed_cup(here) -> Path:
+    """Render a cup in front of noise, away from the middle of the image, and its mask."""
+    size = 192
+    mesh = renderer.normalize(renderer.solid("cup"))
+    camera = OrthographicCamera(57.3, 28.6, 4.0, 0.6, -0.3)
+    light = 0.2 * load_light("grace").double()
+    light[0] += 0.2  # The light has no negative radiance.
+    generator = torch.Generator().manual_seed(0)
+    background = torch.rand(3, size, size, generator=generator).double()
+    photograph = renderer.render(mesh, camera, light, size, background, samples=4, encoding="srgb")[
+        0
+    ]
+    white_behind_black = renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0]
+    Image.fromarray(to_pixels(photograph)).save(here / "photo.png")
+    Image.fromarray(to_pixels(1 - white_behind_black)).save(here / "mask.png")
+    return here
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["mask=small.png"], "mask=small.png has 9 × 9 pixels"),
+        (["mask=black.png"], "no object is found"),
+        (["mask=none.png"], "none.png cannot be read"),
+        ([], "mask=FILE or box="),
+    ],
+)
+def test_a_fit_without_a_usable_mask_is_refused(call, photographed_cup, capsys, arguments, message):
+    Image.new("L", (9, 9), 255).save(photographed_cup / "small.png")
+    Image.new("L", (192, 192)).save(photographed_cup / "black.png")
+    assert call(*FIT, *arguments) == USER_ERROR
+    assert message in capsys.readouterr().err
+    assert not (photographed_cup / "fitted").exists()
 
 
 @pytest.mark.slow
-def test_a_scene_is_found_in_a_photograph_and_attacks_begin_there(call, here, capsys):
-    """A cup in front of noise, at another place than the image's middle: rendered and scored as photographed."""
-    camera, light = OrthographicCamera(57.3, 28.6, 4.0, 0.6, -0.3), 0.2 * load_light("grace").double()
-    light[0] += 0.2  # no negative radiance
-    mesh, size = renderer.normalize(renderer.solid("cup")), 192
-    behind = torch.rand(3, size, size, generator=torch.Generator().manual_seed(0)).double()
-    image = renderer.render(mesh, camera, light, size, behind, samples=4, encoding="srgb")[0]
-    share = 1 - renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0, 0]
-    for name, values in (("photo.png", image), ("mask.png", share.expand(3, -1, -1))):
-        Image.fromarray((255 * values.permute(1, 2, 0)).round().byte().numpy()).save(here / name)
-    fit = ["fit", "photograph=photo.png", "mesh=solid:cup", "out=fitted", "size=48", "bounces=0"]
-    Image.new("L", (9, 9), 255).save(here / "small.png")
-    Image.new("L", (size, size)).save(here / "black.png")
-    for arguments, message in (
-        (["mask=small.png"], "mask=small.png has 9 × 9 pixels: give one of the photograph's size, 192 × 192"),
-        (["mask=black.png"], "no object is found"),
-        (["mask=none.png"], "none.png cannot be read"),
-        ([], "give mask=FILE or box=[left,top,right,bottom], one of them"),
-    ):
-        assert call(*fit, *arguments) == USER_ERROR
-        assert message in capsys.readouterr().err and not (here / "fitted").exists()
-    assert call(*fit, "mask=mask.png") == 0
+def test_a_scene_that_was_fitted_is_rendered_and_scored_as_it_was_photographed(
+    call, photographed_cup, capsys
+):
+    assert call(*FIT, "mask=mask.png") == 0
     output = capsys.readouterr().out
-    command = shlex.split(output.splitlines()[-1])
-    settings = attack_command.read(command[1:])
-    assert not settings.renderer.shadows and settings.label == "orange"  # as it was fitted
-    scene, angles = settings.scene, (settings.scene.polar, settings.scene.azimuth)
-    [found], background = renderer.orbit_cameras(1, scene.width, *angles), read_image(scene.backgrounds[0], 64)
-    shown = renderer.render(mesh, found, load_light(scene.light), 64, background, samples=4, encoding="srgb")[0]
-    differ = (shown - background).abs().amax(0)
-    assert (differ > 0).double().mean() > 0.2 and float(differ[differ > 0].mean()) < 0.06  # all else is photographed
-    background = read_image(scene.backgrounds[0], 224).double()  # of the pixels of the default classifier
+    attack = shlex.split(output.splitlines()[-1])
+    settings = attack_command.read(attack[1:])
+    scene = settings.scene
+    assert not settings.renderer.shadows
+    assert settings.label == "orange"
+
+    mesh = renderer.normalize(renderer.solid("cup"))
+    (camera,) = renderer.orbit_cameras(1, scene.width, scene.polar, scene.azimuth)
     light = load_light(scene.light).double()
-    shown = renderer.render(mesh, found, light, 224, background, samples=2, encoding="srgb")[0]
-    inside = read_image(here / "fitted" / "mask.png", 224)[0] > 0.98
-    shown, background = (decode(image[:, inside], "srgb") for image in (shown, background))
-    real = float((shown - background).norm() / background.norm())
-    printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
-    assert printed == pytest.approx(real, abs=0.00051) and real < 0.15
     assert to_map(light, 128).min() >= 0
+
+    # The render differs from the photograph in the pixels of the object alone.
+    background = read_image(scene.backgrounds[0], 64).double()
+    image = renderer.render(mesh, camera, light, 64, background, samples=4, encoding="srgb")[0]
+    difference = (image - background).abs().amax(0)
+    assert (difference > 0).double().mean() > 0.2
+    assert float(difference[difference > 0].mean()) < 0.06
+
+    # The printed error is that of images in the size of the default classifier.
+    background = read_image(scene.backgrounds[0], 224).double()
+    image = renderer.render(mesh, camera, light, 224, background, samples=2, encoding="srgb")[0]
+    is_inside = read_image(photographed_cup / "fitted" / "mask.png", 224)[0] > 0.98
+    rendered = decode(image[:, is_inside], "srgb")
+    photographed = decode(background[:, is_inside], "srgb")
+    error = float((rendered - photographed).norm() / photographed.norm())
+    printed = float(re.search("the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
+    assert printed == pytest.approx(error, abs=0.00051)
+    assert error < 0.15
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
