@@ -1,8 +1,9 @@
-"""The audit: a brute-force scan of radii, closed forms, and audits that were stopped."""
+"""The audit agrees with a scan of all radii and with closed forms, and continues if it was stopped."""
 
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,8 @@ from train.evaluation.laboratory import lab_patterns as patterns
 CLASSES = ("orange", "other")
 
 
-def brightness(limit: float, size: int = 8) -> augment.Classifier:
-    """Orange is what is darker than a limit on average."""
+def darker_than(limit: float, size: int = 8) -> augment.Classifier:
+    """Make a classifier that takes images darker than a limit on average for an orange."""
 
     def logits(images: torch.Tensor) -> torch.Tensor:
         excess = 100 * (images.mean((1, 2, 3)) - limit)
@@ -35,186 +36,283 @@ def brightness(limit: float, size: int = 8) -> augment.Classifier:
     return augment.Classifier(logits, size, CLASSES, f"darker than {limit}")
 
 
-def chance() -> augment.Classifier:
-    return augment.Classifier(lambda images: 0 * images[:, :2, 0, 0], 8, CLASSES, "chance")
+def guessing() -> augment.Classifier:
+    """Make a classifier whose logits are all 0."""
+    return augment.Classifier(lambda images: 0 * images[:, :2, 0, 0], 8, CLASSES, "guessing")
 
 
 @pytest.fixture(scope="module")
 def views() -> Views:
-    return Views([load_object(ObjectSettings("solid:orange:0", label="orange"))], 4, 0, torch.device("cpu"))
+    orange = load_object(ObjectSettings("solid:orange:0", label="orange"))
+    return Views([orange], 4, 0, torch.device("cpu"))
 
 
-def test_the_smallest_radius_is_that_of_a_scan_of_all_radii(views, tmp_path):
-    """Each lamp adds light: within a radius, no light is brighter than that of all lamps at the radius."""
-    scene, rows = views.scene(8, "lamps"), torch.arange(4)
-    ((where, _),) = [part for part in parts_of(scene.basis) if part[1].name == "lamps"]
+def mean_values(views: Views, power: float) -> torch.Tensor:
+    """Render the views with all lamps at a power, and average each image."""
+    scene = views.scene(8, "lamps")
+    ((rows, _),) = [part for part in parts_of(scene.basis) if part[1].name == "lamps"]
+    light = scene.basis.project_nonnegative(scene.lights)
+    light[:, rows] = power
+    images = scene.render(Conditions(light), torch.arange(len(scene)))
+    return images.mean((1, 2, 3, 4))
 
-    def means(power: float) -> torch.Tensor:
-        light = scene.basis.project_nonnegative(scene.lights)
-        light[:, where] = power
-        return scene.render(Conditions(light), rows).mean((1, 2, 3, 4))
 
-    limit = float(means(2.0).sort().values[1:3].mean())
-    counts = success_by_light(brightness(limit), views, "lamps", tmp_path)
-    correct = means(0.0) < limit
-    expected = [int((correct & (means(radius) > limit)).sum()) for radius in KINDS["lamps"].radii]
-    assert counts["correct"] == int(correct.sum()) and 0 < expected[1] < expected[-1]
+def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp_path):
+    """Each lamp adds light, so no light within a radius is brighter than all lamps at it."""
+    middle_two = mean_values(views, 2.0).sort().values[1:3]
+    limit = float(middle_two.mean())
+    is_correct = mean_values(views, 0.0) < limit
+    expected = []
+    for radius in KINDS["lamps"].radii:
+        is_wrong = mean_values(views, radius) > limit
+        expected.append(int((is_correct & is_wrong).sum()))
+    assert 0 < expected[1] < expected[-1]
+
+    counts = success_by_light(darker_than(limit), views, "lamps", tmp_path)
+
+    assert counts["correct"] == int(is_correct.sum())
     assert counts["adversarial"] == expected
-    assert all(random <= hits for random, hits in zip(counts["random"], expected, strict=True))
+    for random, hits in zip(counts["random"], expected, strict=True):
+        assert random <= hits
 
 
-def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(views, tmp_path, monkeypatch):
+@pytest.fixture
+def lamps_alone(monkeypatch) -> None:
+    """Attack only lamps, with one radius and few steps."""
     monkeypatch.setattr(lights, "STEPS", 3)
     monkeypatch.setattr(lights, "FURTHER", 5)
     for kind in ("skylight", "projector", "lighting"):
         monkeypatch.delitem(KINDS, kind)
     monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
-    views, attacked, other = replace(views, count=2), brightness(0.5), brightness(0.515, size=12)
+
+
+def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
+    views, tmp_path, lamps_alone
+):
+    views = replace(views, count=2)
+    attacked = darker_than(0.5)
+    other = darker_than(0.515, size=12)
     success_by_light(attacked, views, "lamps", tmp_path)
+
     counts = transfers(attacked, other, views, tmp_path)["lamps"]
-    for name, further in (("first", False), ("further", True)):
-        (row,) = augment.transfer(adversaries(attacked, views, "lamps", further), [other])
-        pairs = [*zip(row["clean_correct"], row["success"], strict=True)]
-        pairs_without_noise = [*zip(row["clean_correct"], row["success_without_noise"], strict=True)]
-        lost = [part.count((True, True)) for part in (pairs, pairs_without_noise)]
-        assert counts[name] == [lost[0], sum(row["clean_correct"]), lost[1]]
-    assert (counts["first"], counts["further"]) == ([1, 2, 1], [2, 2, 2])
+
+    assert counts == {"first": [1, 2, 1], "further": [2, 2, 2]}
+    for name, is_further in (("first", False), ("further", True)):
+        found = adversaries(attacked, views, "lamps", is_further)
+        (row,) = augment.transfer(found, [other])
+        is_correct = np.array(row["clean_correct"])
+        lost = is_correct & np.array(row["success"])
+        lost_without_noise = is_correct & np.array(row["success_without_noise"])
+        assert counts[name] == [lost.sum(), is_correct.sum(), lost_without_noise.sum()]
 
 
-def test_classifiers_of_all_sizes_get_the_same_views_which_the_seed_decides(views):
-    small, large = views.scene(8), views.scene(12, "projector")
+def test_classifiers_of_all_sizes_get_the_same_views(views):
+    small = views.scene(8)
+    large = views.scene(12, "projector")
     assert small.examples == large.examples
     for one, other in zip(small.objects, large.objects, strict=True):
         np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
-    assert small.examples != Views(views.objects, 4, 1, views.device).scene(8).examples
+
+
+def test_another_seed_draws_other_views(views):
+    assert views.scene(8).examples != replace(views, seed=1).scene(8).examples
+
+
+CLASSIFIERS = {
+    "dark": darker_than(0.5),
+    "dark in larger images": darker_than(0.5, 12),
+    "guessing": guessing(),
+}
 
 
 @pytest.fixture
-def given(monkeypatch, tmp_path) -> dict:
-    """Settings of an audit of seconds, of two classifiers."""
+def given(monkeypatch, tmp_path) -> dict[str, Any]:
+    """Return settings of an audit that takes seconds."""
     monkeypatch.setattr(lights, "FURTHER", 2)
     monkeypatch.setattr(lights, "STEPS", 2)
     for kind in ("skylight", "projector", "lamps"):
         monkeypatch.delitem(KINDS, kind)
-    for name, value in {
-        "PATTERNS": ("solid", "rings"),
-        "SPP": 1,
-        "VIEWS": 2,
-        "ATTACKED": 2,
-        "SETUPS": 1,
-        "LIGHTS": 1,
-    }.items():
-        monkeypatch.setattr(audit, name, value)
+    monkeypatch.setattr(audit, "PATTERNS", ("solid", "rings"))
+    monkeypatch.setattr(audit, "SPP", 1)
+    monkeypatch.setattr(audit, "VIEWS", 2)
+    monkeypatch.setattr(audit, "ATTACKED", 2)
+    monkeypatch.setattr(audit, "SETUPS", 1)
+    monkeypatch.setattr(audit, "LIGHTS", 1)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
-    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: {"a": brightness(0.5), "b": chance()}[name])
-    meshes = {
+    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: CLASSIFIERS[name])
+    return {
+        "classifier": "dark",
+        "environments": [],
         "meshes": ["solid:orange:0"],
         "look_alikes": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
+        "out": str(tmp_path / "audit"),
     }
-    return {"classifier": "a", "environments": [], **meshes, "out": str(tmp_path / "audit")}
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    names = ("report.html", "*/*.json", "*/*/summary.json", "*/*/predictions.csv", "renders/*/*.png")
-    return {str(path.relative_to(folder)): path.read_bytes() for name in names for path in folder.glob(name)}
+def results_of(folder: Path) -> dict[str, bytes]:
+    """Read the files of an audit that have its results, by their names."""
+    patterns_of_names = (
+        "report.html",
+        "*/*.json",
+        "*/*/summary.json",
+        "*/*/predictions.csv",
+        "renders/*/*.png",
+    )
+    contents = {}
+    for pattern in patterns_of_names:
+        for path in folder.glob(pattern):
+            contents[str(path.relative_to(folder))] = path.read_bytes()
+    return contents
+
+
+def modification_times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.glob("*/*.json")}
+
+
+def stop(*arguments) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.mark.slow
-def test_an_audit_that_was_stopped_goes_on_and_writes_the_same_report(given, monkeypatch, tmp_path):
-    pytest.importorskip("mitsuba")
-    run_audit(AuditSettings(**given, hardened="b"))
-    whole, folder = files(tmp_path / "audit"), tmp_path / "audit"
-    assert len(whole) > 15
-    summary = json.loads((folder / "hardened/laboratory/summary.json").read_text())
-    assert summary["auc"]["value"] == 0.5 and summary["n"]["positives"] == summary["n"]["negatives"] == 2
-    folder.rename(tmp_path / "before")
+class TestAWholeAudit:
+    @pytest.fixture
+    def folder(self, given, tmp_path) -> Path:
+        """Audit two classifiers, of which the hardened one guesses."""
+        pytest.importorskip("mitsuba")
+        run_audit(AuditSettings(**given, hardened="guessing"))
+        return tmp_path / "audit"
 
-    def stop(*arguments):
-        raise KeyboardInterrupt
+    def test_scores_a_classifier_that_guesses_at_chance(self, folder):
+        summary = json.loads((folder / "hardened/laboratory/summary.json").read_text())
+        assert summary["auc"]["value"] == 0.5
+        assert summary["n"]["positives"] == summary["n"]["negatives"] == 2
 
-    with monkeypatch.context() as patch:
-        patch.setattr(audit, "success_by_light", stop)
-        with pytest.raises(KeyboardInterrupt):
-            run_audit(AuditSettings(**given))
-    made = {path: path.stat().st_mtime_ns for path in folder.glob("*/*.json")}
-    assert folder / "classifier" / page.RECOGNIZED in made
-    run_audit(AuditSettings(**given, hardened="b"))  # which may be added
-    assert files(folder) == whole
-    assert made == {path: path.stat().st_mtime_ns for path in made}
-    with pytest.raises(
-        InputError, match="audit was made with seed=0, not 1: give its setting, or another folder with out="
+    def test_continues_if_it_was_stopped_and_writes_the_same(
+        self, folder, given, monkeypatch, tmp_path
     ):
-        run_audit(AuditSettings(**given, hardened="b", seed=1))
+        expected = results_of(folder)
+        assert len(expected) > 15
+        folder.rename(tmp_path / "uninterrupted")
+        with monkeypatch.context() as patch:
+            patch.setattr(audit, "success_by_light", stop)
+            with pytest.raises(KeyboardInterrupt):
+                run_audit(AuditSettings(**given))
+        times = modification_times(folder)
+        assert folder / "classifier" / page.RECOGNIZED in times
+
+        run_audit(AuditSettings(**given, hardened="guessing"))  # A hardened network may be added.
+
+        assert results_of(folder) == expected
+        assert times.items() <= modification_times(folder).items()
+
+    def test_refuses_to_continue_with_another_seed(self, folder, given):
+        with pytest.raises(InputError, match="seed=0, not 1"):
+            run_audit(AuditSettings(**given, hardened="guessing", seed=1))
 
 
-def test_without_mitsuba_all_but_the_laboratory_is_audited_or_a_folder_of_renders_serves(given, monkeypatch, tmp_path):
-    def missing():
-        raise InputError("Mitsuba is not installed")
+class TestAnAuditWithoutMitsuba:
+    @pytest.fixture(autouse=True)
+    def fast_without_mitsuba(self, given, monkeypatch) -> None:
+        """Pretend that Mitsuba is missing, and replace the attacks by fixed counts."""
 
-    counts = {"n": 2, "correct": 2, "adversarial": [0, 0, 0, 0], "random": [0, 0, 0, 0]}
-    counts |= {f"{method}_without_noise": counts[method] for method in ("adversarial", "random")}
-    monkeypatch.setattr(audit, "mitsuba", missing)
-    monkeypatch.setattr(audit, "recognized", lambda *arguments: {"uniform": [True], "random 1": [True]})
-    monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
-    report = run_audit(AuditSettings(**given))
-    text = "The laboratory is left out, and look_alikes with it (Mitsuba is not installed)."
-    assert text in report.read_text() and not (tmp_path / "audit/renders").exists()
-    assert not (tmp_path / "audit/classifier/laboratory").exists()
-    for label in CLASSES:
-        (tmp_path / "lab" / label).mkdir(parents=True)
-        Image.new("RGB", (8, 8), "black" if label == "orange" else "white").save(tmp_path / "lab" / label / "a.png")
-    folders = {"look_alikes": [], "laboratory": str(tmp_path / "lab"), "out": str(tmp_path / "ready")}
-    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: brightness(0.5, {"a": 8, "larger": 12}[name]))
-    monkeypatch.setattr(
-        audit, "transfers", lambda *arguments: {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}
-    )
-    report = run_audit(AuditSettings(**given | folders, hardened="larger")).read_text()
-    assert text not in report and "The networks take images of 8 and 12 pixels" in report
-    summary = json.loads((tmp_path / "ready/classifier/laboratory/summary.json").read_text())
-    assert summary["recall"]["value"] == 1 and summary["false_positive_rate"]["value"] == 0
+        def missing() -> None:
+            raise InputError("Mitsuba is not installed")
+
+        counts = {"n": 2, "correct": 2}
+        for method in ("adversarial", "random"):
+            counts[method] = [0, 0, 0, 0]
+            counts[f"{method}_without_noise"] = [0, 0, 0, 0]
+        recognized = {"uniform": [True], "random 1": [True]}
+        transferred = {kind: {"first": [0, 0, 0], "further": [0, 0, 0]} for kind in KINDS}
+        monkeypatch.setattr(audit, "mitsuba", missing)
+        monkeypatch.setattr(audit, "recognized", lambda *arguments: recognized)
+        monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
+        monkeypatch.setattr(audit, "transfers", lambda *arguments: transferred)
+
+    def test_leaves_the_laboratory_out_and_says_so(self, given, tmp_path):
+        report = run_audit(AuditSettings(**given))
+        assert "The laboratory is left out, and look_alikes with it" in report.read_text()
+        assert not (tmp_path / "audit/renders").exists()
+        assert not (tmp_path / "audit/classifier/laboratory").exists()
+
+    def test_scores_a_folder_of_renders_instead(self, given, tmp_path):
+        for label, color in {"orange": "black", "other": "white"}.items():
+            (tmp_path / "lab" / label).mkdir(parents=True)
+            Image.new("RGB", (8, 8), color).save(tmp_path / "lab" / label / "a.png")
+        given |= {"look_alikes": [], "laboratory": str(tmp_path / "lab")}
+        settings = AuditSettings(**given, hardened="dark in larger images")
+        report = run_audit(settings).read_text()
+        assert "The laboratory is left out" not in report
+        assert "The networks take images of 8 and 12 pixels" in report
+        summary = json.loads((tmp_path / "audit/classifier/laboratory/summary.json").read_text())
+        assert summary["recall"]["value"] == 1
+        assert summary["false_positive_rate"]["value"] == 0
+
+
+ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"label": "pear"}, "'pear' is not a class of the model"),
-        ({"meshes": []}, "meshes is empty: name one mesh"),
-        (
-            {"look_alikes": [{"mesh": "solid:pear", "label": "orange"}]},
-            "look_alikes: solid:pear is of the class orange",
-        ),
+        ({"meshes": []}, "meshes is empty"),
+        ({"look_alikes": [ORANGE_PEAR]}, "look_alikes: solid:pear is of the class orange"),
         ({"look_alikes": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
-        ({"laboratory": "nowhere"}, "look_alikes are rendered instead of laboratory=nowhere"),
+        ({"laboratory": "nowhere"}, "laboratory=nowhere"),
     ],
 )
-def test_what_cannot_be_audited_is_refused_before_anything_is_written(given, tmp_path, changes, message):
+def test_what_cannot_be_audited_is_refused_before_anything_is_written(
+    given, tmp_path, changes, message
+):
     with pytest.raises(InputError, match=message):
         run_audit(AuditSettings(**given | changes))
     assert not (tmp_path / "audit").exists()
 
 
+def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None:
+    """Write what the answer of an audit is computed from.
+
+    Args:
+        folder: Folder of the classifier in the audit.
+        hits: Number of views, and of photographs, that are recognized.
+        n: Number of views, and of photographs.
+        adversarial: Number of 4 views that attacks change, by radius.
+    """
+    is_recognized = [True] * hits + [False] * (n - hits)
+    recognized = {"uniform": is_recognized, "random 1": is_recognized}
+    (folder / page.RECOGNIZED).write_text(json.dumps(recognized))
+    for kind in KINDS:
+        counts = {"correct": 4, "adversarial": adversarial}
+        (folder / f"{kind}.json").write_text(json.dumps(counts))
+    scores = {
+        "recall": asdict(page.fraction(hits, n)),
+        "false_positive_rate": asdict(page.fraction(0, n)),
+    }
+    (folder / page.LABORATORY).mkdir()
+    (folder / page.LABORATORY / "summary.json").write_text(json.dumps(scores))
+
+
 @pytest.mark.parametrize(
-    ("hits", "answer"), [(400, "Yes"), (9, "No fault is shown, but"), (200, "No: it recognizes 50%")]
+    ("hits", "n", "answer"),
+    [
+        (400, 400, "Yes"),
+        (9, 9, "No fault is shown, but"),
+        (200, 400, "No: it recognizes 50%"),
+    ],
 )
-def test_the_answer_is_yes_only_where_intervals_lie_above_what_is_called_safe(monkeypatch, hits, answer):
-    n = 400 if hits > 9 else 9
-    rate, none = page.fraction(hits, n), page.fraction(0, n)
-    views = [True] * hits + [False] * (n - hits)
-    parts = {page.RECOGNIZED: {"uniform": views, "random 1": views}}
-    parts |= {f"{kind}.json": {"correct": 4, "adversarial": [0, 0, 1, 1]} for kind in KINDS}
-    parts["summary.json"] = {"recall": asdict(rate), "false_positive_rate": asdict(none)}
-    monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
-    assert page._answer("orange", "a", Path(), ["laboratory"]).startswith(f"Is a safe in strange light? {answer}")
+def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
+    tmp_path, hits, n, answer
+):
+    write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
+    text = page._answer("orange", "dark", tmp_path, [page.LABORATORY])
+    assert text.startswith(f"Is dark safe in strange light? {answer}")
 
 
-def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(monkeypatch):
-    rate, views = page.fraction(400, 400), [True] * 400
-    parts = {page.RECOGNIZED: {"uniform": views, "random 1": views}}
-    parts |= {f"{kind}.json": {"correct": 4, "adversarial": [0, 1, 2, 4]} for kind in KINDS}
-    parts["summary.json"] = {"recall": asdict(rate), "false_positive_rate": asdict(page.fraction(0, 400))}
-    monkeypatch.setattr(page, "read_json", lambda path: parts[path.name])
-    answer = page._answer("orange", "a", Path(), ["laboratory"])
+def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):
+    write_parts(tmp_path, 400, 400, adversarial=[0, 1, 2, 4])
+    text = page._answer("orange", "dark", tmp_path, [page.LABORATORY])
     for light in KINDS.values():
-        assert f"{light.title} of radius {light.radii[2]:g} " in answer
+        assert f"{light.title} of radius {light.radii[2]:g} " in text
