@@ -1,4 +1,4 @@
-"""A folder with one small good file of every kind that the project reads, and a finished run in it."""
+"""A folder with a small good file of every kind that the project reads, and a finished run."""
 
 import contextlib
 import os

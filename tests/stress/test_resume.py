@@ -1,4 +1,4 @@
-"""Runs that are interrupted at random moments and resumed end like an uninterrupted run, bit for bit.
+"""Runs that are interrupted and resumed end like an uninterrupted run, bit for bit.
 
 By default, one run is killed. `-m slow` tries every signal, full disks and damaged files.
 """
@@ -146,7 +146,10 @@ def test_a_run_that_is_interrupted_three_times_is_resumed_to_the_same_end(
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="only Linux limits another process")
 @pytest.mark.parametrize("epoch", [1, 3, 6])
 def test_a_full_disk_is_an_error_in_one_sentence_and_the_run_is_resumed_later(
-    data, tmp_path, assert_resumed, epoch
+    data,
+    tmp_path,
+    assert_resumed,
+    epoch,
 ):
     process = start(data, tmp_path / "run", epoch)
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))

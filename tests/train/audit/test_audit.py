@@ -1,4 +1,4 @@
-"""The audit agrees with a scan of all radii and with closed forms, and continues if it was stopped."""
+"""The audit agrees with a scan of radii and closed forms, and continues if it was stopped."""
 
 import json
 from dataclasses import asdict, replace
@@ -87,7 +87,9 @@ def lamps_alone(monkeypatch) -> None:
 
 
 def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
-    views, tmp_path, lamps_alone
+    views,
+    tmp_path,
+    lamps_alone,
 ):
     views = replace(views, count=2)
     attacked = darker_than(0.5)
@@ -188,7 +190,11 @@ class TestAWholeAudit:
         assert summary["n"]["positives"] == summary["n"]["negatives"] == 2
 
     def test_continues_if_it_was_stopped_and_writes_the_same(
-        self, folder, given, monkeypatch, tmp_path
+        self,
+        folder,
+        given,
+        monkeypatch,
+        tmp_path,
     ):
         expected = results_of(folder)
         assert len(expected) > 15
@@ -265,7 +271,10 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
     ],
 )
 def test_what_cannot_be_audited_is_refused_before_anything_is_written(
-    given, tmp_path, changes, message
+    given,
+    tmp_path,
+    changes,
+    message,
 ):
     with pytest.raises(InputError, match=message):
         run_audit(AuditSettings(**given | changes))
@@ -304,7 +313,10 @@ def write_parts(folder: Path, hits: int, n: int, adversarial: list[int]) -> None
     ],
 )
 def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
-    tmp_path, hits, n, answer
+    tmp_path,
+    hits,
+    n,
+    answer,
 ):
     write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
     text = page._answer("orange", "dark", tmp_path, [page.LABORATORY])

@@ -141,10 +141,16 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(
-    ("command", "start"), MISTAKES, ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES]
+    ("command", "start"),
+    MISTAKES,
+    ids=[" ".join([c[0], *c[-2:]]) for c, _ in MISTAKES],
 )
 def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
-    call, here, capsys, command, start
+    call,
+    here,
+    capsys,
+    command,
+    start,
 ):
     before = sorted(here.rglob("*"))
     assert call(*command) == USER_ERROR
@@ -156,7 +162,9 @@ def test_a_mistake_is_an_error_in_one_line_before_anything_is_written(
 
 
 @pytest.mark.parametrize(
-    "command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0]
+    "command",
+    [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]],
+    ids=lambda given: given[0],
 )
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
     with sole_writer("out", here / "out"):
@@ -211,9 +219,15 @@ def photographed_cup(here) -> Path:
     light[0] += 0.2  # The light has no negative radiance.
     generator = torch.Generator().manual_seed(0)
     background = torch.rand(3, size, size, generator=generator).double()
-    photograph = renderer.render(mesh, camera, light, size, background, samples=4, encoding="srgb")[
-        0
-    ]
+    photograph = renderer.render(
+        mesh,
+        camera,
+        light,
+        size,
+        background,
+        samples=4,
+        encoding="srgb",
+    )[0]
     white_behind_black = renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0]
     Image.fromarray(to_pixels(photograph)).save(here / "photo.png")
     Image.fromarray(to_pixels(1 - white_behind_black)).save(here / "mask.png")
@@ -239,7 +253,9 @@ def test_a_fit_without_a_usable_mask_is_refused(call, photographed_cup, capsys, 
 
 @pytest.mark.slow
 def test_a_scene_that_was_fitted_is_rendered_and_scored_as_it_was_photographed(
-    call, photographed_cup, capsys
+    call,
+    photographed_cup,
+    capsys,
 ):
     assert call(*FIT, "mask=mask.png") == 0
     output = capsys.readouterr().out

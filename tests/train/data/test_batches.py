@@ -59,7 +59,8 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_fli
 
 
 @pytest.mark.parametrize(
-    ("size", "largest_shift", "count"), [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)]
+    ("size", "largest_shift", "count"),
+    [(11, PADDING, 6000), (65, PADDING, 1200), (129, 8, 1500)],
 )
 def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift, count):
     # The first two channels of a pixel are its row and its column.

@@ -196,7 +196,9 @@ def test_runs_that_cannot_be_read_are_named_in_the_page(tmp_path):
 
 
 def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_training(
-    finished, tmp_path, monkeypatch
+    finished,
+    tmp_path,
+    monkeypatch,
 ):
     monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
     first, *_, last = report_of([finished], tmp_path).strip().splitlines()
@@ -222,7 +224,10 @@ def browser():
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
 def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dark(
-    page, browser, width, scheme
+    page,
+    browser,
+    width,
+    scheme,
 ):
     view = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
     urls = []

@@ -56,7 +56,8 @@ def test_recall_at_a_rate_is_that_at_the_lowest_threshold_within_the_rate(positi
 @pytest.mark.parametrize("image_count", [1, 3])
 @pytest.mark.parametrize("name", ["auc", "recall_at/0.10"])
 def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_image_repeats(
-    name, image_count
+    name,
+    image_count,
 ):
     """Compare up to chance.
 
@@ -76,7 +77,9 @@ def test_intervals_are_those_of_scipys_bootstrap_over_objects_however_often_an_i
     ).confidence_interval
 
     statistic = partial(
-        auc_and_recalls, positives.repeat(image_count), negatives.repeat(image_count)
+        auc_and_recalls,
+        positives.repeat(image_count),
+        negatives.repeat(image_count),
     )
     objects = [np.arange(count).repeat(image_count) for count in (80, 120)]
     replicates = bootstrap(statistic, *objects)[column]
