@@ -317,7 +317,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     local_lights = []
     for name in description["local_lights"]:
         path = folder / f"{Path(name).name}.json"
-        local_lights.append(read_light(path, *LOCAL_LIGHTS))
+        local_lights.append(read_light(path, *LOCAL_LIGHTS.values()))
     sky = load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
     background = description["background"]

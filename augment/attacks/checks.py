@@ -261,9 +261,8 @@ def require_transferable(
     Raises:
         InputError: If a parameter belongs to its view or its mesh alone.
     """
-    kinds = [parameter_class(name) for name in parameters]
-    of_view = [kind.name for kind in kinds if not kind.fits_other_views]
-    of_mesh = [kind.name for kind in kinds if not kind.fits_other_meshes]
+    of_view = [name for name in parameters if not parameter_class(name).fits_other_views]
+    of_mesh = [name for name in parameters if not parameter_class(name).fits_other_meshes]
     for argument, elsewhere, bound in (
         ("azimuths", azimuths, of_view),
         ("meshes", objects, of_mesh),

@@ -201,7 +201,7 @@ def _build_lights(
     """
     if isinstance(environment, str | Path):
         environment = load_light(environment, degree, roughness)
-    local_settings = [getattr(settings, kind.name) for kind in LOCAL_LIGHTS]
+    local_settings = [getattr(settings, name) for name in LOCAL_LIGHTS]
     local = [build_local_light(light) for light in local_settings if light is not None]
     return with_local_lights(environment * settings.exposure, local)
 
@@ -219,7 +219,7 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
         InputError: If a file cannot be read, or if a value does not fit the
             others.
     """
-    [kind] = [kind for kind in LOCAL_LIGHTS if type(settings) is LOCAL_LIGHT_SETTINGS[kind.name]]
+    [kind] = [kind for name, kind in LOCAL_LIGHTS.items() if type(settings) is LOCAL_LIGHT_SETTINGS[name]]
     return kind.from_settings(settings)
 
 

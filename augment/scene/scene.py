@@ -355,7 +355,9 @@ class Scene:
 
     def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
         """Give the layers of all other light by operators, and add the lamps image by image."""
-        where, lamps = next(part for part in self.basis.local_lights if part.basis.is_movable)
+        movable_light = self.basis.movable_light
+        assert movable_light is not None
+        where, lamps = movable_light
         other_light = light.clone()
         other_light[:, where] = 0
         numbers = torch.arange(len(light) * self.views, device=light.device)

@@ -64,6 +64,11 @@ class Basis(ABC):
         """The lights within the scene, in the order of their coefficients."""
         return []
 
+    @property
+    def movable_light(self) -> LocalPart | None:
+        """The first of the lights within the scene that can be moved, None without one."""
+        return next((part for part in self.local_lights if part.basis.is_movable), None)
+
     @abstractmethod
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Project coefficients (..., size, 3) to those of light that can be emitted."""
@@ -162,7 +167,8 @@ class LocalBasis(Basis):
     Attributes:
         name: Name of this kind of light, in files, settings and messages.
         allow_negative: Whether coefficients may be negative.
-        is_movable: Whether `connect` and `moved` take other positions.
+        is_movable: Whether `connect` and `moved` take other positions than
+            `source_positions`.
         power: The largest coefficient. The smallest is 0.
     """
 
@@ -186,6 +192,10 @@ class LocalBasis(Basis):
         Raises:
             InputError: If a setting is out of range.
         """
+
+    def source_positions(self) -> Tensor:
+        """Return the positions (L, 3) of the sources of a movable light."""
+        raise NotImplementedError
 
     @abstractmethod
     def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:

@@ -95,6 +95,9 @@ class Lamps(LocalBasis):
     def size(self) -> int:
         return len(self.positions)
 
+    def source_positions(self) -> Tensor:
+        return torch.tensor(self.positions)
+
     def moved(self, positions: Tensor) -> Self:
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 

@@ -2,8 +2,8 @@
 
 Each quantity is a subclass of `Parameter`. The class `Pose` of the quantity
 "pose" is in the module `pose`, and `ParameterSettings` has the field `pose` for
-its settings. An attack can change several quantities at once (see
-`augment.attacks.problem`).
+its settings. `LocalLight` stands for the coefficients of any kind of local light.
+An attack can change several quantities at once (see `augment.attacks.problem`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from augment.attacks.parameters.local_light import LocalLight
 from augment.parameter_settings import PARAMETER_NAMES
 from renderer.errors import require_choice
+from renderer.light.local_lights import LOCAL_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,12 +31,14 @@ def parameter_class(name: str) -> type[Parameter]:
         name: Name of the quantity, such as "pose".
 
     Returns:
-        The class, such as `Pose`.
+        The class, such as `Pose`, or `LocalLight` for a kind of local light.
 
     Raises:
         InputError: If there is no such quantity.
     """
     require_choice("name", name, PARAMETER_NAMES)
+    if name in LOCAL_LIGHTS:
+        return LocalLight
     module = import_module(f"{__name__}.{name}")
     kind: type[Parameter] = getattr(module, name.capitalize())
     return kind
@@ -58,5 +62,7 @@ def make_parameter(name: str, scene: Scene, settings: StepSettings, **options: A
         InputError: If there is no such quantity, or if the scene lacks what is
             to be changed.
     """
+    if name in LOCAL_LIGHTS:
+        return LocalLight(scene, settings, name)
     constructor: Callable[..., Parameter] = parameter_class(name)
     return constructor(scene, settings, **options)

@@ -9,7 +9,6 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
-from renderer.errors import InputError
 from renderer.light.ball import Ball
 from renderer.light.basis import Harmonics, LocalBasis, parts_of
 
@@ -74,35 +73,6 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
     # The environment lighting comes first, before projector and lamps.
     first_light, *_ = parts_of(scene.basis)
     return first_light
-
-
-def find_light(
-    scene: Scene,
-    light_name: str,
-    parameter_name: str,
-) -> tuple[slice, Harmonics | LocalBasis]:
-    """Find a light of a scene by the name of its basis.
-
-    Args:
-        scene: Scene to attack.
-        light_name: Name of the basis of the light, such as "lamps".
-        parameter_name: Name of the attacked parameter. It appears in the error
-            message.
-
-    Returns:
-        Rows of the light among the coefficients of all lights of the scene, and
-        its basis.
-
-    Raises:
-        InputError: If the scene has no light with this name.
-    """
-    for rows, basis in parts_of(scene.basis):
-        if basis.name == light_name:
-            return rows, basis
-    raise InputError(
-        f"{parameter_name}: the scene has no {light_name}: build it with {light_name}=...",
-        parameter_name,
-    )
 
 
 def replace_light(conditions: Conditions, rows: slice, coefficients: Tensor) -> Conditions:

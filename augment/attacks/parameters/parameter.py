@@ -22,8 +22,7 @@ class Parameter(ABC):
     `domain`.
 
     Attributes:
-        name: Name of the quantity in settings, messages and files. It is also
-            the name of the module.
+        name: Name of the quantity in settings, messages and files.
         fits_other_meshes: Whether the values can be given to another mesh.
         fits_other_views: Whether the values can be given to another view.
         settings: Norm-ball and steps of the attack.
@@ -34,7 +33,7 @@ class Parameter(ABC):
             uses all values.
     """
 
-    name: ClassVar[str]
+    name: str
     fits_other_meshes: ClassVar[bool] = True
     fits_other_views: ClassVar[bool] = True
 

@@ -2,15 +2,14 @@
 
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
-from augment.attacks.parameters.light_parameter import find_light
 from augment.attacks.parameters.parameter import Parameter
 from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
-from renderer.light.lamps import Lamps
+from renderer.errors import InputError
+from renderer.light.local_lights import LOCAL_LIGHTS
 
 
 class Positions(Parameter):
@@ -30,10 +29,12 @@ class Positions(Parameter):
     name = "positions"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        _, lamps = find_light(scene, Lamps.name, self.name)
-        assert isinstance(lamps, Lamps)
+        light = scene.basis.movable_light
+        if light is None:
+            kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
+            raise InputError(f"{self.name}: the scene has no {kinds}: build it with {kinds}=...", self.name)
         # Shape (L, 3) for L lamps. All examples start at the same positions.
-        positions = torch.tensor(lamps.positions).to(scene.lights)
+        positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:

@@ -35,7 +35,7 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
     return augment.build_scene([(solid, "orange")], size, 2, rasterizer="numpy", **lights)
 
 
-@pytest.mark.parametrize("kind", LOCAL_LIGHTS)
+@pytest.mark.parametrize("kind", LOCAL_LIGHTS.values())
 def test_each_kind_of_local_light_has_settings_an_attack_and_a_file(kind, tmp_path):
     basis, coefficients = build_local_light(LOCAL_LIGHT_SETTINGS[kind.name]())
     assert type(basis) is kind and coefficients.shape == (basis.size, 3)
@@ -43,7 +43,7 @@ def test_each_kind_of_local_light_has_settings_an_attack_and_a_file(kind, tmp_pa
     assert kind.name in {item.name for item in fields(augment.AttackSettings)}
     given = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0))
     save_light(tmp_path / "light.json", given, basis)
-    found, values = read_light(tmp_path / "light.json", *LOCAL_LIGHTS)
+    found, values = read_light(tmp_path / "light.json", *LOCAL_LIGHTS.values())
     assert found == basis and torch.equal(values, given)
 
 
