@@ -22,7 +22,7 @@ from renderer.io.files import remove_unfinished, write_whole
 from renderer.io.images import write_image
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
-from train.evaluation.scores.metrics import AT_THRESHOLD, RANKED, Metrics, Pool, Pooled, metric_title, thresholds
+from train.evaluation.scores.metrics import COUNTED, RANKED, Metrics, Pool, Pooled, metric_title, thresholds
 from train.evaluation.scores.predictions import PREDICTIONS, FolderPredictions, Prediction, Predictor, write_predictions
 from train.evaluation.scores.sheet import contact_sheet, write_roc
 from train.evaluation.tables import Proportion, Table, format_fraction, format_interval, fraction
@@ -32,9 +32,6 @@ SUMMARY = "summary.json"
 CONTACT_SHEET = "contact_sheet.png"
 # Number of wrong classes that are named for each class, the most common ones.
 WRONG_CLASSES = 5
-# Names of the metrics that are fractions of images, as the first table shows
-# them.
-COUNTED = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
 # Words after the number of other things, if there are several labels.
 COUNTED_EACH = ", once for each of these classes"
 
