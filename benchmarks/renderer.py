@@ -316,7 +316,7 @@ PANELS = {
     ),
 }
 
-# Names of the contenders that are the renderer's defaults, with SAMPLES.
+# Names of the contenders that are the renderer's defaults but for SAMPLES.
 DEFAULT_SETTINGS = {
     "operator",
     f"degree {DEGREE}, float32",

@@ -31,8 +31,8 @@ from renderer.transport.operators import TransferOperator, build_operators
 from renderer.visibility.fragments import Fragments, build_fragments
 from renderer.visibility.rasterizers import Rasterizer
 
-# Samples per side of a pixel that the renderer takes by default.
-SAMPLES = ImageSettings().samples
+# Samples per side of a pixel in training with the paper's settings.
+SAMPLES = 8
 ALBEDO = (0.8, 0.5, 0.3)
 CAMERA = OrthographicCamera(math.degrees(1.0), math.degrees(0.5), 2.4)
 # Gray value of the background.

@@ -18,7 +18,7 @@ from renderer.geometry.shapes import sphere
 from renderer.image import as_background, composite
 from renderer.light.basis import HARMONICS, Basis, LocalBasis, SplitLight, split_light
 from renderer.light.harmonics import degree_of
-from renderer.settings import DEFAULT_SAMPLES, RASTERIZERS, ImageSettings, samples_per_side
+from renderer.settings import RASTERIZERS, ImageSettings, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import face_albedo, surface_albedo
@@ -192,7 +192,7 @@ def precompute_transfer(
     *,
     albedo_scale: float = 1.0,
     gloss: Gloss | None = None,
-    samples: int = DEFAULT_SAMPLES,
+    samples: int = ImageSettings.samples,
     encoding: str = "linear",
     normals: str = "smooth",
     shadows: bool = False,

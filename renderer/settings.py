@@ -38,7 +38,6 @@ RASTERIZERS = ("auto", "opengl", "numba", "numpy")
 MAX_BOUNCES = 100
 MAX_SIZE = 4096  # pixels per side of an image
 MAX_SAMPLES_PER_ROW = 2**15  # samples in a row of an image, so at most a billion in all of it
-DEFAULT_SAMPLES = 2  # samples per side of a pixel
 SILHOUETTE_SAMPLES = 8  # the default if gradients include visibility changes at silhouettes
 MAX_SAMPLES = 64  # samples per side of a pixel, which resolve its coverage to 1/4096
 MAX_DEGREE = 40  # spherical-harmonic degree of lighting, enough for reflections at MIN_ROUGHNESS
@@ -360,7 +359,7 @@ class ImageSettings(Settings):
 
     size: int = setting(32, "Pixels per side.", minimum=1, maximum=MAX_SAMPLES_PER_ROW)
     samples: int = setting(
-        8,
+        2,
         "Samples per side of a pixel. With 2, each pixel has 4 samples.",
         minimum=1,
         maximum=MAX_SAMPLES,
@@ -411,4 +410,4 @@ def samples_per_side(samples: int | None, silhouettes: bool) -> int:
     """
     if samples is not None:
         return samples
-    return SILHOUETTE_SAMPLES if silhouettes else DEFAULT_SAMPLES
+    return SILHOUETTE_SAMPLES if silhouettes else ImageSettings.samples

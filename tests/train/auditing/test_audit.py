@@ -16,10 +16,10 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
-from train.audit import audit, lights
-from train.audit import audit_page as page
-from train.audit.audit import run_audit
-from train.audit.lights import KINDS, Views, adversaries, success_by_light, transfers
+from train.auditing import audit, lights
+from train.auditing import audit_page as page
+from train.auditing.audit import run_audit
+from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfers
 from train.command_settings import AuditSettings
 from train.evaluation.laboratory import lab_patterns as patterns
 

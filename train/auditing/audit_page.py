@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.audit.lights import FURTHER, KINDS, RANDOM, SIDE, STEPS
+from train.auditing.lights import FURTHER, KINDS, RANDOM, SIDE, STEPS
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -25,9 +25,9 @@ HARDENED = "hardened"
 # Parts of a network that are scored on a folder of images.
 LABORATORY = "laboratory"
 PHOTOGRAPHS = "photographs"
-# File of `train.audit.lights.recognized` in the folder of a network.
+# File of `train.auditing.lights.recognized` in the folder of a network.
 RECOGNIZED = "recognized.json"
-# File of `train.audit.lights.transfers` in the folder of a network.
+# File of `train.auditing.lights.transfers` in the folder of a network.
 TRANSFER = "transfer.json"
 # Number of images in a gallery of the worst images.
 WORST = 10

@@ -3,7 +3,7 @@
 An audit has many parts, such as the attacks on one network with one kind of
 lighting. Each part is measured once, and its file is written completely or not
 at all. An audit that was stopped therefore continues with the first missing
-part. `train.audit.audit_page` reads the files and writes the report.
+part. `train.auditing.audit_page` reads the files and writes the report.
 """
 
 import json
@@ -25,8 +25,8 @@ from renderer.io.files import write_whole
 from renderer.light.presets import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
-from train.audit import audit_page as page
-from train.audit.lights import KINDS, Views, recognized, success_by_light, transfers
+from train.auditing import audit_page as page
+from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfers
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.commands.results import RESULTS, require_replaceable
