@@ -60,6 +60,7 @@ from renderer import save_light as save_light
 from renderer import skylight as skylight
 from renderer import solid as solid
 from renderer import subdivide as subdivide
+from train import AuditReport as AuditReport
 from train import AuditSettings as AuditSettings
 from train import DataSettings as DataSettings
 from train import EvaluateSettings as EvaluateSettings
@@ -69,6 +70,9 @@ from train import LabSettings as LabSettings
 from train import ModelSettings as ModelSettings
 from train import TrainingSceneSettings as TrainingSceneSettings
 from train import TrainSettings as TrainSettings
+from train import audit as audit
+from train import evaluate as evaluate
+from train import load as load
 from train import load_run as load_run
 
 __version__: str

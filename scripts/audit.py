@@ -7,7 +7,7 @@ from train.help import HelpText
 main = Command(
     name="audit",
     settings=AuditSettings,
-    body="train.auditing.audit:audit",
+    body="train.commands.audit:audit",
     help=HelpText(
         about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
         "An audit that was stopped continues with the same settings, and with hardened= or photos= "

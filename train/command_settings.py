@@ -24,6 +24,7 @@ from renderer.settings import (
 )
 from train.settings import GROUPS, MAX_IMAGES, MAX_SEED, TIME_FOLDER, label_names
 
+ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")  # of an audit
 RENDERERS = ("reload", "mitsuba")  # of written adversaries
 LAMP_POWER = 2.0  # of the default lamps if only their positions are attacked
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
@@ -281,9 +282,7 @@ class AuditSettings(Settings):
     laboratory: str | None = setting(
         None, "Such a folder of renders. null: it is made of the meshes if Mitsuba is installed."
     )
-    environments: list[str] = setting(
-        ["grace", "eucalyptus", "st_peters"], "Environment lightings, or maps (.hdr ...)."
-    )
+    environments: list[str] = setting([*ENVIRONMENTS], "Environment lightings, or maps (.hdr ...).")
     budget: float = setting(
         1.0,
         "Factor of the number of views, lightings and renders. "

@@ -266,7 +266,7 @@ def attack(
     size = scene.settings.size
     device = scene.lights.device
     with gradient_flags_kept(classifier):
-        adapted = as_classifier(classifier, size, classes, normalization, value_range, device)
+        adapted = as_classifier(classifier, size, classes, normalization, value_range, device, "classifier")
         return _attack(adapted, scene, target, settings, seed, force)
 
 

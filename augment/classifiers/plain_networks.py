@@ -22,21 +22,26 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 COLORS = 3
 UNIT_RANGE = (0.0, 1.0)
+# Pixels per side of the images of most networks that were trained on ImageNet.
+USUAL_SIZE = 224
 # Images of the call that checks a network. Two tell probabilities from logits.
 CHECKED_COUNT = 2
 # Names of the modules of torchvision, kornia and this library that normalize.
 NORMALIZING = frozenset({"Normalize", "Normalized"})
+# Names of the buffers with which networks normalize images themselves.
+MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 
 
 def as_classifier(
     network: Classifier | Callable[[Tensor], Tensor],
-    size: int,
+    size: int | None = None,
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
-    device: torch.device | str = "cpu",
+    device: torch.device | str | None = None,
+    argument: str = "network",
 ) -> Classifier:
     """Make a classifier of a plain network, and check it on gray images.
 
@@ -44,7 +49,7 @@ def as_classifier(
         network: A classifier, which is returned as it is, or a network from
             images to logits: a `torch.nn.Module` in evaluation mode, or a
             function.
-        size: Pixels per side of the images.
+        size: Pixels per side of the images. None for 224.
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
         normalization: "imagenet", or mean and standard deviation of the
@@ -52,7 +57,8 @@ def as_classifier(
             network takes images as they are, or normalizes them itself.
         value_range: Values of black and white that the network takes before
             normalization, such as (0, 255) or (-1, 1).
-        device: Device of the images.
+        device: Device of the images. None for that of the network.
+        argument: Name of the argument `network` of the caller, for errors.
 
     Returns:
         The classifier. It contains the network itself.
@@ -75,18 +81,27 @@ def as_classifier(
                 "leave them out, because a Classifier has its own"
             )
         return network
-    require_kind("classifier", network, Callable, "a torch.nn.Module, a function to logits, or a Classifier")
+    require_kind(argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier")
     names = None if classes is None else as_class_names("classes", classes)
     if isinstance(network, nn.Module) and network.training:
-        raise InputError("classifier is a network in training mode: call its eval() first")
+        raise InputError(f"{argument} is a network in training mode: call its eval() first")
+    size = USUAL_SIZE if size is None else size
+    device = device_of(network) if device is None else device
     function = _preprocessed(network, normalization, value_range).to(device)
-    count = _count_outputs(function, size, device)
+    count = _count_outputs(function, size, device, argument)
     if names is not None and len(names) != count:
         raise InputError(
             f"classes has {len(names)} names, and the network returns {count} outputs: give one name per output"
         )
     name = type(network).__name__
     return Classifier(function, size, names or [str(index) for index in range(count)], name)
+
+
+def device_of(network: object) -> torch.device:
+    """Return the device of the parameters of a network. It is the CPU if there are none."""
+    parameters = network.parameters() if isinstance(network, nn.Module) else iter(())
+    first = next(parameters, None)
+    return torch.device("cpu") if first is None else first.device
 
 
 @contextmanager
@@ -153,19 +168,20 @@ def _mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequen
 
 def _require_no_normalization(network: nn.Module) -> None:
     """Raise InputError if a network contains a module that normalizes images."""
-    for module in network.modules():
-        kind = type(module).__name__
-        if kind in NORMALIZING:
-            raise InputError(
-                f"normalization is given, and the network contains {kind}, so that images would "
-                "be normalized twice: leave normalization out"
-            )
+    kinds = {type(module).__name__ for module in network.modules()}
+    buffers = {name for name, _ in network.named_buffers() if name.rpartition(".")[2] in MEANS}
+    found = sorted(kinds & NORMALIZING) + sorted(buffers)
+    if found:
+        raise InputError(
+            f"normalization is given, and the network contains {found[0]}, so that images would "
+            "be normalized twice: leave normalization out"
+        )
 
 
 @torch.no_grad()
-def _count_outputs(network: nn.Module, size: int, device: torch.device | str) -> int:
+def _count_outputs(network: nn.Module, size: int, device: torch.device | str, argument: str) -> int:
     """Call a network on gray images, and return the number of its outputs."""
     shades = torch.linspace(0.3, 0.7, CHECKED_COUNT, device=device)
     images = shades.view(-1, 1, 1, 1).expand(-1, COLORS, size, size)
-    call = NetworkCall("classifier")
+    call = NetworkCall(argument)
     return call(network, images.contiguous()).shape[1]

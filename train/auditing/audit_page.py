@@ -79,7 +79,7 @@ def write_audit_page(
         correct=correct,
         pictures=_attack_pictures(paths, counts),
         transfers=transfers,
-        answers=[_answer(label, name, path, folders) for name, path in paths.items()],
+        answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
@@ -140,8 +140,18 @@ class Finding(NamedTuple):
     least: float
 
 
-def _answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
-    """Say whether a network is safe in unusual lighting, and why it is not."""
+def write_answer(label: str, name: str, folder: Path, parts: Collection[str]) -> str:
+    """Say whether a network is safe in unusual lighting, and why it is not.
+
+    Args:
+        label: Class whose objects were tested.
+        name: Name of the network.
+        folder: Folder of the parts of the network.
+        parts: Names of the parts that are scored on images.
+
+    Returns:
+        A question and its answer.
+    """
     findings = _find_rates(label, folder, parts)
     faults = [finding.text for finding in findings if finding.right < SAFE]
     faults += _attack_faults(folder)

@@ -161,6 +161,30 @@ def _require_files_of_rows(
     _warn_once(problem)
 
 
+def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
+    """List the classes that have a sub-folder.
+
+    Args:
+        folder: The folder.
+        classes: The names of the network's classes.
+
+    Returns:
+        The names of the classes, sorted.
+
+    Raises:
+        InputError: The folder is missing.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: name a folder of photographs")
+    return [name for name in _folder_names(folder) if name in classes]
+
+
+def _folder_names(folder: Path) -> list[str]:
+    """Return the names of the folders in a folder, sorted, without hidden ones."""
+    folders = [entry.name for entry in folder.iterdir() if entry.is_dir()]
+    return sorted(name for name in folders if not is_hidden(name))
+
+
 def find_unlabeled(folder: Path) -> list[Photograph]:
     """Find all images of a folder and its sub-folders. They have no class.
 
@@ -252,7 +276,7 @@ def _has_class_folders(
     Raise InputError if no folder is a class, if a folder may be meant for a label, or if images
     lie beside folders.
     """
-    names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
+    names = _folder_names(folder)
     others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
     for name in others:
         if others == names or any(_is_like(name, label) for label in labels):

@@ -1,0 +1,9 @@
+"""pnb-audit: how safe a network is in unusual lighting."""
+
+from train.auditing.audit import run_audit
+from train.command_settings import AuditSettings
+
+
+def audit(settings: AuditSettings) -> None:
+    """Run the audit of pnb-audit, and print the path of its report."""
+    print(f"report: {run_audit(settings)}")

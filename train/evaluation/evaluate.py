@@ -1,0 +1,154 @@
+"""Scores of any network on a folder of photographs, in one call."""
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment.classifiers import Classifier
+from augment.classifiers.adapter import Label, OperatingPoint
+from augment.classifiers.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    device_of,
+    gradient_flags_kept,
+)
+from renderer.errors import InputError
+from renderer.validation import as_folder
+from train.command_settings import require_calibration
+from train.commands.results import require_replaceable
+from train.data.photographs import class_folders, require_outside
+from train.evaluation.scores import scoring
+from train.evaluation.scores.predictions import Predictor
+from train.evaluation.scores.scoring import Scores
+from train.runs.run_lock import sole_writer
+from train.settings import label_names, published
+from train.system.device import MixedPrecision, choose_precision
+from train.system.user_errors import renamed, writable_folder
+
+
+def evaluate(
+    network: Classifier | Callable[[Tensor], Tensor],
+    folder: str | Path,
+    label: str | int | Sequence[str | int] | None = None,
+    *,
+    classes: Sequence[str] | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    by: str = "source",
+    calibrate: str | Path | None = None,
+    false_positive_rate: float | None = None,
+    skip_unreadable: bool = False,
+    precision: str = "auto",
+    device: torch.device | str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> Scores:
+    """Score a network on the photographs of a folder.
+
+    Nothing is written unless `out` is given.
+
+    Args:
+        network: A classifier, or a plain network from images to logits, such as
+            a `torch.nn.Module`.
+        folder: Folder with a sub-folder of photographs for each class. Other
+            sub-folders show other things. "pretrained/laboratory" is installed.
+        label: Class under study, or several: names or indices. Recall counts
+            the photographs of a class that the network finds. None for all
+            classes that have a sub-folder.
+        classes: Names of the classes of a plain network, in the order of its
+            outputs. None for "0", "1" and so on.
+        size: Pixels per side of the images of a plain network. None for 224.
+        normalization: "imagenet", or mean and standard deviation, as `attack`
+            takes it.
+        value_range: Values of black and white that a plain network takes before
+            normalization.
+        by: "mesh" to score each object of photos.csv, too. Otherwise "source".
+        calibrate: Folder like `folder`, on which a threshold on the log-odds of
+            each label is chosen for `false_positive_rate`. None for the
+            thresholds that the network carries, if any.
+        false_positive_rate: False-positive rate of these thresholds, in (0, 1).
+        skip_unreadable: Whether to leave out photographs that cannot be read.
+        precision: "auto" (bfloat16 if the hardware computes in it), "bfloat16"
+            or "float32".
+        device: Device that computes. None for that of the network.
+        out: Folder to which tables and images of the scores are written.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        Scores. `overall` has the metrics of all photographs, `by_label` those
+        of each label, and `by_class` the recall of each class of the folder.
+
+    Raises:
+        InputError: If the network does not fit its arguments, if it lacks a
+            class, or if the photographs cannot be read.
+
+    Example:
+        >>> def logits(images):
+        ...     return images.mean((2, 3))
+        >>> classes = ["orange", "lemon", "pear"]
+        >>> folder = "pretrained/laboratory"
+        >>> scores = evaluate(logits, folder, "orange", classes=classes, size=8)
+        >>> scores.overall.recall.n
+        280
+    """
+    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    folder = published(as_folder("folder", folder))
+    device = device_of(network) if device is None else torch.device(device)
+    with gradient_flags_kept(network):
+        classifier = as_classifier(network, size, classes, normalization, value_range, device)
+        labels = _choose_labels(classifier, folder, label)
+        model = MixedPrecision(classifier.to(device), choose_precision(precision, device))
+        predictor = Predictor(model, classifier.classes, classifier.size, device)
+        target = None
+        if out is not None:
+            target = writable_folder(str(out), "out")
+            require_replaceable(target, "out", overwrite)
+            require_outside(target, folder)
+        with sole_writer("out", target) if target else nullcontext():
+            points = _points_of(classifier, labels)
+            if calibrate is not None and false_positive_rate is not None:
+                points = _choose_points(predictor, calibrate, labels, false_positive_rate, skip_unreadable)
+            answers = predictor.predict(folder, labels, skip_unreadable)
+            scores = scoring.score(answers, by, points)
+            if target:
+                scoring.write(scores, target)
+    return scores
+
+
+def _choose_labels(classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None) -> list[str]:
+    """Return the names of the classes under study."""
+    if label is not None:
+        return [classifier.classes[classifier.label(name)] for name in label_names(label)]
+    labels = class_folders(folder, classifier.classes)
+    if not labels:
+        known = ", ".join(classifier.classes[:3])
+        raise InputError(
+            f"folder={folder} has no sub-folder of a class of the network ({known}, ...): "
+            "name the sub-folders by classes, or give classes or label"
+        )
+    return labels
+
+
+def _points_of(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
+    """Return the operating points that a network carries, if it has one for each label."""
+    by_label = {point.label: point for point in classifier.operating_points}
+    has_all = by_label.keys() >= set(labels)
+    return [by_label[name] for name in labels] if has_all else []
+
+
+def _choose_points(
+    predictor: Predictor,
+    folder: str | Path,
+    labels: Label,
+    rate: float,
+    skip_unreadable: bool,
+) -> list[OperatingPoint]:
+    """Choose an operating point of each label on a folder of photographs."""
+    path = published(Path(folder))
+    with renamed(folder="calibrate"):
+        return scoring.choose_operating_points(predictor, path, labels, rate, skip_unreadable)

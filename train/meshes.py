@@ -1,0 +1,84 @@
+"""The meshes that callers name, as the settings take them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from augment.classifiers import Classifier
+from augment.settings import ObjectSettings
+from renderer.errors import InputError, describe
+from renderer.validation import as_list
+from train.settings import solid_name
+
+# What a caller names a mesh by: a file or solid:NAME, a pair of it and its
+# class, or settings.
+MeshItem = str | Path | tuple[str | Path, str | int] | ObjectSettings
+EXPECTED = (
+    "a list of files or solids such as 'solid:orange', of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
+)
+
+
+def as_mappings(name: str, meshes: Sequence[MeshItem], classifier: Classifier) -> list[dict[str, Any]]:
+    """Convert meshes to mappings with the fields of `ObjectSettings`.
+
+    Args:
+        name: Name of the argument, for errors.
+        meshes: Meshes, with or without their classes.
+        classifier: Classifier whose classes the labels name or count.
+
+    Returns:
+        The mappings. Without a class, a mapping has no key "label".
+
+    Raises:
+        InputError: If an item is something else, or if the classifier lacks a
+            class.
+    """
+    kinds = str | Path | tuple | list | ObjectSettings
+    mappings = []
+    for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
+        if isinstance(item, ObjectSettings):
+            mapping = asdict(item)
+        elif isinstance(item, str | Path):
+            mapping = {"mesh": str(item)}
+        elif len(item) == 2 and isinstance(item[0], str | Path):
+            mapping = {"mesh": str(item[0]), "label": item[1]}
+        else:
+            raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
+        if mapping.get("label", "") != "":
+            mapping["label"] = classifier.classes[classifier.label(mapping["label"])]
+        mappings.append(mapping)
+    return mappings
+
+
+def studied_classes(label: str | int | None, meshes: Sequence[dict[str, Any]], classifier: Classifier) -> list[str]:
+    """Return the classes under study.
+
+    Args:
+        label: A class, or None for those of the meshes.
+        meshes: Meshes as `as_mappings` returns them.
+        classifier: Classifier that has the classes.
+
+    Returns:
+        Names of the classes, each once, in the order of the meshes.
+
+    Raises:
+        InputError: If the classifier lacks the class, or if neither `label` nor
+            a mesh tells a class.
+    """
+    if label is not None:
+        return [classifier.classes[classifier.label(label)]]
+    return list(dict.fromkeys(_class_of(mesh, classifier) for mesh in meshes))
+
+
+def _class_of(mesh: dict[str, Any], classifier: Classifier) -> str:
+    """Return the class of a mesh: its label, or else the class that its name is."""
+    if mesh.get("label"):
+        return str(mesh["label"])
+    name = solid_name(mesh["mesh"]) or Path(mesh["mesh"]).stem
+    if name not in classifier.classes:
+        raise InputError(
+            f"label is not given, and {mesh['mesh']} is not named by a class of the network: "
+            "give label, or pairs of a mesh and its class"
+        )
+    return name

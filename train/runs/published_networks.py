@@ -1,0 +1,82 @@
+"""The published networks of the installation, each with its row of results."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from augment.classifiers import Classifier
+from renderer.errors import InputError
+from renderer.validation import require_kind
+from train.evaluation.scores.metrics import METRICS, read_metric
+from train.evaluation.tables import Estimate
+from train.runs.saved_networks import PUBLISHED, load_run, load_selected
+from train.settings import published
+
+# Folder of the published networks, in the installation or in a clone.
+PRETRAINED = Path("pretrained")
+# Name of the accuracy on the test images of CIFAR-100, among the scores.
+ACCURACY = "test/accuracy"
+
+
+class PublishedNetwork(Classifier):
+    """A published network with its row of results.
+
+    Attributes:
+        results: Metrics with their intervals by name: "test/accuracy" on the
+            test images of CIFAR-100, and on photographs "photographs/recall",
+            "photographs/false_positive_rate", "photographs/auc" and others.
+    """
+
+    results: Mapping[str, Estimate]
+
+
+def load(name: str) -> PublishedNetwork:
+    """Load a published network with its row of results.
+
+    Args:
+        name: "best", "adversarial", "random" or "none", as pretrained/README.md
+            describes them.
+
+    Returns:
+        The network, a classifier of images of 32 pixels per side.
+
+    Raises:
+        InputError: If there is no published network of this name.
+
+    Example:
+        >>> network = load("best")
+        >>> network.size, len(network.classes)
+        (32, 100)
+        >>> round(network.results["photographs/auc"].value, 3)
+        0.966
+    """
+    require_kind("name", name, str, "the name of a published network, such as 'best'")
+    names = published_names()
+    if name not in names:
+        known = ", ".join(names)
+        raise InputError(f"name={name!r} is no published network: choose one of {known}")
+    folder = published(PRETRAINED / name)
+    loaded = load_run(folder)
+    _, state = load_selected(folder)
+    network = PublishedNetwork(loaded.function, loaded.size, loaded.classes, name)
+    network.operating_points = loaded.operating_points
+    network.results = _read_results(state["scores"])
+    return network
+
+
+def published_names() -> list[str]:
+    """Return the names of the published networks, sorted."""
+    files = published(PRETRAINED).glob(f"*/{PUBLISHED}")
+    return sorted(path.parent.name for path in files)
+
+
+def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
+    """Read the accuracy, and the metrics on each folder of photographs, by name."""
+    results = {ACCURACY: Estimate(scores[ACCURACY])}
+    folders = {name: entry for name, entry in scores.items() if isinstance(entry, Mapping)}
+    for folder, entry in folders.items():
+        for metric in METRICS:
+            estimate = read_metric(entry, metric)
+            if estimate is not None:
+                results[f"{folder}/{metric}"] = estimate
+    return results
