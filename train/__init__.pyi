@@ -1,12 +1,12 @@
 import logging
 
-from train.auditing.audit import audit as audit
 from train.auditing.audit_report import AuditReport as AuditReport
 from train.command_settings import AuditSettings as AuditSettings
 from train.command_settings import EvaluateSettings as EvaluateSettings
 from train.command_settings import LabSettings as LabSettings
-from train.evaluation.evaluate import evaluate as evaluate
-from train.runs.published_networks import load as load
+from train.functions.audit import audit as audit
+from train.functions.evaluate import evaluate as evaluate
+from train.functions.load import load as load
 from train.runs.saved_networks import load_run as load_run
 from train.settings import DataSettings as DataSettings
 from train.settings import EvaluationSettings as EvaluationSettings

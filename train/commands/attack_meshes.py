@@ -30,7 +30,6 @@ from renderer.errors import InputError
 from renderer.visibility.rasterizers import Rasterizer
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
-from train.commands.results import require_replaceable
 from train.report.attack_tables import (
     FIGURE,
     TABLE,
@@ -41,6 +40,7 @@ from train.report.attack_tables import (
     write_sweeps,
     write_transfers,
 )
+from train.report.results import require_replaceable
 from train.runs.run_config import write_config
 from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from augment.classifiers import Classifier
 from train.command_settings import EvaluateSettings
-from train.evaluation.evaluate import evaluate as evaluate_network
 from train.evaluation.scores.scoring import format_scores
+from train.functions.evaluate import evaluate as evaluate_network
 from train.runs.saved_networks import load_network, load_run
 from train.settings import label_names
 from train.system.device import choose_device

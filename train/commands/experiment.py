@@ -15,10 +15,10 @@ from augment import distributed
 from augment.settings import ARMS
 from train import console
 from train.command import program, read_settings
-from train.commands.results import require_new_run
 from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import report_of
+from train.report.results import require_new_run
 from train.report.summary import summarize
 from train.runs import checkpoint
 from train.runs.run_config import CONFIG, given_command, require_same_run, resumed

@@ -19,7 +19,7 @@ from renderer.io.images import read_image, read_rgb, write_image
 from renderer.light.light_files import save_light
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings, FitSettings
 from train.commands.attack_meshes import build_attacked
-from train.commands.results import require_replaceable
+from train.report.results import require_replaceable
 from train.settings import read_object
 from train.system.user_errors import writable_folder
 

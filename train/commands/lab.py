@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from train.command_settings import LabSettings
-from train.commands.results import require_replaceable
 from train.evaluation.laboratory.laboratory import write_laboratory
+from train.report.results import require_replaceable
 
 
 def render_laboratory(settings: LabSettings) -> None:

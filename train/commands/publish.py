@@ -6,10 +6,10 @@ from typing import Any
 
 from augment.classifiers import Classifier
 from train.command_settings import PublishSettings
-from train.commands.results import require_replaceable
 from train.evaluation.scores import scoring
 from train.evaluation.scores.predictions import Predictor
 from train.networks import PYTHON
+from train.report.results import require_replaceable
 from train.report.summary import summarize
 from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published

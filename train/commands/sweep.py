@@ -24,10 +24,10 @@ from renderer.io.files import write_whole
 from train import console
 from train.command import quoted, read_settings
 from train.commands.experiment import LOG, logged_to
-from train.commands.results import require_new_run, require_replaceable
 from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import PAGE, report_of
+from train.report.results import require_new_run, require_replaceable
 from train.report.summary import is_finished, summarize
 from train.runs import checkpoint
 from train.runs.run_config import given_command, require_same_run

@@ -319,12 +319,12 @@ def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
     answer,
 ):
     write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
-    text = page._answer("orange", "dark", tmp_path, [page.LABORATORY])
+    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     assert text.startswith(f"Is dark safe in strange light? {answer}")
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):
     write_parts(tmp_path, 400, 400, adversarial=[0, 1, 2, 4])
-    text = page._answer("orange", "dark", tmp_path, [page.LABORATORY])
+    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     for light in KINDS.values():
         assert f"{light.title} of radius {light.radii[2]:g} " in text

@@ -28,10 +28,10 @@ RATES = ("0.05", "0.10", "0.20")
 RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
 # Names of the metrics that `Pool` computes only if it has thresholds: the
 # recall and the false-positive rate at these thresholds.
-AT_THRESHOLD = ("recall_at_threshold", "false_positive_rate_at_threshold")
+AT_THRESHOLD: tuple[str, ...] = ("recall_at_threshold", "false_positive_rate_at_threshold")
 # Names of the metrics that `Pool.outcomes` computes as fractions of images. The
 # table of an evaluation shows them in this order.
-COUNTED = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
+COUNTED: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
 # Names of the metrics that the tables of reports show, in this order. A slash
 # separates the keys of nested entries of summary.json.
 METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD)

@@ -1,0 +1,81 @@
+"""Any network is audited in one call, which returns the numbers of the page."""
+
+import json
+
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+import norm_balls as nb
+from train.auditing import audit as engine
+from train.auditing import lights
+
+SIZE = 8
+CLASSES = ["orange", "apple"]
+
+
+class Brightness(nn.Module):
+    """A network that calls an orange what is darker than a limit on average."""
+
+    def __init__(self):
+        super().__init__()
+        self.limit = nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, images: Tensor) -> Tensor:
+        excess = 100 * (images.mean((1, 2, 3)) - self.limit)
+        return torch.stack([-excess, excess], dim=1)
+
+
+@pytest.fixture
+def laboratory(tmp_path_factory) -> str:
+    """Write two gray images of each class, and return their folder."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    for name in CLASSES:
+        (folder / name).mkdir()
+        for shade in (60, 200):
+            Image.new("RGB", (SIZE, SIZE), (shade,) * 3).save(folder / name / f"{shade}.png")
+    return str(folder)
+
+
+@pytest.fixture
+def options(monkeypatch, laboratory) -> dict:
+    """Return arguments of an audit of a second."""
+    monkeypatch.setattr(lights, "STEPS", 2)
+    for kind in ("skylight", "projector", "lamps"):
+        monkeypatch.delitem(lights.KINDS, kind)
+    for name, count in {"VIEWS": 2, "ATTACKED": 2, "LIGHTS": 1}.items():
+        monkeypatch.setattr(engine, name, count)
+    return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
+
+
+def test_the_report_has_the_numbers_of_the_files(options, tmp_path):
+    network = Brightness().eval()
+    out = tmp_path / "audit"
+    report = nb.audit(network, ["solid:orange:0"], out=out, **options)
+    counts = json.loads((out / "classifier" / "lighting.json").read_text())
+    attack = report.network.attacks["lighting"]
+    assert [*attack.adversarial] == counts["adversarial"]
+    assert (attack.views, attack.correct) == (counts["n"], counts["correct"])
+    summary = json.loads((out / "classifier" / "laboratory" / "summary.json").read_text())
+    assert report.network.scores["laboratory"]["recall"].hits == summary["recall"]["hits"]
+    page = report.save(tmp_path / "pages" / "audit.html")
+    assert page.read_text() == (out / "report.html").read_text()
+    assert network.limit.requires_grad
+
+
+def test_nothing_is_written_without_a_folder(options, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    report = nb.audit(Brightness().eval(), [("solid:orange:0", 0)], **options)
+    assert report.label == "orange"
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_mesh_without_a_class_needs_a_label(options):
+    with pytest.raises(nb.InputError, match="label is not given"):
+        nb.audit(Brightness().eval(), ["solid:lemon"], **options)
+
+
+def test_a_class_that_the_network_lacks_is_refused_with_the_nearest(options):
+    with pytest.raises(nb.InputError, match="orange"):
+        nb.audit(Brightness().eval(), ["solid:orange"], label="ornage", **options)

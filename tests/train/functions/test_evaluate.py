@@ -1,0 +1,77 @@
+"""Any network is scored on class folders of photographs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+import norm_balls as nb
+
+SIZE = 8
+CLASSES = ["dark", "bright", "green"]
+# Gray values of the photographs of each class.
+SHADES = {"dark": [10, 20, 200, 30], "bright": [250, 40, 220]}
+
+
+@pytest.fixture
+def photographs(tmp_path) -> Path:
+    """Write one gray image for each of SHADES, and return the folder of the class folders."""
+    folder = tmp_path / "photographs"
+    for name, shades in SHADES.items():
+        (folder / name).mkdir(parents=True)
+        for index, shade in enumerate(shades):
+            pixels = np.full((SIZE, SIZE, 3), shade, np.uint8)
+            Image.fromarray(pixels).save(folder / name / f"{index}.png")
+    return folder
+
+
+class Brightness(nn.Module):
+    """A network that takes images in 0..255 and calls those above 127 bright."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, images: Tensor) -> Tensor:
+        excess = self.weight * (images.mean((1, 2, 3)) - 127)
+        return torch.stack([-excess, excess, torch.full_like(excess, -1000)], dim=1)
+
+
+OPTIONS = {"classes": CLASSES, "size": SIZE, "value_range": (0, 255), "precision": "float32"}
+
+
+def test_scores_count_the_photographs_of_each_class(photographs):
+    scores = nb.evaluate(Brightness().eval(), photographs, **OPTIONS)
+    assert (scores.by_class["dark"].recall.hits, scores.by_class["dark"].recall.n) == (3, 4)
+    assert (scores.by_class["bright"].recall.hits, scores.by_class["bright"].recall.n) == (2, 3)
+    assert (scores.overall.recall.hits, scores.overall.recall.n) == (5, 7)
+
+
+@pytest.mark.parametrize("label", ["bright", 1])
+def test_a_label_is_a_name_or_an_index(photographs, label):
+    scores = nb.evaluate(Brightness().eval(), photographs, label, **OPTIONS)
+    assert (scores.overall.recall.hits, scores.overall.recall.n) == (2, 3)
+    assert (scores.overall.false_positive_rate.hits, scores.overall.false_positive_rate.n) == (1, 4)
+
+
+def test_files_are_written_only_if_a_folder_is_given(photographs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    nb.evaluate(Brightness().eval(), photographs, **OPTIONS)
+    assert sorted(tmp_path.rglob("*")) == before
+    nb.evaluate(Brightness().eval(), photographs, out="scores", **OPTIONS)
+    assert (tmp_path / "scores" / "summary.json").is_file()
+
+
+def test_the_network_is_left_as_it_was(photographs):
+    network = Brightness().eval()
+    nb.evaluate(network, photographs, **OPTIONS)
+    assert network.weight.requires_grad and not network.training
+
+
+def test_folders_of_other_names_than_the_classes_are_explained(photographs):
+    with pytest.raises(nb.InputError, match="classes"):
+        nb.evaluate(Brightness().eval(), photographs, size=SIZE, value_range=(0, 255))

@@ -1,0 +1,118 @@
+"""An audit of any network in one call."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment.classifiers import Classifier
+from augment.classifiers.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    device_of,
+    gradient_flags_kept,
+)
+from renderer.errors import InputError
+from train.auditing import audit_page as page
+from train.auditing.audit import run_audit
+from train.auditing.audit_report import AuditReport, read_audit
+from train.command_settings import ENVIRONMENTS, AuditSettings
+from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.system.folders import folder_or_temporary
+
+
+def audit(
+    network: Classifier | Callable[[Tensor], Tensor],
+    meshes: Sequence[MeshItem],
+    label: str | int | None = None,
+    *,
+    hard_negatives: Sequence[MeshItem] = (),
+    hardened: Classifier | Callable[[Tensor], Tensor] | None = None,
+    classes: Sequence[str] | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    photographs: str | Path | None = None,
+    laboratory: str | Path | None = None,
+    environments: Sequence[str] = ENVIRONMENTS,
+    budget: float = 1.0,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> AuditReport:
+    """Measure how safe a network is in unusual lighting.
+
+    Nothing is written unless `out` is given.
+
+    Args:
+        network: A classifier, or a plain network from images to logits, such as
+            a `torch.nn.Module`.
+        meshes: Meshes of one class: files, solids such as "solid:orange", or
+            pairs of these and the class.
+        label: Class of the meshes, a name or an index. None if a mesh is in a
+            pair with its class, or is named by it.
+        hard_negatives: Meshes of other things in the same lighting, also with a
+            class or without. They are needed unless `laboratory` is given.
+        hardened: Another network of the same arguments to show beside it.
+        classes: Names of the classes of plain networks, in the order of their
+            outputs. None for "0", "1" and so on.
+        size: Pixels per side of the images of plain networks. None for 224.
+        normalization: "imagenet", or mean and standard deviation, as `attack`
+            takes it.
+        value_range: Values of black and white that plain networks take before
+            normalization.
+        photographs: Folder of photographs, as `evaluate` takes it.
+        laboratory: Such a folder of renders, as "pretrained/laboratory". None
+            if it is made of the meshes, for which Mitsuba is needed.
+        environments: Names of environment lightings, or files of maps.
+        budget: Factor of the number of views, lightings and renders. With 1, a
+            network of 224 pixels takes about 20 minutes on one core.
+        seed: Seed of all random draws.
+        device: Device that computes. None for that of the network.
+        out: Folder for the files of the audit.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        Report with all numbers. `save("audit.html")` writes it as a page.
+
+    Raises:
+        InputError: If an input cannot be read, or if a network lacks a class.
+
+    Example:
+        >>> report = audit(network, ["solid:orange"], laboratory="pretrained/laboratory",
+        ...     classes=["orange", "apple"], size=32)  # doctest: +SKIP
+        >>> report.network.attacks["lamps"].adversarial  # doctest: +SKIP
+        (0, 1, 5, 12)
+    """
+    device = device_of(network) if device is None else device
+    options = (size, classes, normalization, value_range, device)
+    with gradient_flags_kept(network), gradient_flags_kept(hardened):
+        networks = {page.CLASSIFIER: as_classifier(network, *options)}
+        if hardened is not None:
+            networks[page.HARDENED] = as_classifier(hardened, *options, argument="hardened")
+        classifier = networks[page.CLASSIFIER]
+        items = as_mappings("meshes", meshes, classifier)
+        studied = studied_classes(label, items, classifier)
+        if len(studied) > 1:
+            raise InputError(f"meshes are of several classes ({', '.join(studied)}): give one")
+        with folder_or_temporary(out) as folder:
+            settings = AuditSettings(
+                classifier=classifier.name,
+                label=studied[0],
+                meshes=items,
+                look_alikes=as_mappings("hard_negatives", hard_negatives, classifier),
+                photos=None if photographs is None else str(photographs),
+                laboratory=None if laboratory is None else str(laboratory),
+                environments=[*environments],
+                budget=budget,
+                seed=seed,
+                device=str(device),
+                out=str(folder),
+                overwrite=overwrite,
+            )
+            report = run_audit(settings, networks)
+            names = {key: item.name for key, item in networks.items()}
+            return read_audit(studied[0], names, report)
