@@ -1,4 +1,4 @@
-"""The attack command: from its configuration to scenes, and its text."""
+"""The attack command makes scenes from its configuration, and prints what it found."""
 
 from unittest.mock import Mock
 
@@ -19,90 +19,133 @@ from train.command_settings import AttackExperimentSettings
 from train.commands.attack_meshes import attacks, overrides
 from train.report.attack_tables import format_attack
 
-CLASSES = ("orange", "lime", "sky")
-
 
 def configured(*arguments: str) -> AttackExperimentSettings:
-    """The real configuration; arguments are further overrides."""
-    small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
-    return attack_command.read([*small, "attack.margin=0", *arguments])
+    """Read the real configuration with small sizes and additional overrides."""
+    small = [
+        "renderer.rasterizer=numpy",
+        "renderer.shadows=false",
+        "attack.max_steps=8",
+        "attack.margin=0",
+    ]
+    return attack_command.read([*small, *arguments])
 
 
-def by_color(classes: tuple[str, ...] = CLASSES) -> Classifier:
+def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier:
+    """Make a classifier whose logits are the mean red, green and blue."""
     return Classifier(lambda images: 30 * images.mean((2, 3)), 8, classes, "by_color")
 
 
 def attacked(*arguments: str, classifier: Classifier | None = None) -> AttackResult:
-    ((_, _, result),) = attacks(configured(*arguments), classifier or by_color(), torch.device("cpu"))
+    settings = configured(*arguments)
+    ((_, _, result),) = attacks(settings, classifier or by_color(), torch.device("cpu"))
     return result
 
 
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
-    several = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "scene.azimuth=30"
-    result = attacked(*several, "attack.allow_negative=true", "attack.max_steps=0")
-    cameras = orbit_cameras(3, 2.0, 90.0, 30.0)
-    assert result.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
-    assert result.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(gray)] * 3 for gray in [0.2, 0.6] * 3]
-    assert torch.equal(result.problem.scene.lights, probe("grace").expand(6, -1, -1))
+    result = attacked(
+        "scene.views=3",
+        "scene.backgrounds=[0.2,0.6]",
+        "scene.polar=90",
+        "scene.azimuth=30",
+        "attack.allow_negative=true",
+        "attack.max_steps=0",
+    )
+    cameras = []
+    for camera in orbit_cameras(3, 2.0, 90.0, 30.0):
+        cameras += [(camera,), (camera,)]
+    scene = result.problem.scene
+    assert scene.cameras == cameras
+    corners = result.images_before[:, 0, :, 0, 0]
+    grays = torch.tensor([0.2, 0.6] * 3)[:, None].expand(-1, 3)
+    torch.testing.assert_close(corners, grays, rtol=1e-6, atol=0)
+    assert torch.equal(scene.lights, probe("grace").expand(6, -1, -1))
 
 
 def test_exposure_multiplies_the_light_and_albedo_scale_the_surface():
-    none = "attack.max_steps=0", "attack.force=true"
-    brighter, same = attacked(*none, "scene.exposure=1.5"), attacked(*none)
-    whiter = attacked(*none, "scene.meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]")
-    torch.testing.assert_close(brighter.images_before, whiter.images_before, rtol=0, atol=1e-6)
-    assert not torch.equal(brighter.images_before, same.images_before)
+    unchanged = "attack.max_steps=0", "attack.force=true"
+    whiter_mesh = "scene.meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]"
+    same = attacked(*unchanged).images_before
+    brighter = attacked(*unchanged, "scene.exposure=1.5").images_before
+    whiter = attacked(*unchanged, whiter_mesh).images_before
+    torch.testing.assert_close(brighter, whiter, rtol=0, atol=1e-6)
+    assert not torch.equal(brighter, same)
 
 
 @pytest.mark.parametrize("light", ["projector", "lamps"])
-def test_an_attacked_local_light_stands_in_the_scene_without_being_named(light):
-    alone, bare = (attacked(f"attack={name}", "attack.max_steps=1") for name in (light, "lighting"))
-    assert len(alone.problem.scene.lights[0]) > len(bare.problem.scene.lights[0])
+def test_an_attacked_local_light_is_added_to_the_scene(light):
+    with_light = attacked(f"attack={light}", "attack.max_steps=1")
+    without_light = attacked("attack=lighting", "attack.max_steps=1")
+    coefficients = with_light.problem.scene.lights[0]
+    assert len(coefficients) > len(without_light.problem.scene.lights[0])
 
 
 def test_a_class_whose_name_is_a_number_is_a_target():
-    result = attacked("target=7", "attack.max_steps=1", classifier=by_color(("orange", "7", "8")))
+    classifier = by_color(("orange", "7", "8"))
+    result = attacked("target=7", "attack.max_steps=1", classifier=classifier)
     assert result.goal.target.tolist() == [[1]]
 
 
-def test_a_scene_is_searched_for_and_given_as_overrides():
-    """Of a classifier that knows oranges before light gray alone."""
+class TestAClassifierThatKnowsOrangesBeforeLightGrayAlone:
+    @pytest.fixture
+    def classifier(self) -> Classifier:
+        def is_light(images: Tensor) -> Tensor:
+            score = 100 * (images[..., 0, 0].mean(1) - 0.8)
+            return torch.stack([score, -score], dim=1)
 
-    def before_light(images: Tensor) -> Tensor:
-        score = 100 * (images[..., 0, 0].mean(1) - 0.8)
-        return torch.stack([score, -score], dim=1)
+        return Classifier(is_light, 8, ("orange", "other"))
 
-    settings, classifier = configured(), Classifier(before_light, 8, ("orange", "other"))
-    ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
-    assert name == "solid:orange:0" and result.clean_correct.all()
-    assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
-    with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images of solid:orange:0 are .* before any attack"):
-        attacked("scene.search=0", classifier=classifier)
+    def test_is_attacked_in_a_scene_that_is_searched_for(self, classifier):
+        settings = configured()
+        ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
+        assert name == "solid:orange:0"
+        assert result.clean_correct.all()
+        assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
+
+    def test_is_not_attacked_without_a_search(self, classifier):
+        with pytest.raises(InputError, match=r"^attack\.force=.* 1 of 1 images"):
+            attacked("scene.search=0", classifier=classifier)
 
 
-def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, tiny, tmp_path):
-    monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
-    settings = tiny("renderer.rasterizer=opengl")
-    for command in (
-        lambda: attacked("renderer.rasterizer=opengl"),
-        lambda: loaded_run(settings, tmp_path),
-    ):
+class TestARasterizerThatDoesNotStart:
+    @pytest.fixture(autouse=True)
+    def no_device(self, monkeypatch) -> None:
+        monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
+
+    def test_is_an_error_of_its_key_in_an_attack(self):
         with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
-            command()
+            attacked("renderer.rasterizer=opengl")
+
+    def test_is_an_error_of_its_key_in_a_training(self, tiny, tmp_path):
+        settings = tiny("renderer.rasterizer=opengl")
+        with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
+            loaded_run(settings, tmp_path)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["attack.restarts=2"], r"restarts draws from the norm-balls: set the radius of every parameter"),
+        (["attack.restarts=2"], "restarts draws from the norm-balls"),
         (["scene.meshes=[]"], r"^scene\.meshes must not be empty"),
-        (["label=mango"], r"classifier by_color: 'mango' is not a class of the model"),
-        (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
-        (["target=[[lime]]"], r"target: give a class, least_likely, or a list of classes"),
+        (["label=mango"], "'mango' is not a class of the model"),
+        (
+            ["target=[lime]", "scene.views=2", "attack.shared=true"],
+            "names 1 classes for 2 views",
+        ),
+        (["target=[[lime]]"], "^target"),
         (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
-        (["scene.meshes=[{mesh: a, props: [solid:cup]}]"], r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'"),
-        (["scene.meshes=[{mesh: a, props: [{mesh: b}]}]"], r"scene.meshes\[0\].*at is not set"),
-        (["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"props\[0\]\.at=\[1\] must be x and y"),
+        (
+            ["scene.meshes=[{mesh: a, props: [solid:cup]}]"],
+            r"^scene\.meshes\[0\]\.props\[0\] is 'solid:cup'",
+        ),
+        (
+            ["scene.meshes=[{mesh: a, props: [{mesh: b}]}]"],
+            r"scene.meshes\[0\].*at is not set",
+        ),
+        (
+            ["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"],
+            r"props\[0\]\.at=\[1\] must be x and y",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -112,14 +155,33 @@ def test_bad_input_is_refused_in_one_sentence(arguments, message):
     assert "\n" not in str(refused.value)
 
 
-def test_success_is_printed_of_clean_correct_examples_and_of_their_views():
-    """No light makes both views' images green and blue, so that of two views with a target each one remains."""
-    result = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.margin=0.5")
+def test_success_is_printed_for_examples_and_for_their_views():
+    """Attack two views in one light, with the targets green and blue.
+
+    No light makes both images right, so that at most one view succeeds.
+    """
+    shared = "scene.views=2", "attack.shared=true"
+    result = attacked("target=[lime,sky]", *shared, "attack.margin=0.5")
     text = format_attack("mesh", result, None)
-    assert f", {int(result.success_with_margin)} with the margin of {result.settings.margin:g}" in text
-    assert text.startswith("mesh: lighting against by_color: ") and len(text.splitlines()) == 1
-    assert f"{int(result.success)} of 1 [" in text and f", {int(result.success_in_views.sum())} of 2 views" in text
-    wrong = attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
-    assert "none of 2 examples was correct before" in format_attack("mesh", wrong, None)
-    checks = check(wrong)
-    assert (checks["success"], checks["random_search"], set(checks["success_by_steps"].values())) == (0, 0, {0})
+    assert text.startswith("mesh: lighting against by_color: ")
+    assert len(text.splitlines()) == 1
+    assert f"{int(result.success)} of 1 [" in text
+    assert f", {int(result.success_in_views.sum())} of 2 views" in text
+    with_margin = int(result.success_with_margin)
+    assert f", {with_margin} with the margin of {result.settings.margin:g}" in text
+
+
+class TestExamplesThatWereWrongBefore:
+    @pytest.fixture
+    def result(self) -> AttackResult:
+        return attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
+
+    def test_are_no_successes_in_the_text(self, result):
+        text = format_attack("mesh", result, None)
+        assert "none of 2 examples was correct before" in text
+
+    def test_are_no_successes_in_the_checks(self, result):
+        checks = check(result)
+        assert checks["success"] == 0
+        assert checks["random_search"] == 0
+        assert set(checks["success_by_steps"].values()) == {0}

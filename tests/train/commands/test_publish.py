@@ -2,13 +2,13 @@ import json
 from pathlib import Path
 from shutil import copytree
 
-import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
+from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.io.images import read_square
+from renderer.io.images import read_image
 from train.command_settings import EvaluateSettings, PublishSettings
 from train.commands.evaluate import evaluate
 from train.commands.publish import publish_network
@@ -18,75 +18,153 @@ from train.runs.saved_networks import PUBLISHED, load_run, load_selected
 from train.system.hashing import content_hash
 
 
-def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
-    out = tmp_path / "pretrained" / "tiny"
-    publish_network(PublishSettings(str(finished), str(out)))
-    assert [path.name for path in out.iterdir()] == [PUBLISHED]
-    network = load_run(out)
-    assert network.classes == ("apple", "orange", "pear") and network.function.head.in_features == 64
-    with safe_open(out / PUBLISHED, "pt") as file:
-        metadata = {name: json.loads(text) for name, text in file.metadata().items()}
-    assert metadata["settings"]["data.path"] == "tiny.npz" and metadata["settings"]["train.epochs"] == 3
-    summary = json.loads((finished / "photographs" / "summary.json").read_text())
-    assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
-    scored, run = summarize(out), summarize(finished)
-    assert (scored.accuracy, scored.photographs) == (run.accuracy, run.photographs)
-    assert str(finished.parent) not in str(metadata) and str(tmp_path) not in str(metadata)
+@pytest.fixture(scope="module")
+def published(finished, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("published") / "tiny"
+    publish_network(PublishSettings(str(finished), str(folder)))
+    return folder
 
 
-def test_an_operating_point_is_published_kept_and_used(finished, photos, tmp_path):
-    """The threshold of a rate of 1/2 on four others, tomatoes and apples, is the third of their log-odds."""
-    first, second = tmp_path / "first", tmp_path / "second"
-    with pytest.raises(InputError, match="together, or neither"):
-        PublishSettings(str(finished), str(first), false_positive_rate=0.5)
-    publish_network(PublishSettings(str(finished), str(first)))
-    with pytest.raises(InputError, match="has no operating point"):
-        load_run(first).detect(torch.zeros(1, 3, 16, 16))
-    publish_network(PublishSettings(str(first), str(first), 0.5, str(photos)))
-    publish_network(PublishSettings(str(first), str(second)))
-    hashes = [content_hash(sorted(load_selected(folder)[1].items())) for folder in (first, second)]
-    assert hashes[0] == hashes[1]
-    network = load_run(second)
-    files = [path for path in sorted(photos.rglob("*.png")) if path.parent.name != "orange"]
-    images = torch.stack([torch.from_numpy(np.array(read_square(path, 16))).permute(2, 0, 1) / 255 for path in files])
-    odds = torch.logit(network(images).double().softmax(1)[:, 1])
-    (point,) = network.operating_points
-    assert point.threshold == pytest.approx(float(odds.sort().values[1]), rel=1e-5)
-    assert network.detect(images).sum() == 2
-    evaluate(EvaluateSettings(str(photos), str(second), out=str(tmp_path / "scores")))
-    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
-    assert summary["operating_point"] == vars(point) | {"in_sample": True}
+@pytest.fixture(scope="module")
+def metadata(published) -> dict:
+    with safe_open(published / PUBLISHED, "pt") as file:
+        return {name: json.loads(text) for name, text in file.metadata().items()}
 
 
-def test_each_of_several_labels_has_its_own_threshold(finished, photos, tmp_path):
-    labels, both = ["orange", "apple"], tmp_path / "both"
-    for name, label in {"both": labels, "orange": "orange", "apple": "apple"}.items():
-        publish_network(PublishSettings(str(finished), str(tmp_path / name), 0.5, str(photos), label))
-    network, images = load_run(both), torch.rand(9, 3, 16, 16)
-    for label, point in zip(labels, network.operating_points, strict=True):
-        (own,) = load_run(tmp_path / label).operating_points
-        assert (point.label, point.threshold) == (label, own.threshold)
-        assert torch.equal(network.detect(images, label), load_run(tmp_path / label).detect(images))
-    with pytest.raises(InputError, match="but of orange, apple: give one of these as label"):
-        network.detect(images)
-    settings = EvaluateSettings(str(photos), str(both), label=labels[::-1], out=str(tmp_path / "scores"))
-    evaluate(settings)
-    summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
-    assert [point["label"] for point in summary["operating_point"]] == labels[::-1]
+class TestAPublishedNetwork:
+    def test_is_one_file_that_loads(self, published):
+        assert [path.name for path in published.iterdir()] == [PUBLISHED]
+        network = load_run(published)
+        assert network.classes == ("apple", "orange", "pear")
+        assert network.function.head.in_features == 64
+
+    def test_has_the_settings_without_paths(self, published, metadata, finished):
+        assert metadata["settings"]["data.path"] == "tiny.npz"
+        assert metadata["settings"]["train.epochs"] == 3
+        assert str(finished.parent) not in str(metadata)
+        assert str(published.parent) not in str(metadata)
+
+    def test_has_the_scores_of_its_run(self, published, metadata, finished):
+        summary = json.loads((finished / "photographs" / "summary.json").read_text())
+        assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
+        found = summarize(published)
+        expected = summarize(finished)
+        assert found.accuracy == expected.accuracy
+        assert found.photographs == expected.photographs
+
+    def test_has_no_operating_point_unless_one_was_asked_for(self, published):
+        with pytest.raises(InputError, match="has no operating point"):
+            load_run(published).detect(torch.zeros(1, 3, 16, 16))
+
+
+def test_a_rate_without_photographs_is_refused(finished, tmp_path):
+    with pytest.raises(InputError, match="together"):
+        PublishSettings(str(finished), str(tmp_path), false_positive_rate=0.5)
+
+
+def read_images(paths: list[Path]) -> Tensor:
+    return torch.stack([read_image(path, 16) for path in paths])
+
+
+@pytest.fixture(scope="module")
+def calibrated(finished, photos, tmp_path_factory) -> Path:
+    """Publish a network with the threshold of a false positive rate of 1/2."""
+    folder = tmp_path_factory.mktemp("calibrated") / "first"
+    publish_network(PublishSettings(str(finished), str(folder), 0.5, str(photos)))
+    return folder
+
+
+class TestAnOperatingPoint:
+    def test_is_the_second_lowest_of_the_log_odds_of_four_negatives(self, calibrated, photos):
+        """With rate 1/2 and 4 negatives, at most 2 score above the threshold."""
+        network = load_run(calibrated)
+        paths = sorted(photos.rglob("*.png"))
+        negatives = read_images([path for path in paths if path.parent.name != "orange"])
+        probabilities = network(negatives).double().softmax(1)[:, 1]
+        log_odds = torch.logit(probabilities).sort().values
+        (point,) = network.operating_points
+        assert point.threshold == pytest.approx(float(log_odds[1]), rel=1e-5)
+        assert network.detect(negatives).sum() == 2
+
+    def test_and_the_network_stay_the_same_if_it_is_published_again(self, calibrated, tmp_path):
+        publish_network(PublishSettings(str(calibrated), str(tmp_path / "second")))
+        hashes = []
+        for folder in (calibrated, tmp_path / "second"):
+            _, state = load_selected(folder)
+            hashes.append(content_hash(sorted(state.items())))
+        assert hashes[0] == hashes[1]
+
+    def test_is_used_by_evaluation(self, calibrated, photos, tmp_path):
+        (point,) = load_run(calibrated).operating_points
+        evaluate(EvaluateSettings(str(photos), str(calibrated), out=str(tmp_path)))
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        assert summary["operating_point"] == vars(point) | {"in_sample": True}
+
+
+LABELS = ("orange", "apple")
+
+
+@pytest.fixture(scope="module")
+def folders(finished, photos, tmp_path_factory) -> dict[str, Path]:
+    """Publish a network for both labels, and one for each, with thresholds."""
+    root = tmp_path_factory.mktemp("labels")
+    labels = {"both": list(LABELS), "orange": "orange", "apple": "apple"}
+    for name, label in labels.items():
+        out = str(root / name)
+        publish_network(PublishSettings(str(finished), out, 0.5, str(photos), label))
+    return {name: root / name for name in labels}
+
+
+class TestSeveralLabels:
+    def test_have_the_thresholds_that_each_has_alone(self, folders):
+        network = load_run(folders["both"])
+        images = torch.rand(9, 3, 16, 16)
+        for label, point in zip(LABELS, network.operating_points, strict=True):
+            alone = load_run(folders[label])
+            (expected,) = alone.operating_points
+            assert point.label == label
+            assert point.threshold == expected.threshold
+            assert torch.equal(network.detect(images, label), alone.detect(images))
+
+    def test_must_be_named_to_detect(self, folders):
+        with pytest.raises(InputError, match="orange, apple"):
+            load_run(folders["both"]).detect(torch.zeros(1, 3, 16, 16))
+
+    def test_are_scored_in_the_order_of_the_settings(self, folders, photos, tmp_path):
+        labels = list(reversed(LABELS))
+        settings = EvaluateSettings(
+            str(photos),
+            str(folders["both"]),
+            label=labels,
+            out=str(tmp_path),
+        )
+        evaluate(settings)
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        assert [point["label"] for point in summary["operating_point"]] == labels
 
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     run = copytree(finished, tmp_path / "run")
     state = checkpoint.load(run / checkpoint.BEST)
-    checkpoint.save(run / checkpoint.BEST, state | {"architecture": state["architecture"] | {"width": "wide"}})
+    state["architecture"] = state["architecture"] | {"width": "wide"}
+    checkpoint.save(run / checkpoint.BEST, state)
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
         publish_network(PublishSettings(str(run), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["none", "random", "adversarial", "best"])
-def test_each_pretrained_network_says_what_it_left_out_and_has_scores_on_one_set_of_photographs(name):
-    architecture = load_selected(Path("pretrained", name))[1]["architecture"]
-    assert architecture["validation"]["fraction"] == 0.02
-    images = {summarize(Path("pretrained", other)).photographs["photographs"].images for other in ("none", name)}
+PRETRAINED = ["none", "random", "adversarial", "best"]
+
+
+@pytest.mark.parametrize("name", PRETRAINED)
+def test_each_pretrained_network_was_validated_on_images_that_it_left_out(name):
+    _, state = load_selected(Path("pretrained", name))
+    assert state["architecture"]["validation"]["fraction"] == 0.02
+
+
+def test_all_pretrained_networks_are_scored_on_the_same_photographs():
+    images = set()
+    for name in PRETRAINED:
+        scores = summarize(Path("pretrained", name)).photographs
+        images.add(scores["photographs"].images)
     assert len(images) == 1
