@@ -29,7 +29,6 @@ from numpy.polynomial import legendre
 from torch import Tensor
 
 from renderer.light.harmonics import bands, lambertian_factors, per_degree
-from renderer.light.program import shortest
 
 # Exchange steps. Eight are usual.
 _MAX_ROUNDS = 100
@@ -122,6 +121,9 @@ def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray)
     length is the error.
     """
     degree = len(weight) - 1
+    # The import of scipy.linalg takes a tenth of a second, and few programs need it.
+    from renderer.light.program import shortest
+
     kernel = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
     change = shortest(kernel[:, 1:] / weight[1:], -kernel.sum(1))
     return np.concatenate([[1.0], 1 + change / weight[1:]])
