@@ -52,7 +52,12 @@ def require_same_camera(found: Camera, expected: Camera) -> None:
     assert found.up == pytest.approx(expected.up, abs=tolerance)
 
 
-def irradiance_error(found: FittedScene, mesh: renderer.Mesh, camera: Camera, light: Tensor) -> float:
+def irradiance_error(
+    found: FittedScene,
+    mesh: renderer.Mesh,
+    camera: Camera,
+    light: Tensor,
+) -> float:
     """Compare the irradiance of the visible surface under the light found and the true light."""
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
     [operator] = renderer.precompute_transfer(white, camera, 64)
@@ -158,7 +163,8 @@ def test_the_light_of_a_quadratic_program_is_nowhere_negative(program):
 def test_no_other_nonnegative_light_solves_a_quadratic_program_better(program):
     """At the minimum, the slope toward any other light of the convex set is not negative.
 
-    The other lights are squares of lights of degree 3, plus a constant light, and the light of zero.
+    The other lights are zero, and squares of lights of degree 3 to which a
+    constant light is added.
     """
     directions = random_directions(2000)
     roots = basis(directions, 3) @ draw(16, 200, seed=2)
