@@ -2,15 +2,21 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from numpy.typing import ArrayLike
 from scipy.special import sph_harm_y_all
 
-from renderer.geometry.mesh import Mesh
+from renderer.geometry.mesh import Mesh, normalize
+from renderer.geometry.shapes import SOLIDS, solid
+from renderer.io.meshes import load_mesh
 from renderer.light.harmonics import lambertian_factors
+
+SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -93,6 +99,15 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
 def mesh_of(shape: trimesh.Trimesh, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
     """Convert a shape of trimesh to a mesh of one color."""
     return Mesh.plain(shape.vertices, shape.faces, color)
+
+
+def named_mesh(name: str) -> Mesh:
+    """Return a solid, or the scan in a file, normalized. Without the file, the test is skipped."""
+    if name in SOLIDS:
+        return normalize(solid(name))
+    if not (SCANS / name).exists():
+        pytest.skip(f"{name} is not there")
+    return normalize(load_mesh(SCANS / name))
 
 
 def corners_of(mesh: Mesh) -> np.ndarray:

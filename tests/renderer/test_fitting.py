@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from oracles import draw, draw_uniform, random_directions
+from oracles import draw, draw_uniform, named_mesh, random_directions
 from torch import Tensor
 
 import renderer
@@ -20,7 +20,6 @@ from renderer.settings import ImageSettings
 
 FAR = OrthographicCamera(51.6, 114.6, 3.0, 0.2, -0.1)
 NEAR = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
-SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 
 
 def positive_light(name: str) -> Tensor:
@@ -75,15 +74,6 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
     found = fit_scene(image, coverage_of(mesh, FAR, 48), mesh)
     require_same_camera(found.camera, FAR)
     assert irradiance_error(found, mesh, FAR, light) < 0.05
-
-
-def named_mesh(name: str) -> renderer.Mesh:
-    """Return a solid by its name, or a scan by its file name, normalized."""
-    if not name.endswith(".glb"):
-        return renderer.normalize(renderer.solid(name))
-    if not (SCANS / name).exists():
-        pytest.skip(f"{name} is not there")
-    return renderer.normalize(renderer.load_mesh(SCANS / name))
 
 
 def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor) -> Tensor:

@@ -1,12 +1,13 @@
-"""Gradients that see outlines move: in closed form, and against differences of images rendered anew."""
+"""Gradients through moving outlines, in closed form and against differences of images."""
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import torch
+from oracles import draw_uniform, named_mesh
 from torch import Tensor
 
 import renderer
@@ -16,161 +17,259 @@ from renderer.geometry.shapes import SOLIDS
 from renderer.light.lamps import Lamps
 from renderer.light.presets import ambient, load_light
 
-SIZE = 64
-FAR, NEAR = OrthographicCamera(63.0, 22.9, 2.8), PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)
+FAR = OrthographicCamera(63.0, 22.9, 2.8)
+NEAR = PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)
+FROM_ABOVE = OrthographicCamera(0.0, 17.2, 2.0)
 LIGHT = 0.4 * load_light("grace").double()
-SCANS = Path(__file__).parents[4] / "shared" / "data" / "meshes"
+
+# Image (3, size, size) after a change of the scene. The arguments are the change
+# and the samples per row of a pixel.
+ChangedImage = Callable[[Tensor, int], Tensor]
+
+
+def rendered(
+    mesh: renderer.Mesh,
+    camera: Camera,
+    size: int,
+    samples: int | None,
+    **options,
+) -> Tensor:
+    """Render an image (3, size, size) whose gradients see outlines move."""
+    choices = {"light": LIGHT, "background": 0.3, "albedo_scale": 0.8, "silhouettes": True}
+    [image] = renderer.render(mesh, camera, size=size, samples=samples, **choices | options)
+    return image
+
+
+def even_light(radiance: float) -> Tensor:
+    """Return light under which a white surface has a radiance, in float64."""
+    return ambient(torch.full((3,), radiance / math.pi).double())
+
+
+# ---------------------------------------------------------------------------- differences
 
 
 def smooth_weights(size: int) -> Tensor:
-    """(3, 3, size, size): projections of an image, its sum and two smooth ones."""
-    y, x = torch.meshgrid(*[torch.linspace(-1, 1, size, dtype=torch.float64)] * 2, indexing="ij")
-    waves = [torch.stack([torch.sin(a * x + b * y + c) for a in (1.0, 2.0, 3.0)]) for b, c in ((2.0, 0.5), (-1.0, 2.0))]
-    return torch.stack([torch.ones(3, size, size, dtype=torch.float64), *waves])
+    """Return the weights of three sums over an image, shape (3 sums, 3, size, size).
+
+    The weights of the first sum are one. Those of the others vary smoothly.
+    """
+    along = torch.linspace(-1, 1, size, dtype=torch.float64)
+    y, x = torch.meshgrid(along, along, indexing="ij")
+    slow_wave = [torch.sin(frequency * x + 2 * y + 0.5) for frequency in (1, 2, 3)]
+    tilted_wave = [torch.sin(frequency * x - y + 2) for frequency in (1, 2, 3)]
+    ones = torch.ones(3, size, size, dtype=torch.float64)
+    return torch.stack([ones, torch.stack(slow_wave), torch.stack(tilted_wave)])
 
 
-def displacements(points: Tensor) -> Tensor:
-    """(7, V, 3): inflation, three turns, a shear and two smooth fields."""
-    turns = [torch.linalg.cross(axis.expand_as(points), points) for axis in torch.eye(3, dtype=torch.float64)]
-    shear = torch.stack([points[:, 2], 0 * points[:, 0], points[:, 0]], dim=1)
-    return torch.stack([points, *turns, shear, *(torch.sin(points[:, [1, 2, 0]] * k + k) for k in (2.0, 3.0))])
+def smooth_sums(image: Tensor) -> Tensor:
+    """Compute the three sums (3,) of an image."""
+    return (smooth_weights(image.shape[-1]) * image).sum((1, 2, 3))
 
 
-def derivatives(image: Callable[[Tensor, int], Tensor], directions: Tensor, size: int, samples: int) -> Tensor:
-    """(D, 3) of projections of an image, by gradients along directions (D, ...). image: of an offset and samples."""
-    weights, offset = smooth_weights(size), torch.zeros_like(directions[0]).requires_grad_()
-    values = (weights * image(offset, samples)).sum((1, 2, 3))
-    gradients = [torch.autograd.grad(value, offset, retain_graph=True)[0] for value in values]
-    return torch.stack([(directions * gradient).flatten(1).sum(1) for gradient in gradients], dim=1)
+def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor:
+    """Compute derivatives of the sums from gradients.
+
+    Args:
+        image: The image after a change.
+        directions: Changes, shape (D, ...).
+        samples: Samples per row of a pixel.
+
+    Returns:
+        Derivative of each sum along each direction, shape (D, 3).
+    """
+    change = torch.zeros_like(directions[0]).requires_grad_()
+    columns = []
+    for value in smooth_sums(image(change, samples)):
+        (gradient,) = torch.autograd.grad(value, change, retain_graph=True)
+        columns.append((directions * gradient).flatten(1).sum(1))
+    return torch.stack(columns, dim=1)
 
 
-def differences(
-    image: Callable[[Tensor, int], Tensor], directions: Tensor, size: int, samples: int, step: float
-) -> Tensor:
-    """(D, 3) central differences in place of `derivatives`."""
-    weights = smooth_weights(size)
-    with torch.no_grad():
-        sides = [[(weights * image(sign * step * by, samples)).sum((1, 2, 3)) for by in directions] for sign in (1, -1)]
-    return (torch.stack(sides[0]) - torch.stack(sides[1])) / (2 * step)
+@torch.no_grad()
+def differences(image: ChangedImage, directions: Tensor, samples: int, step: float) -> Tensor:
+    """Compute central differences of the sums, with the shapes of `derivatives`."""
+    rows = []
+    for direction in directions:
+        forward = smooth_sums(image(step * direction, samples))
+        backward = smooth_sums(image(-step * direction, samples))
+        rows.append((forward - backward) / (2 * step))
+    return torch.stack(rows)
 
 
-def error(image: Callable[[Tensor, int], Tensor], directions: Tensor, size: int = SIZE, step: float = 0.02) -> float:
-    """Of the derivatives of projections along directions (D, ...), at 8² samples, relative to central differences at
-    20²: norms over all of them. image: of an offset and samples."""
-    found, expected = derivatives(image, directions, size, 8), differences(image, directions, size, 20, step)
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Divide the norm of the error of all values by the norm of the values."""
     return float((found - expected).norm() / expected.norm())
 
 
-def rendered(mesh: renderer.Mesh, camera: Camera, samples: int | None, size: int = SIZE, **options) -> Tensor:
-    choices = {"light": LIGHT, "background": 0.3, "albedo_scale": 0.8, "silhouettes": True} | options
-    return renderer.render(mesh, camera, size=size, samples=samples, **choices)[0]
+@dataclass(frozen=True)
+class MovedVertices:
+    """Image of a mesh whose vertices are moved by a change (V, 3)."""
+
+    mesh: renderer.Mesh
+    camera: Camera
+    size: int
+    normals: str
+
+    def __call__(self, change: Tensor, samples: int) -> Tensor:
+        vertices = torch.from_numpy(self.mesh.vertices) + change
+        return rendered(
+            self.mesh,
+            self.camera,
+            self.size,
+            samples,
+            vertices=vertices,
+            normals=self.normals,
+            silhouettes=change.requires_grad,
+        )
 
 
-def named(name: str) -> renderer.Mesh:
-    if name in SOLIDS:
-        return renderer.normalize(renderer.solid(name))
-    if not (SCANS / name).exists():
-        pytest.skip(f"{name} is not there")
-    return renderer.normalize(renderer.load_mesh(SCANS / name))
+@dataclass(frozen=True)
+class MovedCamera:
+    """Image of a mesh from a camera whose fields are changed by a vector."""
+
+    mesh: renderer.Mesh
+    camera: Camera
+    names: list[str]
+
+    def __call__(self, change: Tensor, samples: int) -> Tensor:
+        values = {}
+        for name, amount in zip(self.names, change, strict=True):
+            values[name] = getattr(self.camera, name) + amount
+        return rendered(self.mesh, replace(self.camera, **values), 48, samples)
 
 
+def displacements(points: Tensor) -> Tensor:
+    """Return changes of vertices (V, 3): inflation, turns, a shear, and waves, shape (7, V, 3)."""
+    axes = torch.eye(3, dtype=torch.float64)
+    turns = [torch.linalg.cross(axis.expand_as(points), points) for axis in axes]
+    shear = torch.stack([points[:, 2], torch.zeros_like(points[:, 0]), points[:, 0]], dim=1)
+    waves = [torch.sin(points[:, [1, 2, 0]] * k + k) for k in (2.0, 3.0)]
+    return torch.stack([points, *turns, shear, *waves])
+
+
+# Walls of the cup and of the plate are a few samples thick.
+BOUNDS = {"cup": 0.03, "plate": 0.04}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "normals", "camera", "size"),
+    ("name", "normals", "camera"),
     [
-        ("mushroom", "flat", NEAR, 32),
-        *(pytest.param(name, "smooth", FAR, SIZE, marks=pytest.mark.slow) for name in SOLIDS),
-        *(pytest.param(name, "flat", NEAR, SIZE, marks=pytest.mark.slow) for name in SOLIDS),
-        *(
-            pytest.param(name, "smooth", NEAR, SIZE, marks=pytest.mark.slow)
-            for name in ("banana.glb", "apple_scan.glb")
-        ),
+        *((name, "smooth", FAR) for name in SOLIDS),
+        *((name, "flat", NEAR) for name in SOLIDS),
+        *((name, "smooth", NEAR) for name in ("banana.glb", "apple_scan.glb")),
     ],
 )
-def test_gradients_by_vertices_are_differences_of_images_rendered_anew(name, normals, camera, size):
-    mesh = named(name)
-    points = torch.from_numpy(mesh.vertices)
+def test_gradients_by_vertices_are_differences_of_new_images(name, normals, camera):
+    mesh = named_mesh(name)
+    image = MovedVertices(mesh, camera, 64, normals)
+    directions = displacements(torch.from_numpy(mesh.vertices))
+    found = derivatives(image, directions, samples=8)
+    expected = differences(image, directions, samples=20, step=0.02)
+    assert relative_error(found, expected) < BOUNDS.get(name, 0.02)
 
-    def image(offset: Tensor, samples: int) -> Tensor:
-        return rendered(mesh, camera, samples, size, vertices=points + offset, normals=normals)
 
-    directions = displacements(points)
-    bound = {"cup": 0.03, "plate": 0.04}.get(name, 0.02)  # whose walls are of a few samples
-    assert error(image, directions if size == SIZE else directions[::3], size) < bound
+def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
+    mesh = named_mesh("mushroom")
+    image = MovedVertices(mesh, NEAR, 32, "flat")
+    directions = displacements(torch.from_numpy(mesh.vertices))[::3]
+    found = derivatives(image, directions, samples=8)
+    expected = differences(image, directions, samples=14, step=0.02)
+    assert relative_error(found, expected) < 0.02
 
 
 @pytest.mark.parametrize("camera", [FAR, NEAR], ids=["orthographic", "perspective"])
-def test_gradients_by_the_camera_are_differences_of_images_rendered_anew(camera):
-    mesh = named("pear")
-    names = ["polar", "azimuth", "width", "right", "up"] + ["distance"] * (camera is NEAR)
-    fields = torch.tensor([getattr(camera, name) for name in names], dtype=torch.float64)
+def test_gradients_by_the_camera_are_differences_of_new_images(camera):
+    names = ["polar", "azimuth", "width", "right", "up"]
+    if isinstance(camera, PerspectiveCamera):
+        names.append("distance")
+    image = MovedCamera(named_mesh("pear"), camera, names)
+    directions = torch.eye(len(names), dtype=torch.float64)
+    found = derivatives(image, directions, samples=8)
+    expected = differences(image, directions, samples=14, step=0.02)
+    assert relative_error(found, expected) < 0.02
 
-    def image(offset: Tensor, samples: int) -> Tensor:
-        moved = replace(camera, **dict(zip(names, fields + offset, strict=True)))
-        return rendered(mesh, moved, samples, 48)
 
-    assert error(image, torch.eye(len(names), dtype=torch.float64), 48) < 0.02
+# ---------------------------------------------------------------------------- closed forms
 
 
 def square(half: float, height: float) -> renderer.Mesh:
-    corners = [[-half, -half, height], [half, -half, height], [half, half, height], [-half, half, height]]
+    """Create a square with sides of 2 · half at a height, parallel to the ground."""
+    corners = [
+        [-half, -half, height],
+        [half, -half, height],
+        [half, half, height],
+        [-half, half, height],
+    ]
     return renderer.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
 
 
 @pytest.mark.parametrize(
-    ("meshes", "expected"),
+    ("meshes", "jump"),
     [
-        ([square(0.5, 0.0)], 0.6 - 0.1),
-        ([square(0.5, 0.5), square(0.9, 0.0)], 0.0),  # as bright as what is behind
-        ([square(0.5, 0.5), square(0.503, 0.0)], 0.0),  # which ends before the next sample
-        ([square(0.5, -0.5), square(0.9, 0.0)], 0.0),  # hidden
-        ([square(0.5, 0.5), square(0.3, 0.0)], 0.6 - 0.1),
+        pytest.param([square(0.5, 0.0)], 0.5, id="before the background"),
+        pytest.param([square(0.5, 0.5), square(0.3, 0.0)], 0.5, id="hiding a square"),
+        pytest.param([square(0.5, 0.5), square(0.9, 0.0)], 0.0, id="before an equal square"),
+        pytest.param(
+            [square(0.5, 0.5), square(0.503, 0.0)],
+            0.0,
+            id="before a square that ends less than a sample further",
+        ),
+        pytest.param([square(0.5, -0.5), square(0.9, 0.0)], 0.0, id="hidden"),
     ],
 )
-def test_a_growing_square_gains_its_perimeter_times_the_jump(meshes, expected):
-    """In even light; its corners move outwards by one each, and its area grows by its perimeter of 8 · 0.5."""
-    mesh, light = concatenate(meshes), ambient(torch.full((3,), 0.6 / math.pi).double())
+def test_a_growing_square_gains_its_perimeter_times_the_jump_of_radiance(meshes, jump):
+    """The radiance is 0.6 on the squares and 0.1 on the background.
+
+    Each side of the first square moves outward by one, so that its area grows by its perimeter.
+    """
+    mesh = concatenate(meshes)
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
-    camera = OrthographicCamera(0.0, 17.2, 2.0)
-    image = rendered(mesh, camera, 8, 32, light=light, vertices=vertices, background=0.1, albedo_scale=1.0)
+    image = rendered(
+        mesh,
+        FROM_ABOVE,
+        32,
+        8,
+        light=even_light(0.6),
+        vertices=vertices,
+        background=0.1,
+        albedo_scale=1.0,
+    )
     (gradient,) = torch.autograd.grad(image[0].sum(), vertices)
-    growth = (gradient[:4] * torch.from_numpy(mesh.vertices[:4]).sign())[:, :2].sum()
-    assert float(growth) / (32 / 2) ** 2 == pytest.approx(4 * expected, abs=0.02 * 4 * 0.5)
-
-
-def test_the_image_is_the_same_and_local_light_and_shadows_move_with_the_outline():
-    """Under a lamp and shadowed environment light; a shift in the image's plane moves nothing else."""
-    mesh, lamps = named("apple"), Lamps(((2.0, 1.0, 2.5),), radius=0.0)
-    points, right = torch.from_numpy(mesh.vertices), torch.from_numpy(FAR.axes()[0])
-    options = {"lights": [(lamps, torch.full((1, 3), 2.0))], "shadows": True}
-    images = [rendered(mesh, FAR, 3, 24, silhouettes=moves, **options) for moves in (False, True)]
-    torch.testing.assert_close(images[1], images[0], rtol=0, atol=1e-12)
-    vertices = points.clone().requires_grad_()
-    image = rendered(mesh, FAR, 8, 32, vertices=vertices, **options)
-    (gradient,) = torch.autograd.grad((image * smooth_weights(32)[1]).sum(), vertices)
-    found = float((gradient @ right).sum())
-    sides = [rendered(mesh, replace(FAR, right=0.03 * sign), 20, 32, **options) for sign in (1, -1)]
-    expected = float(((sides[0] - sides[1]) * smooth_weights(32)[1]).sum()) / 0.06
-    assert found == pytest.approx(expected, rel=0.1)  # the distance to the lamp changes, too
+    outward = vertices.detach()[:4, :2].sign()
+    growth = float((gradient[:4, :2] * outward).sum())
+    pixels_per_area = (32 / FROM_ABOVE.width) ** 2
+    perimeter = 8 * 0.5
+    assert growth / pixels_per_area == pytest.approx(perimeter * jump, abs=0.04)
 
 
 def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
-    """A square of cells of two triangles each, whose corners are displaced at random, and the triangles' albedos."""
-    generator = torch.Generator().manual_seed(4)
+    """Create a square of cells² cells with displaced corners, and two triangles for each cell.
+
+    Returns:
+        A tuple of the mesh and the albedo of its triangles, shape (2 cells², 3).
+    """
     along = torch.linspace(-0.8, 0.8, cells + 1, dtype=torch.float64)
-    plane = torch.stack(torch.meshgrid(along, along, indexing="ij"), dim=2)
-    plane += (torch.rand(plane.shape, generator=generator, dtype=torch.float64) - 0.5) * 0.8 / cells
-    points = torch.nn.functional.pad(plane.flatten(0, 1), (0, 1))
-    first = (torch.arange(cells)[:, None] * (cells + 1) + torch.arange(cells)).flatten()
-    lower = torch.stack([first, first + cells + 1, first + cells + 2], dim=1)
-    upper = torch.stack([first, first + cells + 2, first + 1], dim=1)
+    grid = torch.stack(torch.meshgrid(along, along, indexing="ij"), dim=2)
+    grid += (draw_uniform(*grid.shape, seed=4) - 0.5) * 0.8 / cells
+    points = torch.nn.functional.pad(grid.flatten(0, 1), (0, 1))
+    # Vertices of a row have successive indices.
+    row = cells + 1
+    corner = (torch.arange(cells)[:, None] * row + torch.arange(cells)).flatten()
+    lower = torch.stack([corner, corner + row, corner + row + 1], dim=1)
+    upper = torch.stack([corner, corner + row + 1, corner + 1], dim=1)
     faces = torch.cat([lower, upper])
-    albedo = torch.rand(len(faces), 3, generator=generator, dtype=torch.float64)
+    albedo = draw_uniform(len(faces), 3, seed=5)
     return renderer.Mesh.plain(points.numpy(), faces.numpy()), albedo
 
 
 def triangle_areas(points: Tensor, faces: Tensor) -> Tensor:
-    a, b, c = points[faces].unbind(1)
-    return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+    """Compute the areas of triangles seen from above."""
+    a, b, c = points[faces, :2].unbind(1)
+    first_edge = b - a
+    second_edge = c - a
+    cross_product = first_edge[:, 0] * second_edge[:, 1] - first_edge[:, 1] * second_edge[:, 0]
+    return cross_product / 2
 
 
 @pytest.mark.parametrize(
@@ -183,86 +282,174 @@ def triangle_areas(points: Tensor, faces: Tensor) -> Tensor:
     ],
 )
 def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow(size, bounds):
-    """In even light an image's sum is that of the triangles' colors times their areas; most of the edges are inner."""
+    """In even light, the sum of an image is that of the triangles' colors times their areas.
+
+    The parameter `bounds` maps samples per row of a pixel to the largest relative error.
+    """
     mesh, albedo = colored_plane(9)
-    points, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
-    camera, light = OrthographicCamera(0.0, 17.2, 2.0), ambient(torch.full((3,), 1 / math.pi).double())
-    moved = points.clone().requires_grad_()
-    total = ((albedo.sum(1) - 3 * 0.3) * triangle_areas(moved, faces)).sum() * (size / camera.width) ** 2
-    (expected,) = torch.autograd.grad(total, moved)
+    vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+    areas = triangle_areas(vertices, torch.from_numpy(mesh.faces))
+    pixels_per_area = (size / FROM_ABOVE.width) ** 2
+    # The background has a radiance of 0.3 in three channels.
+    total = ((albedo.sum(1) - 3 * 0.3) * areas).sum() * pixels_per_area
+    (expected,) = torch.autograd.grad(total, vertices)
+    options = {"light": even_light(1.0), "albedo": albedo, "albedo_scale": 1.0}
     for samples, bound in bounds.items():
-        vertices = points.clone().requires_grad_()
-        image = rendered(mesh, camera, samples, size, light=light, vertices=vertices, albedo=albedo, albedo_scale=1.0)
+        image = rendered(mesh, FROM_ABOVE, size, samples, vertices=vertices, **options)
         (found,) = torch.autograd.grad(image.sum(), vertices)
-        assert float((found - expected)[:, :2].norm() / expected.norm()) < bound
+        assert relative_error(found[:, :2], expected[:, :2]) < bound
+
+
+# ---------------------------------------------------------------------------- local light
+
+
+@pytest.fixture(scope="module")
+def lit_by_a_lamp() -> Callable[..., Tensor]:
+    """Return a function that renders an apple under a lamp and a sky, with shadows."""
+    lamps = Lamps(((2.0, 1.0, 2.5),), radius=0.0)
+    power = torch.full((1, 3), 2.0)
+    return partial(rendered, named_mesh("apple"), lights=[(lamps, power)], shadows=True)
+
+
+def test_gradients_of_outlines_leave_local_light_and_shadows_as_they_are(lit_by_a_lamp):
+    with_silhouettes = lit_by_a_lamp(FAR, 24, 3)
+    without = lit_by_a_lamp(FAR, 24, 3, silhouettes=False)
+    torch.testing.assert_close(with_silhouettes, without, rtol=0, atol=1e-12)
+
+
+def test_local_light_and_shadows_move_with_the_outline(lit_by_a_lamp):
+    """A shift in the image's plane changes the distance to the lamp, too, by less than a tenth."""
+    vertices = torch.from_numpy(named_mesh("apple").vertices).requires_grad_()
+    image = lit_by_a_lamp(FAR, 32, 8, vertices=vertices)
+    (gradient,) = torch.autograd.grad(smooth_sums(image)[1], vertices)
+    right = torch.from_numpy(FAR.axes()[0])
+    found = float((gradient @ right).sum())
+
+    shifted_right = smooth_sums(lit_by_a_lamp(replace(FAR, right=0.03), 32, 12))[1]
+    shifted_left = smooth_sums(lit_by_a_lamp(replace(FAR, right=-0.03), 32, 12))[1]
+    expected = float(shifted_right - shifted_left) / 0.06
+    assert found == pytest.approx(expected, rel=0.1)
+
+
+# ---------------------------------------------------------------------------- hidden parts
 
 
 def box(low: list[float], high: list[float]) -> renderer.Mesh:
-    low_corner, high_corner = torch.tensor(low), torch.tensor(high)
-    unit = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    return renderer.Mesh.plain((low_corner + unit * (high_corner - low_corner)).numpy(), faces)
+    """Create a box between two corners."""
+    low_corner = torch.tensor(low)
+    sides = torch.tensor(high) - low_corner
+    unit_cube = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
+    vertices = low_corner + unit_cube * sides
+    faces = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+    return renderer.Mesh.plain(vertices.numpy(), faces)
 
 
 def angular_cup(segments: int = 7) -> renderer.Mesh:
-    """A cup with a thick wall and no handle: rings of vertices outside, on the rim and inside."""
+    """Create a cup with a thick wall and no handle.
+
+    It has four rings of vertices: at the bottom outside, at the rim outside and
+    inside, and at the bottom inside. The last two vertices are the centers of
+    the outer and of the inner bottom.
+    """
+    radii = [0.6, 0.8, 0.6, 0.4]
+    heights = [-0.7, 0.7, 0.7, -0.4]
     angle = torch.arange(segments, dtype=torch.float64) * (2 * math.pi / segments)
-    radius, height = torch.tensor([0.6, 0.8, 0.6, 0.4]), torch.tensor([-0.7, 0.7, 0.7, -0.4])
-    rings = torch.stack([angle.cos() * radius[:, None], angle.sin() * radius[:, None]], dim=2)
-    rings = torch.cat([rings, height[:, None, None].expand(-1, segments, 1)], dim=2)
-    points = torch.cat([rings.flatten(0, 1), torch.tensor([[0.0, 0.0, -0.7], [0.0, 0.0, -0.4]])])
-    after = (torch.arange(segments) + 1) % segments
-    faces = [torch.stack([torch.full_like(after, 4 * segments), after, torch.arange(segments)], dim=1)]
-    for ring in range(3):
-        low, next_low = ring * segments + torch.arange(segments), ring * segments + after
-        faces += [
-            torch.stack([low, next_low, next_low + segments], 1),
-            torch.stack([low, next_low + segments, low + segments], 1),
-        ]
-    inside = 3 * segments
-    faces += [
-        torch.stack([torch.full_like(after, 4 * segments + 1), inside + torch.arange(segments), inside + after], dim=1)
-    ]
+    rings = []
+    for radius, height in zip(radii, heights, strict=True):
+        ring = [radius * angle.cos(), radius * angle.sin(), torch.full_like(angle, height)]
+        rings.append(torch.stack(ring, dim=1))
+    centers = torch.tensor([[0.0, 0.0, heights[0]], [0.0, 0.0, heights[-1]]])
+    points = torch.cat([*rings, centers])
+
+    position = torch.arange(segments)
+    next_position = (position + 1) % segments
+    outer_center = torch.full_like(position, 4 * segments)
+    faces = [torch.stack([outer_center, next_position, position], dim=1)]
+    for ring_index in range(3):
+        here = ring_index * segments + position
+        beside = ring_index * segments + next_position
+        faces.append(torch.stack([here, beside, beside + segments], dim=1))
+        faces.append(torch.stack([here, beside + segments, here + segments], dim=1))
+    inner_center = outer_center + 1
+    inner_ring = 3 * segments
+    inner_bottom = [inner_center, inner_ring + position, inner_ring + next_position]
+    faces.append(torch.stack(inner_bottom, dim=1))
     return renderer.Mesh.plain(points.numpy(), torch.cat(faces).numpy())
 
 
-ERROR_BY_SAMPLES = {2: 0.2, 8: 0.05, 32: 0.015}
+def table() -> list[renderer.Mesh]:
+    """Create a board and four legs."""
+    parts = [box([-0.9, -0.9, 0.3], [0.9, 0.9, 0.45])]
+    for x in (-0.7, 0.7):
+        for y in (-0.7, 0.7):
+            parts.append(box([x - 0.1, y - 0.1, -0.8], [x + 0.1, y + 0.1, 0.3]))
+    return parts
+
+
 PARTS = {
     "cup": [angular_cup()],
-    "boxes": [box([-0.8, -0.7, -0.6], [0.2, 0.1, 0.3]), box([-0.3, 0.15, -0.5], [0.5, 0.9, 0.6])],
-    "table": [box([-0.9, -0.9, 0.3], [0.9, 0.9, 0.45])]
-    + [box([x - 0.1, y - 0.1, -0.8], [x + 0.1, y + 0.1, 0.3]) for x in (-0.7, 0.7) for y in (-0.7, 0.7)],
+    "boxes": [
+        box([-0.8, -0.7, -0.6], [0.2, 0.1, 0.3]),
+        box([-0.3, 0.15, -0.5], [0.5, 0.9, 0.6]),
+    ],
+    "table": table(),
 }
+# Samples per row of a pixel, and the largest relative error.
+ERROR_BY_SAMPLES = {2: 0.2, 8: 0.05, 32: 0.015}
+# Most samples in a row of an image.
+FINEST = 2048
+
+
+def moves_of_nearest_vertices(mesh: renderer.Mesh) -> Tensor:
+    """Return changes that move one of three vertices close to the camera, shape (3, V, 3)."""
+    nearest = NEAR.depths(mesh.vertices).argsort()[:12:4]
+    moves = torch.zeros(3, *mesh.vertices.shape, dtype=torch.float64)
+    for move, vertex in zip(moves, nearest, strict=True):
+        move[vertex] = torch.tensor([0.5, 0.7, -0.5])
+    return moves
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [32, 64, 224])
 @pytest.mark.parametrize("name", PARTS)
-def test_gradients_by_single_vertices_are_differences_where_a_part_hides_another(name, size):
-    """Each nearest vertex alone: the error at 2² samples is larger than at 8², and at 32² it is small."""
+def test_gradients_by_single_vertices_are_differences_if_a_part_hides_another(name, size):
     mesh = concatenate(PARTS[name])
-    points, direction = torch.from_numpy(mesh.vertices), torch.tensor([0.5, 0.7, -0.5], dtype=torch.float64)
-    nearest = NEAR.depths(mesh.vertices).argsort()[:12:4].copy()
-    directions = points.new_zeros(len(nearest), *points.shape)
-    directions[range(len(nearest)), nearest] = direction
-
-    def image(offset: Tensor, samples: int) -> Tensor:
-        vertices, moves = points + offset, offset.requires_grad
-        return rendered(mesh, NEAR, samples, size, vertices=vertices, normals="flat", silhouettes=moves)
-
-    step, finest = min(NEAR.width / size / 2, 0.04), 2048 // size
-    coarse, fine = (differences(image, directions, size, finest, by) for by in (step, step / 2))
-    expected = (4 * fine - coarse) / 3  # the error of differences falls with the square of the step
+    image = MovedVertices(mesh, NEAR, size, "flat")
+    directions = moves_of_nearest_vertices(mesh)
+    # The error of differences falls with the square of the step.
+    step = min(NEAR.width / size / 2, 0.04)
+    coarse = differences(image, directions, FINEST // size, step)
+    fine = differences(image, directions, FINEST // size, step / 2)
+    expected = (4 * fine - coarse) / 3
     for samples, bound in ERROR_BY_SAMPLES.items():
-        if samples * size <= 2048:
-            found = derivatives(image, directions, size, samples)
-            assert float((found - expected).norm() / expected.norm()) < bound
+        if samples * size <= FINEST:
+            found = derivatives(image, directions, samples)
+            assert relative_error(found, expected) < bound
 
 
-def test_outlines_take_the_samples_of_their_documented_accuracy_unless_a_number_is_given():
-    mesh = named("pear")
-    images = [rendered(mesh, FAR, samples, 16, silhouettes=moves) for samples, moves in [(None, True), (8, False)]]
-    assert torch.equal(*images)
-    images = [rendered(mesh, FAR, samples, 16, silhouettes=moves) for samples, moves in [(2, True), (None, False)]]
-    assert torch.equal(*images)
+# ---------------------------------------------------------------------------- samples
+
+
+def test_outlines_take_the_samples_of_their_documented_accuracy_by_default():
+    mesh = named_mesh("pear")
+    default = rendered(mesh, FAR, 16, None)
+    assert torch.equal(default, rendered(mesh, FAR, 16, 8, silhouettes=False))
+
+
+def test_outlines_take_the_samples_that_are_given():
+    mesh = named_mesh("pear")
+    few = rendered(mesh, FAR, 16, 2)
+    assert torch.equal(few, rendered(mesh, FAR, 16, None, silhouettes=False))
