@@ -72,6 +72,7 @@ from train import TrainingSceneSettings as TrainingSceneSettings
 from train import TrainSettings as TrainSettings
 from train import audit as audit
 from train import evaluate as evaluate
+from train import harden as harden
 from train import load as load
 from train import load_run as load_run
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers import load_classifier
+from augment.classifiers import Classifier, load_classifier
 from renderer.errors import InputError
 from train import console
 from train.data.cache import TensorCache
@@ -34,11 +34,13 @@ class Initial:
         source: The file of a run's network, or the name of a classifier.
         architecture: What rebuilds the network (see `train.networks.describe`).
         weights: Its state dict.
+        network: The network itself, of which the run trains a copy. None if its name builds it.
     """
 
     source: Path
     architecture: dict[str, Any]
     weights: dict[str, Tensor]
+    network: nn.Module | None = None
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -121,6 +123,22 @@ def _classifier(name: str, weights: str | None, size: int | None) -> Initial:
     shape = {"name": name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     return Initial(Path(name), architecture, network.state_dict())
+
+
+def initial_of(classifier: Classifier, size: int | None) -> Initial:
+    """Make the network that a run begins with of a classifier that has no name to build it by.
+
+    Args:
+        classifier: The classifier.
+        size: The pixels per side of the images. None for those of the classifier.
+
+    Returns:
+        The network.
+    """
+    network = cast(nn.Module, classifier.function)
+    shape = {"name": classifier.name, CLASSIFIER: True}
+    architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
+    return Initial(Path(classifier.name), architecture, network.state_dict(), network)
 
 
 @dataclass(frozen=True)

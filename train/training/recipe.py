@@ -98,7 +98,8 @@ def freeze(network: nn.Module, stage: str) -> None:
     Args:
         network: Network, which is changed.
         stage: Name of the last frozen module, such as "blocks.5". With
-            ALL_BUT_LAST, everything before the last layer is frozen.
+            ALL_BUT_LAST, everything before the last layer is frozen, which is
+            nothing if there is no other layer.
 
     Raises:
         InputError: If there is no module of this name, or if it has no
@@ -108,6 +109,8 @@ def freeze(network: nn.Module, stage: str) -> None:
     modules = [name.rpartition(".")[0] for name in names]
     if stage == ALL_BUT_LAST:
         frozen = [index for index, module in enumerate(modules) if module != modules[-1]]
+        if not frozen:
+            return
     else:
         frozen = [index for index, name in enumerate(names) if name.startswith(f"{stage}.")]
     if not frozen:

@@ -3,6 +3,7 @@
 `train.__main__` makes runs and calls their steps in order: `load`, `fit`, `score`, `export`.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -336,8 +337,11 @@ def build_trainer(
         images = data.train.sample(SAMPLED)
     mean, std = channel_statistics(images)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    with renamed(**keys_of("model", settings.model)):
-        network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
+    if initial and initial.network is not None:
+        network = deepcopy(initial.network).requires_grad_(True)
+    else:
+        with renamed(**keys_of("model", settings.model)):
+            network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {
         "classes": list(data.classes),
         "size": data.size,

@@ -1,0 +1,138 @@
+"""A copy of any network is hardened in one call, as pnb-train does it."""
+
+from copy import deepcopy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+
+import norm_balls as nb
+from tests.runs import completed_run
+from train.__main__ import main
+
+SIZE = 8
+CLASSES = ["apple", "orange", "pear"]
+# Fields of the settings with which a training takes seconds.
+SHORT = {
+    "train": {"epochs": 1, "images_per_epoch": 16, "batch_size": 8},
+    "scene": {"views": 1, "backgrounds": [0.5]},
+    "renderer": {"rasterizer": "numpy", "samples": 1},
+    "data": {"workers": 0},
+}
+MODULE = """
+import torch
+from torch import nn
+
+def make():
+    network = nn.Sequential(
+        nn.AdaptiveAvgPool2d(2), nn.Flatten(), nn.Linear(12, 8), nn.Tanh(), nn.Linear(8, 3)
+    )
+    network.load_state_dict(torch.load("weights.pth"))
+    return network.eval(), 8, ["apple", "orange", "pear"]
+"""
+
+
+def build() -> nn.Sequential:
+    """Build a network with random weights."""
+    layers = [nn.Linear(12, 8), nn.Tanh(), nn.Linear(8, 3)]
+    return nn.Sequential(nn.AdaptiveAvgPool2d(2), nn.Flatten(), *layers)
+
+
+@pytest.fixture
+def network() -> nn.Sequential:
+    torch.manual_seed(0)
+    return build().eval()
+
+
+@pytest.fixture
+def photographs(tmp_path) -> Path:
+    """Write 20 images of noise, and return their folder."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    draws = np.random.default_rng(0)
+    for index in range(20):
+        pixels = draws.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{index}.png")
+    return folder
+
+
+def harden(network: nn.Module, photographs: Path, **options) -> nn.Module:
+    options = {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
+    return nb.harden(network, ["solid:orange:0"], photographs, **options)
+
+
+def test_the_result_loads_where_the_network_was_loaded(network, photographs):
+    hardened = harden(network, photographs, normalization="imagenet")
+    assert type(hardened) is type(network) and not hardened.training
+    fresh = build()
+    fresh.load_state_dict(hardened.state_dict(), strict=True)
+    assert not torch.equal(fresh[4].weight, network[4].weight)
+    # Only the last layer learns.
+    assert torch.equal(fresh[2].weight, network[2].weight)
+
+
+def test_the_network_and_the_state_of_torch_stay_as_they_were(network, photographs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    weights = deepcopy(network.state_dict())
+    random_state = torch.get_rng_state()
+    threads = torch.get_num_threads()
+    files = sorted(tmp_path.rglob("*"))
+    harden(network, photographs)
+    assert all(value.equal(weights[name]) for name, value in network.state_dict().items())
+    assert all(parameter.requires_grad for parameter in network.parameters())
+    assert torch.equal(torch.get_rng_state(), random_state)
+    assert torch.get_num_threads() == threads
+    assert sorted(tmp_path.rglob("*")) == files
+
+
+def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, monkeypatch):
+    """The command builds the network by a function of a user's module."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    torch.save(network.state_dict(), "weights.pth")
+    (tmp_path / "module_of_a_user.py").write_text(MODULE)
+    overrides = [
+        "experiment=classifier",
+        "train.init_from=python:module_of_a_user:make",
+        f"data.path={photographs}",
+        "data.workers=0",
+        "scene.meshes=[solid:orange:0]",
+        "scene.hard_negatives=[solid:lemon]",
+        "scene.views=1",
+        "scene.backgrounds=[0.5]",
+        "renderer.rasterizer=numpy",
+        "renderer.samples=1",
+        "train.epochs=1",
+        "train.images_per_epoch=16",
+        "train.batch_size=8",
+        "train.cache=null",
+        "train.device=cpu",
+    ]
+    completed_run(main.read(overrides), tmp_path / "run")
+    expected = torch.load(tmp_path / "run" / "weights.pt")
+    hardened = harden(network, photographs, out=tmp_path / "hardened")
+    assert all(value.equal(expected[name]) for name, value in hardened.state_dict().items())
+    written = torch.load(tmp_path / "hardened" / "weights.pt")
+    assert all(value.equal(expected[name]) for name, value in written.items())
+
+
+def test_a_classifier_is_hardened_as_its_network_is(network, photographs):
+    classifier = nb.Classifier(deepcopy(network), SIZE, CLASSES)
+    options = {"classes": None, "size": None}
+    hardened = harden(classifier, photographs, **options)
+    expected = harden(network, photographs)
+    assert isinstance(hardened, nb.Classifier)
+    assert torch.equal(hardened.function[4].weight, expected[4].weight)
+
+
+def test_a_field_that_does_not_exist_is_refused(network, photographs):
+    with pytest.raises(nb.InputError, match=r"train\.epoch"):
+        harden(network, photographs, train={"epoch": 1})
+
+
+def test_a_function_is_refused(photographs):
+    with pytest.raises(nb.InputError, match="network"):
+        harden(lambda images: images.mean((2, 3)), photographs)

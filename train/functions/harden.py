@@ -1,0 +1,220 @@
+"""Hardening of any network in one call."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from augment.classifiers import Classifier
+from augment.classifiers.adapter import Normalized
+from augment.classifiers.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    device_of,
+)
+from augment.settings import AugmentationSettings, RendererSettings
+from renderer.errors import InputError, describe
+from renderer.settings import Settings
+from renderer.validation import as_path, require_kind
+from train import console
+from train.__main__ import main
+from train.command import read_settings
+from train.data.load import load_data
+from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.report.report_page import report_of
+from train.report.results import require_new_run
+from train.runs.run_lock import sole_writer
+from train.runs.saved_networks import without_normalization
+from train.settings import (
+    DataSettings,
+    ExperimentSettings,
+    TrainingSceneSettings,
+    TrainSettings,
+    label_names,
+    solid_name,
+)
+from train.system.folders import folder_or_temporary
+from train.system.user_errors import renamed
+from train.training.initial import initial_of
+from train.training.run import Run
+
+# What a section of the settings is given as: all of its fields, or those to
+# change by name.
+Section = Mapping[str, Any] | None
+
+
+def harden(
+    network: nn.Module,
+    meshes: Sequence[MeshItem],
+    photographs: str | Path,
+    label: str | int | None = None,
+    *,
+    hard_negatives: Sequence[MeshItem] | None = None,
+    classes: Sequence[str] | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
+    train: TrainSettings | Section = None,
+    augment: AugmentationSettings | Section = None,
+    scene: TrainingSceneSettings | Section = None,
+    renderer: RendererSettings | Section = None,
+    data: DataSettings | Section = None,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> nn.Module:
+    """Train a copy of a network to recognize objects in strange light.
+
+    This is `pnb-train experiment=classifier`: the last layer learns from
+    renders, and the network keeps its answers on photographs.
+
+    Args:
+        network: A plain network from images to logits, in evaluation mode, or
+            a `Classifier` that contains one. It stays as it is.
+        meshes: Meshes of the class: files, solids such as "solid:orange", or
+            pairs of these and the class. Meshes of several classes harden all
+            of them.
+        photographs: Folder of any photographs, with labels or without.
+        label: Class of the meshes, a name or an index. None if each mesh is in
+            a pair with its class, or is named by it.
+        hard_negatives: Meshes of other things, which the network must not take
+            for the class. None for generated fruit.
+        classes: Names of the classes of a plain network, in the order of its
+            outputs. None for "0", "1" and so on.
+        size: Pixels per side of the images of a plain network. None for 224.
+        normalization: "imagenet", or mean and standard deviation, as `attack`
+            takes it.
+        value_range: Values of black and white that a plain network takes before
+            normalization.
+        train: Fields of `TrainSettings` that differ from the experiment, such
+            as {"epochs": 5, "learning_rate": 0.01}, or all of them.
+        augment: The same of `AugmentationSettings`.
+        scene: The same of `TrainingSceneSettings`, such as {"views": 4}.
+        renderer: The same of `RendererSettings`.
+        data: The same of `DataSettings`.
+        seed: Seed of all random draws.
+        device: Device that computes. None for that of the network.
+        out: Folder for the files of the run. None for a temporary one.
+        overwrite: Whether to replace results in `out`.
+
+    Returns:
+        The hardened copy, of the same class and in evaluation mode. Its state
+        dict loads where that of `network` was loaded.
+
+    Raises:
+        InputError: If an input cannot be read, if the network lacks a class, or
+            if a setting is wrong. The sentence then begins with its key, such
+            as "train.epochs".
+
+    Example:
+        >>> hardened = harden(network, ["orange.glb"], "photos", classes=classes,
+        ...     normalization="imagenet")  # doctest: +SKIP
+        >>> torch.save(hardened.state_dict(), "hardened.pth")  # doctest: +SKIP
+    """
+    require_kind("network", network, nn.Module, "a torch.nn.Module, whose weights are trained")
+    device = device_of(network) if device is None else device
+    options = (size, classes, normalization, value_range, device)
+    with folder_or_temporary(out) as folder:
+        classifier = as_classifier(deepcopy(network), *options)
+        if next(classifier.parameters(), None) is None:
+            raise InputError("network has no parameters: give one whose weights can be trained")
+        items = as_mappings("meshes", meshes, classifier)
+        labels = studied_classes(label, items, classifier)
+        changes: dict[str, Any] = {
+            "run": str(folder.absolute()),
+            "seed": seed,
+            "overwrite": overwrite,
+            "label": labels[0] if len(labels) == 1 else labels,
+            "data": {"name": "unlabelled", "path": str(as_path("photographs", photographs))},
+            "scene": {"meshes": items},
+            "train": {"init_from": classifier.name, "device": str(device)},
+        }
+        if hard_negatives is not None:
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+            changes["scene"]["hard_negatives"] = negatives
+        if out is None:
+            changes["train"]["cache"] = None
+        sections = {
+            "train": train,
+            "augment": augment,
+            "scene": scene,
+            "renderer": renderer,
+            "data": data,
+        }
+        settings = _read_settings(changes, sections)
+        require_new_run(folder, "out", overwrite, resume=False)
+        with sole_writer("out", folder), _state_of_torch_kept():
+            trained = _train(settings, classifier, has_report=out is not None)
+    return _copy_with(network, classifier, trained)
+
+
+def _read_settings(changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]) -> ExperimentSettings:
+    """Read the settings of the experiment with changes, and then those of the caller."""
+    composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
+    names = [item.name for item in fields(ExperimentSettings)]
+    settings = OmegaConf.create({name: composed[name] for name in names})
+    given = {name: _as_mapping(name, section) for name, section in sections.items()}
+    merged = OmegaConf.merge(settings, changes, given)
+    if "hard_negatives" not in changes["scene"]:
+        labels = label_names(changes["label"])
+        negatives = [item for item in merged.scene.hard_negatives if solid_name(item) not in labels]
+        merged.scene.hard_negatives = negatives
+    return read_settings(ExperimentSettings, cast(DictConfig, merged))
+
+
+def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
+    """Return the fields of a section of the settings by name."""
+    if isinstance(section, Settings):
+        return asdict(cast(Any, section))
+    if section is None or isinstance(section, Mapping):
+        return section or {}
+    raise InputError(f"{name} is {describe(section)}: give a mapping of fields, or settings")
+
+
+@contextmanager
+def _state_of_torch_kept() -> Iterator[None]:
+    """Restore torch's threads, random state and choice of algorithms at the end of the block."""
+    threads = torch.get_num_threads()
+    is_benchmarked = torch.backends.cudnn.benchmark
+    try:
+        with torch.random.fork_rng():
+            yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.backends.cudnn.benchmark = is_benchmarked
+
+
+def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
+    """Train a copy of a classifier in the folder of the run, and return its network."""
+    folder = Path(settings.run)
+    initial = initial_of(classifier, settings.data.size)
+    with renamed(**{"data.path": "photographs"}):
+        data = load_data(settings, initial.size)
+    run = Run(settings, data, folder, initial)
+    run.load()
+    run.fit()
+    run.score()
+    run.export()
+    if has_report:
+        console.info("%s", report_of([folder], folder))
+    return run.trainer.selected.network
+
+
+def _copy_with(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
+    """Return a copy of a network with the weights that its classifier has learned."""
+    copy = deepcopy(network)
+    if isinstance(copy, Classifier):
+        cast(nn.Module, copy.function).load_state_dict(trained.state_dict())
+        return copy
+    is_wrapped = type(classifier.function) is Normalized and type(network) is not Normalized
+    learned = without_normalization(trained) if is_wrapped else trained
+    copy.load_state_dict(learned.state_dict())
+    return copy
