@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from tests.train.helpers import read_markdown
 from train import __main__ as command
+from train.command import USER_ERROR
 from train.commands import sweep
 from train.commands.sweep import format_sweep
 from train.runs.checkpoint import LAST
@@ -24,12 +26,19 @@ from train.runs.run_names import run_name
 from train.training import loop
 
 ROOT = Path(__file__).parents[3]
-USER_ERROR = 2
 SMALL = [
     "experiment=paper",
-    "augment=none", "data=npz", "model.depth=10", "model.width=1", "train.epochs=2", "train.batch_size=16",
-    "train.learning_rate=0.05", "train.precision=float32", "train.device=cpu", "evaluate.photos=null",
-]  # fmt: skip
+    "augment=none",
+    "data=npz",
+    "model.depth=10",
+    "model.width=1",
+    "train.epochs=2",
+    "train.batch_size=16",
+    "train.learning_rate=0.05",
+    "train.precision=float32",
+    "train.device=cpu",
+    "evaluate.photos=null",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -38,13 +47,16 @@ def no_report(monkeypatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def run_sweep(tiny_npz):
-    """`python -m train --multirun` with a small network in this process, without its logs; its exit status."""
+def run_sweep(tiny_npz) -> Callable[..., int | None]:
+    """Return a function that trains a small network by a sweep in this process.
+
+    The function returns the exit status.
+    """
 
     def run(folder: Path, *overrides: str) -> int | None:
-        arguments = ["--multirun", *SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
+        arguments = [*SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["train", *arguments])
+            patch.setattr(sys, "argv", ["train", "--multirun", *arguments])
             try:
                 command.main()
             except SystemExit as stop:
@@ -55,42 +67,58 @@ def run_sweep(tiny_npz):
 
 
 @pytest.fixture(scope="module")
-def folder_of(tiny_npz):
-    """The folder of a run of `run_sweep`, by its further overrides; of a key's values the last counts, and the runs
-    differ in the last key."""
+def folder_of(tiny_npz) -> Callable[..., Path]:
+    """Return a function that finds the folder of a run of `run_sweep` by its overrides.
+
+    The runs of the sweep differ in the key of the last override.
+    """
 
     def find(parent: Path, *overrides: str) -> Path:
-        last = {override.partition("=")[0]: override for override in [*SMALL, f"data.path={tiny_npz}", *overrides]}
-        return parent / run_name([*last.values()], last.keys() - {overrides[-1].partition("=")[0]}, str(parent))
+        override_of_key = {}
+        for override in [*SMALL, f"data.path={tiny_npz}", *overrides]:
+            key, _, _ = override.partition("=")
+            override_of_key[key] = override  # The last value of a key counts.
+        common_keys = [other for other in override_of_key if other != key]
+        return parent / run_name([*override_of_key.values()], common_keys, str(parent))
 
     return find
 
 
 @pytest.fixture(scope="module")
 def swept(run_sweep, tmp_path_factory) -> Path:
-    """A finished sweep over two seeds."""
+    """Finish a sweep over two seeds, and return its folder."""
     folder = tmp_path_factory.mktemp("sweeps") / "swept"
     assert run_sweep(folder, "seed=0,1") == 0
     return folder
 
 
-def require_same_weights(*folders: Path) -> None:
-    first, second = (torch.load(folder / LAST, weights_only=True)["model"] for folder in folders)
-    assert all(torch.equal(first[name], second[name]) for name in first)
+def require_same_weights(first: Path, second: Path) -> None:
+    first_weights = torch.load(first / LAST, weights_only=True)["model"]
+    second_weights = torch.load(second / LAST, weights_only=True)["model"]
+    for name, value in first_weights.items():
+        assert torch.equal(value, second_weights[name])
 
 
 @pytest.mark.parametrize(
-    "overrides, name",
+    ("overrides", "name"),
     [
-        ([], "run@"),
-        (["seed=0", "augment=none", "model.depth=10"], "augment-none+seed-0@"),
-        (["launcher=joblib", "sweep=runs/x", "train.device=cpu", "seed=0", "train.resume=true"], "seed-0@"),
-        (["train.learning_rate=1e-3", "seed=-1"], "seed--1+train.learning_rate-1e-3@"),
-        (["scene.meshes=[a.glb,{mesh:b.glb,albedo_scale:2}]"], "scene.meshes-_a.glb_mesh_b.glb_albedo_scale_2_@"),
+        ([], "run"),
+        (["seed=0", "augment=none", "model.depth=10"], "augment-none+seed-0"),
+        (
+            ["launcher=joblib", "sweep=runs/x", "train.device=cpu", "seed=0", "train.resume=true"],
+            "seed-0",
+        ),
+        (["train.learning_rate=1e-3", "seed=-1"], "seed--1+train.learning_rate-1e-3"),
+        (
+            ["scene.meshes=[a.glb,{mesh:b.glb,albedo_scale:2}]"],
+            "scene.meshes-_a.glb_mesh_b.glb_albedo_scale_2_",
+        ),
     ],
 )
 def test_a_run_of_a_sweep_is_named_by_the_overrides_that_are_its_own(overrides, name):
-    assert run_name(overrides, ["model.depth"]).partition("@")[0] == name[:-1]
+    found, at, _ = run_name(overrides, ["model.depth"]).partition("@")
+    assert at
+    assert found == name
 
 
 def test_a_run_keeps_its_folder_when_a_sweep_gets_more_values(tmp_path):
@@ -99,43 +127,75 @@ def test_a_run_keeps_its_folder_when_a_sweep_gets_more_values(tmp_path):
     assert run_name(["seed=0", "augment=none"], [], str(tmp_path)) == first
 
 
-VALUES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\n"), max_size=300)
-RUNS = st.dictionaries(st.sampled_from(["seed", "augment", "data.path", "scene.meshes"]), VALUES)
+def name_of(values: dict[str, str]) -> str:
+    overrides = [f"{key}={value}" for key, value in values.items()]
+    return run_name(overrides, ["data.path"])
+
+
+CHARACTERS = st.characters(exclude_categories=["Cs"], exclude_characters="\n")
+VALUES = st.text(CHARACTERS, max_size=300)
+KEYS = st.sampled_from(["seed", "augment", "data.path", "scene.meshes"])
+RUNS = st.dictionaries(KEYS, VALUES)
 
 
 @given(RUNS, RUNS)
-def test_different_runs_have_different_names_that_file_systems_and_command_lines_take(first, second):
-    names = [run_name([f"{key}={value}" for key, value in run.items()], ["data.path"]) for run in (first, second)]
-    assert (names[0].lower() == names[1].lower()) == (first == second)
-    for name in names:
-        assert len(name.encode()) < 256 and not name.startswith((".", "-"))
-        (override,) = OverridesParser.create().parse_overrides([f"run=runs/sweep/{name}"])
-        assert override.value() == f"runs/sweep/{name}"
+def test_different_runs_have_different_names_also_if_case_does_not_count(first, second):
+    has_same_name = name_of(first).lower() == name_of(second).lower()
+    assert has_same_name == (first == second)
+
+
+@given(RUNS)
+def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
+    name = name_of(values)
+    assert len(name.encode()) < 256
+    assert not name.startswith((".", "-"))
+    (override,) = OverridesParser.create().parse_overrides([f"run=runs/sweep/{name}"])
+    assert override.value() == f"runs/sweep/{name}"
+
+
+def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
+    """Read the contents and the modification times of all files, except for locks."""
+    files = {}
+    for folder in folders:
+        for path in folder.rglob("*"):
+            if path.is_file() and path.name != LOCK:
+                files[path] = (path.read_bytes(), path.stat().st_mtime_ns)
+    return files
 
 
 def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
-    run_sweep, folder_of, swept, capsys, read_markdown
+    run_sweep,
+    folder_of,
+    swept,
+    capsys,
 ):
     folders = [folder_of(swept, f"seed={seed}") for seed in (0, 1)]
-
-    def files():
-        paths = [path for folder in folders for path in folder.rglob("*") if path.is_file() and path.name != LOCK]
-        return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
-
-    before = files()
+    before = read_files(folders)
     assert run_sweep(swept, "seed=0,1") == 0
-    assert files() == before
+    assert read_files(folders) == before
     printed = capsys.readouterr().out
-    assert all(f"finished before: {folder}\n" in printed for folder in folders)
+    for folder in folders:
+        assert f"finished before: {folder}\n" in printed
     (table,) = read_markdown(printed).values()
-    assert [row[:2] for row in table] == [["network", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]]
+    assert [row[:2] for row in table] == [
+        ["network", "seed"],
+        ["none", "0"],
+        ["none", "1"],
+        ["none", "2 seeds"],
+    ]
 
 
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
-    run_sweep, folder_of, swept, tmp_path, monkeypatch, capsys
+    run_sweep,
+    folder_of,
+    swept,
+    tmp_path,
+    monkeypatch,
+    capsys,
 ):
-    evaluate, calls = loop.evaluate, []
+    evaluate = loop.evaluate
     handler = signal.getsignal(signal.SIGTERM)
+    calls = []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -147,11 +207,15 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
         patch.setattr(loop, "evaluate", interrupted)
         assert run_sweep(tmp_path, "seed=0,1") == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) == handler
-    first, second = (folder_of(tmp_path, f"seed={seed}") for seed in (0, 1))
-    assert (first / LAST).exists() and not second.exists()
-    assert capsys.readouterr().out.splitlines()[-7:-1:2] == [
-        "0 of 2 runs are finished", f"{first}: interrupted", f"{second}: not begun"
-    ]  # fmt: skip
+    first = folder_of(tmp_path, "seed=0")
+    second = folder_of(tmp_path, "seed=1")
+    assert (first / LAST).exists()
+    assert not second.exists()
+    printed = capsys.readouterr().out
+    assert "0 of 2 runs are finished\n" in printed
+    assert f"{first}: interrupted\n" in printed
+    assert f"{second}: not begun\n" in printed
+
     assert run_sweep(tmp_path, "seed=0,1") == 0
     for folder in (first, second):
         require_same_weights(folder, swept / folder.name)
@@ -159,7 +223,11 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
 
 
 def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_other(
-    run_sweep, folder_of, tmp_path, monkeypatch, capsys
+    run_sweep,
+    folder_of,
+    tmp_path,
+    monkeypatch,
+    capsys,
 ):
     fit = sweep.Run.fit
 
@@ -168,22 +236,26 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
             raise ZeroDivisionError("a mistake of the program")
         fit(run)
 
-    rates = ("-1", "0.05", "0.5")
-    overrides = ["train.epochs=1", f"train.learning_rate={','.join(rates)}"]
-    wrong, right, unlucky = (folder_of(tmp_path, overrides[0], f"train.learning_rate={rate}") for rate in rates)
+    overrides = ["train.epochs=1", "train.learning_rate=-1,0.05,0.5"]
+    wrong = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=-1")
+    right = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.05")
+    unlucky = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.5")
     with monkeypatch.context() as patch:
         patch.setattr(sweep.Run, "fit", broken)
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
     assert "1 of 3 runs are finished\n" in printed
-    reasons = [(wrong, "train.learning_rate=-1.0 must be above 0"), (unlucky, "ZeroDivisionError: a mistake")]
-    for folder, reason in reasons:
-        assert f"{folder}: failed: {(folder / FAILURE).read_text()}" in printed and reason in printed
+    for folder, reason in [(wrong, "train.learning_rate=-1.0"), (unlucky, "ZeroDivisionError")]:
+        failure = (folder / FAILURE).read_text()
+        assert reason in failure
+        assert f"{folder}: failed: {failure}" in printed
 
     assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
-    assert f"finished before: {right}\n" in printed and "2 of 3 runs are finished\n" in printed
-    assert f"{wrong}: failed: " in printed and not (unlucky / FAILURE).exists()
+    assert f"finished before: {right}\n" in printed
+    assert "2 of 3 runs are finished\n" in printed
+    assert f"{wrong}: failed: " in printed
+    assert not (unlucky / FAILURE).exists()
 
 
 def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, tmp_path, capsys):
@@ -195,69 +267,106 @@ def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, t
     assert [path.name for path in folder.iterdir()] == [LOCK]
 
 
-@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize("is_finished", [True, False])
 def test_a_run_with_other_settings_is_refused_before_any_is_trained(
-    run_sweep, folder_of, swept, tmp_path, capsys, finished
+    run_sweep,
+    folder_of,
+    swept,
+    tmp_path,
+    capsys,
+    is_finished,
 ):
-    folder = folder_of(shutil.copytree(swept, tmp_path / "edited"), "seed=0")
+    parent = shutil.copytree(swept, tmp_path / "edited")
+    folder = folder_of(parent, "seed=0")
     config = (folder / "config.yaml").read_text()
     (folder / "config.yaml").write_text(config.replace("  epochs: 2\n", "  epochs: 7\n"))
-    if not finished:
+    if not is_finished:
         (folder / "metrics.jsonl").unlink()
-    assert run_sweep(folder.parent, "seed=2,0") == USER_ERROR
+    assert run_sweep(parent, "seed=2,0") == USER_ERROR
     printed = capsys.readouterr()
-    assert printed.out == "" and printed.err.startswith(f"error: {folder} was made with train.epochs=7, not 2")
-    assert not folder_of(folder.parent, "seed=2").exists()
+    assert printed.out == ""
+    assert printed.err.startswith(f"error: {folder} was made with train.epochs=7, not 2")
+    assert not folder_of(parent, "seed=2").exists()
 
 
 @pytest.mark.parametrize(
-    "launcher, plugin", [("joblib", "joblib"), ("slurm", "submitit"), ("submitit_local", "submitit")]
+    ("launcher", "plugin"),
+    [("joblib", "joblib"), ("slurm", "submitit"), ("submitit_local", "submitit")],
 )
 def test_the_settings_of_every_launcher_are_accepted_by_its_plugin(launcher, plugin):
     pytest.importorskip(f"hydra_plugins.hydra_{plugin}_launcher")
     with initialize_config_module("conf", version_base="1.3"):
         config = compose("train", [f"launcher={launcher}"], return_hydra_config=True)
-    assert config.hydra.launcher._target_.startswith(f"hydra_plugins.hydra_{plugin}_launcher.")
+    target = config.hydra.launcher._target_
+    assert target.startswith(f"hydra_plugins.hydra_{plugin}_launcher.")
 
 
-def sweep_process(folder: Path, *overrides: str) -> subprocess.Popen:
-    """`python -m train --multirun` with a small network in processes of its own; it prints to output.txt."""
-    environment = {name: value for name, value in os.environ.items() if name != "SUBMITIT_EXECUTOR"}
-    command = [sys.executable, "-m", "train", "--multirun", *SMALL, f"sweep={folder}", *overrides]
-    environment["PYTHONPATH"] = str(ROOT)
+def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
+    """Start a sweep of a small network in processes of its own, which print to output.txt."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.pop("SUBMITIT_EXECUTOR", None)
+    arguments = ["-m", "train", "--multirun", *SMALL, f"sweep={folder}", *overrides]
     with open(folder.parent / "output.txt", "w") as output:
-        return subprocess.Popen(command, cwd=folder.parent, env=environment, stdout=output, stderr=output)
+        return subprocess.Popen(
+            [sys.executable, *arguments],
+            cwd=folder.parent,
+            env=environment,
+            stdout=output,
+            stderr=output,
+        )
 
 
 @pytest.mark.slow
 def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    overrides = [f"data.path={tiny_npz}", "train.learning_rate=0.05,-1", "launcher=joblib", "hydra.launcher.n_jobs=2"]
-    assert sweep_process(tmp_path / "sweep", *overrides).wait(300) == 1
+    folder = tmp_path / "sweep"
+    process = start_sweep(
+        folder,
+        f"data.path={tiny_npz}",
+        "train.learning_rate=0.05,-1",
+        "launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+    )
+    assert process.wait(300) == 1
     printed = (tmp_path / "output.txt").read_text()
-    good, bad = (folder_of(tmp_path / "sweep", f"train.learning_rate={rate}") for rate in ("0.05", "-1"))
+    assert "Traceback" not in printed
+    good = folder_of(folder, "train.learning_rate=0.05")
+    bad = folder_of(folder, "train.learning_rate=-1")
     (table,) = read_markdown(printed).values()
-    assert [row[0] for row in table] == ["network", "none"] and "Traceback" not in printed
+    assert [row[0] for row in table] == ["network", "none"]
     assert f"{bad}: failed: {(bad / FAILURE).read_text()}" in printed
+    first_run = [line for line in printed.splitlines() if line.startswith("#0 ")]
     log = (good / "train.log").read_text().splitlines()
-    assert [line.removeprefix("#0 ") for line in printed.splitlines() if line.startswith("#0 ")] == log
+    assert [line.removeprefix("#0 ") for line in first_run] == log
+
+
+def child_of(process_id: int) -> int:
+    """Return the id of the only child of a process."""
+    return int(Path(f"/proc/{process_id}/task/{process_id}/children").read_text())
 
 
 @pytest.mark.slow
 def test_a_preempted_job_of_submitit_queues_itself_again_and_ends_with_the_same_weights(
     run_sweep, folder_of, tiny_npz, tmp_path
 ):
-    """The signal comes as from Slurm, to the process that submitit's controller started."""
+    """Send the signal, as Slurm does, to the process that submitit's controller started."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    epochs, log = "train.epochs=20", tmp_path / "none"
-    process = sweep_process(tmp_path / "jobs", f"data.path={tiny_npz}", epochs, "launcher=submitit_local")
+    epochs = "train.epochs=20"
+    data = f"data.path={tiny_npz}"
+    process = start_sweep(tmp_path / "jobs", data, epochs, "launcher=submitit_local")
+    log = tmp_path / "none"
     while not (log.is_file() and "epoch 2/" in log.read_text()):
         assert process.poll() is None
         time.sleep(0.05)
         log = next(tmp_path.glob("jobs/.submitit/*/*_log.out"), log)
-    controller = log.name.partition("_")[0]
-    os.kill(int(Path(f"/proc/{controller}/task/{controller}/children").read_text()), signal.SIGUSR2)
+    controller, _, _ = log.name.partition("_")
+    os.kill(child_of(int(controller)), signal.SIGUSR2)
     assert process.wait(300) == 0
-    assert "Requeued job" in log.read_text() and "resumed" in log.read_text()
+    assert "Requeued job" in log.read_text()
+    assert "resumed" in log.read_text()
+
     assert run_sweep(tmp_path / "undisturbed", epochs) == 0
-    require_same_weights(*(folder_of(tmp_path / name, epochs) for name in ("jobs", "undisturbed")))
+    require_same_weights(
+        folder_of(tmp_path / "jobs", epochs),
+        folder_of(tmp_path / "undisturbed", epochs),
+    )
