@@ -1,4 +1,4 @@
-"""Commands from start to end: their statuses, their single lines of error, and interrupts."""
+"""Commands from start to end: exit statuses, errors in one line, and interrupts."""
 
 import io
 import os
@@ -28,80 +28,119 @@ from train.system.user_errors import one_sentence, writable_folder
 ROOT = Path(__file__).parents[2]
 SMALL = [
     "experiment=paper",
-    "model.depth=10", "model.width=1", "train.epochs=1", "train.precision=float32", "augment.examples=4",
-    "augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy", "renderer.samples=2",
+    "model.depth=10",
+    "model.width=1",
+    "train.epochs=1",
+    "train.precision=float32",
     "train.threads=1",
-]  # fmt: skip
+    "augment.examples=4",
+    "augment.attack.max_steps=2",
+    "scene.backgrounds=[0,1]",
+    "renderer.rasterizer=numpy",
+    "renderer.samples=2",
+]
+
+
+@pytest.fixture
+def two_arms(tiny_npz) -> list[str]:
+    """Return the overrides of an adversarial arm and one without renders."""
+    return ["data=npz", f"data.path={tiny_npz}", "compare=[none]"]
 
 
 @pytest.fixture
 def no_report(monkeypatch) -> None:
-    """Several trainings of a test write no pages, whose plots take longer."""
+    """Write no page of a training, whose plots take longer than the training."""
     monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
 
 
-def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_path, tiny_npz, photos):
-    """From another folder than the repository's, in the background of a shell, which ignores SIGINT."""
-    overrides = ["run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]"]
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        assert call("train", *overrides, *SMALL) == 0
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
-    printed = capsys.readouterr()
-    assert re.sub(r".* \.\.\.\n", "", printed.err) == ""  # but for what took long
-    rows = [line.split("|")[1].strip() for line in printed.out.splitlines() if line.startswith("|")]
-    assert [row for row in rows if row in ("none", "adversarial")] == ["none", "adversarial"] * 2
-    for folder in (tmp_path / "here", tmp_path / "here" / "none"):
-        assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
-    assert (tmp_path / "here" / "train.log").read_text() == printed.out
-    config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
-    assert shlex.split(config["command"]) == ["python", "-m", "train", *overrides[1:], *SMALL]
-    assert config["working_folder"] == str(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+def modification_times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+class TestTrainingOfTwoArms:
+    @pytest.fixture
+    def overrides(self, two_arms, photos) -> list[str]:
+        return ["run=here", *two_arms, f"evaluate.photos={photos}"]
+
+    @pytest.fixture
+    def printed(self, call, capsys, overrides):
+        """Train in the background of a shell, which ignores SIGINT, and return what is printed."""
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            assert call("train", *overrides, *SMALL) == 0
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        finally:
+            signal.signal(signal.SIGINT, before)
+        return capsys.readouterr()
+
+    def test_ends_with_their_table_and_records_its_command(self, printed, overrides, tmp_path):
+        self.assert_output(printed, tmp_path / "here")
+        config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
+        arguments = [*overrides[1:], *SMALL]
+        assert shlex.split(config["command"]) == ["python", "-m", "train", *arguments]
+        assert config["working_folder"] == str(tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+    def assert_output(self, printed, folder: Path) -> None:
+        """Check the output, the log and the files of a training."""
+        errors = re.sub(r".* \.\.\.\n", "", printed.err)  # Announcements end with dots.
+        assert errors == ""
+        table_lines = [line for line in printed.out.splitlines() if line.startswith("|")]
+        names = [line.split("|")[1].strip() for line in table_lines]
+        arms = [name for name in names if name in ("none", "adversarial")]
+        assert arms == ["none", "adversarial"] * 2
+        for run in (folder, folder / "none"):
+            assert (run / LAST).is_file()
+            assert (run / "photographs" / "contact_sheet.png").is_file()
+        assert (folder / "train.log").read_text() == printed.out
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("arguments", "start"),
     [
-        (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist: give the path of an .npz file"),
-        (["run=file/run"], "run=file/run cannot be written to (Not a directory): choose another folder"),
-        (["run=odd"], "PATH/odd/train.log cannot be read or written: Is a directory"),
+        (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist"),
+        (["run=file/run"], "run=file/run cannot be written to"),
+        (["run=odd"], "PATH/odd/train.log cannot be read or written"),
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["compare=[non]"], "compare: "),
-        (["train.init_from=none"], "train.init_from=none holds neither best.pt nor model.safetensors"),
+        (["train.init_from=none"], "train.init_from=none"),
         (["train.init_from=timm:"], "train.init_from=timm: "),
-        (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
+        (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch"),
         (["--multirun", "seed=0,0"], "the sweep has a run twice"),
-        (["--multirun", "run=a", "seed=0,1"], "run= names the folder of a single run"),
+        (["--multirun", "run=a", "seed=0,1"], "run="),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
-def test_a_mistake_is_one_line_and_status_2(call, capsys, monkeypatch, tmp_path, arguments, sentence):
+def test_a_mistake_is_an_error_in_one_line(call, capsys, monkeypatch, tmp_path, arguments, start):
     monkeypatch.setenv("PATH", str(tmp_path))
     (tmp_path / "file").touch()
     (tmp_path / "odd" / "train.log").mkdir(parents=True)
     assert call("train", *arguments) == USER_ERROR
-    error = capsys.readouterr().err
-    assert error.replace(str(tmp_path), "PATH").startswith(f"error: {sentence}") and error.count("\n") == 1
+    error = capsys.readouterr().err.replace(str(tmp_path), "PATH")
+    assert error.startswith(f"error: {start}")
+    assert error.count("\n") == 1
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(call, capsys, tmp_path, tiny_npz):
-    arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]"]
-    assert call("train", *arms, *SMALL, "scene.views=3") == USER_ERROR
-    assert "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds" in capsys.readouterr().err
+def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
+    call,
+    capsys,
+    tmp_path,
+    two_arms,
+):
+    assert call("train", "run=here", *two_arms, *SMALL, "scene.views=3") == USER_ERROR
+    assert "augment.examples=4" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
 
 
 @pytest.mark.parametrize("busy", ["here", "here/none"])
-def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_npz, busy):
-    arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", "train.resume=true"]
+def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_arms, busy):
     with locked(tmp_path / busy):
-        assert call("train", *arms, *SMALL) == USER_ERROR
-    assert capsys.readouterr().err.startswith(f"error: run={tmp_path / busy} is being written by another process")
-    assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
+        assert call("train", "run=here", *two_arms, *SMALL, "train.resume=true") == USER_ERROR
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: run={tmp_path / busy} is being written by another process")
+    assert not list(tmp_path.rglob("config.yaml"))
+    assert not list(tmp_path.rglob("metrics.jsonl"))
 
 
 def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
@@ -110,89 +149,137 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
     assert "start a sweep with pnb-train --multirun" in capsys.readouterr().err
 
 
-@pytest.fixture
-def stopped(call, capsys, no_report, tmp_path, tiny_npz, photos) -> Path:
-    """A run of two arms with options of its own that SIGTERM ended, and that was then moved."""
-    folder = tmp_path / "begun"
-    data = ["data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]", "seed=3"]
-    with pytest.MonkeyPatch.context() as patch:
+class TestAStoppedRun:
+    @pytest.fixture
+    def stopped(self, call, capsys, no_report, tmp_path, two_arms, photos) -> Path:
+        """Stop a run of two arms by SIGTERM, and move its folder."""
+        folder = tmp_path / "begun"
+        overrides = [*two_arms, f"evaluate.photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
+        with pytest.MonkeyPatch.context() as patch:
 
-        def save_and_stop(*arguments):
-            patch.undo()
-            torch.save(*arguments)
-            signal.raise_signal(signal.SIGTERM)
+            def save_and_stop(*arguments):
+                patch.undo()
+                torch.save(*arguments)
+                signal.raise_signal(signal.SIGTERM)
 
-        patch.setattr(torch, "save", save_and_stop)
-        assert call("train", f"run={folder}", *data, *SMALL, "train.epochs=2") == 128 + signal.SIGTERM
-    command = shlex.split(capsys.readouterr().out.rpartition("to go on: ")[2])
-    assert command == [sys.executable, "-m", "train", f"run={folder}", "train.resume=true"]
-    return folder.rename(tmp_path / "moved")
+            patch.setattr(torch, "save", save_and_stop)
+            status = call("train", f"run={folder}", *overrides)
+        assert status == 128 + signal.SIGTERM
+        advice = shlex.split(capsys.readouterr().out.splitlines()[-1])
+        assert advice[-5:] == [sys.executable, "-m", "train", f"run={folder}", "train.resume=true"]
+        return folder.rename(tmp_path / "moved")
 
+    def test_is_resumed_by_its_folder_alone(self, call, tmp_path, stopped):
+        """Resume both arms, with an additional setting, to the weights of a whole run."""
+        before = yaml.safe_load((stopped / "config.yaml").read_text())
+        additional = "train.checkpoint_every=2"
+        assert call("train", f"run={stopped}", "train.resume=true", additional) == 0
+        config = yaml.safe_load((stopped / "config.yaml").read_text())
+        assert config["command"] == f"{before['command']} {additional}"
+        assert config["run"] == str(stopped)
 
-def test_a_run_is_resumed_by_its_folder_alone(call, tmp_path, stopped):
-    """Its arms, too, to the weights of a run that was not stopped; with further overrides, which are recorded."""
-    before = yaml.safe_load((stopped / "config.yaml").read_text())
-    assert call("train", f"run={stopped}", "train.resume=true", "train.checkpoint_every=2") == 0
-    config = yaml.safe_load((stopped / "config.yaml").read_text())
-    assert config["command"] == f"{before['command']} train.checkpoint_every=2" and config["run"] == str(stopped)
-    begun, whole = shlex.split(config["command"])[3:], tmp_path / "whole"
-    assert call("train", f"run={whole}", *begun) == 0
-    for arm in (".", "none"):
-        states = [torch.load(run / arm / LAST, weights_only=True) for run in (stopped, whole)]
-        assert states[0]["epoch"] == 2 and content_hash(states[0]["model"]) == content_hash(states[1]["model"])
-        assert (stopped / arm / "photographs" / "summary.json").is_file()
-    assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0  # an arm by itself
-    assert not (stopped / "none" / "none").exists()
+        whole = tmp_path / "whole"
+        _, _, _, *overrides = shlex.split(config["command"])
+        assert call("train", f"run={whole}", *overrides) == 0
+        for arm in (".", "none"):
+            resumed_state = torch.load(stopped / arm / LAST, weights_only=True)
+            whole_state = torch.load(whole / arm / LAST, weights_only=True)
+            assert resumed_state["epoch"] == 2
+            assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
+            assert (stopped / arm / "photographs" / "summary.json").is_file()
+
+    def test_is_resumed_arm_by_arm(self, call, stopped):
+        assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0
+        assert not (stopped / "none" / "none").exists()
+
+    @pytest.mark.parametrize(
+        ("override", "message"),
+        [("seed=4", "seed=3, not 4"), ("augment=random", "was made with ")],
+    )
+    def test_is_resumed_with_no_other_settings_that_affect_its_result(
+        self,
+        call,
+        capsys,
+        stopped,
+        override,
+        message,
+    ):
+        before = modification_times(stopped)
+        assert call("train", f"run={stopped}", "train.resume=true", override) == USER_ERROR
+        assert message in capsys.readouterr().err
+        assert modification_times(stopped) == before
 
 
 @pytest.mark.parametrize(
-    "overrides, sentence",
+    ("overrides", "start"),
     [
-        (["run=empty"], "run=empty holds no run to resume"),
-        (["run=nowhere"], "run=nowhere holds no run to resume"),
+        (["run=empty"], "run=empty holds no run"),
+        (["run=nowhere"], "run=nowhere holds no run"),
         ([], "run=runs/"),
-        (["run=attack"], "run=attack holds no run to resume"),
+        (["run=attack"], "run=attack holds no run"),
         (["run=damaged"], "damaged/config.yaml is damaged"),
     ],
     ids=str,
 )
-def test_nothing_is_written_to_a_folder_that_holds_no_run(call, capsys, tmp_path, overrides, sentence):
-    for name, content in (("empty", ""), ("attack", "label: orange\nattack: {}"), ("damaged", "[")):
+def test_nothing_is_written_to_a_folder_without_a_run(call, capsys, tmp_path, overrides, start):
+    for name in ("empty", "attack", "damaged"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yaml").write_text(content)
-    (tmp_path / "empty" / "config.yaml").unlink()
-    files = sorted(tmp_path.rglob("*"))
+    (tmp_path / "attack" / "config.yaml").write_text("label: orange\nattack: {}")
+    (tmp_path / "damaged" / "config.yaml").write_text("[")
+    before = sorted(tmp_path.rglob("*"))
     assert call("train", *overrides, "train.resume=true") == USER_ERROR
     error = capsys.readouterr().err.replace(f"{tmp_path}/", "")
-    assert error.startswith(f"error: {sentence}") and error.count("\n") == 1
-    assert sorted(tmp_path.rglob("*")) == files
+    assert error.startswith(f"error: {start}")
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("stage", ["commands.experiment.load_data", "training.run.evaluate_photographs"])
-def test_ctrl_c_tells_how_to_go_on_from_a_checkpoint(call, capsys, monkeypatch, tmp_path, tiny_npz, photos, stage):
-    monkeypatch.setattr(f"train.{stage}", Mock(side_effect=KeyboardInterrupt))
-    arguments = "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", *SMALL
-    assert call("train", *arguments) == 128 + signal.SIGINT
-    advice = capsys.readouterr().out.splitlines()[-1]
-    has_trained = stage != "commands.experiment.load_data"
-    assert ("train.resume=true" in advice) == (tmp_path / "here" / LAST).is_file() == has_trained
-
-
-def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):
-    files = {path: path.stat().st_mtime_ns for path in stopped.rglob("*")}
-    for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was made with ")):
-        assert call("train", f"run={stopped}", "train.resume=true", override) == USER_ERROR
-        assert key in capsys.readouterr().err
-    assert {path: path.stat().st_mtime_ns for path in stopped.rglob("*")} == files
+@pytest.mark.parametrize(
+    ("function", "has_trained"),
+    [
+        ("train.commands.experiment.load_data", False),
+        ("train.training.run.evaluate_photographs", True),
+    ],
+)
+def test_ctrl_c_tells_how_to_resume_if_there_is_a_checkpoint(
+    call,
+    capsys,
+    monkeypatch,
+    tmp_path,
+    tiny_npz,
+    photos,
+    function,
+    has_trained,
+):
+    monkeypatch.setattr(function, Mock(side_effect=KeyboardInterrupt))
+    data = "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}"
+    assert call("train", "run=here", *data, *SMALL) == 128 + signal.SIGINT
+    last_line = capsys.readouterr().out.splitlines()[-1]
+    assert (tmp_path / "here" / LAST).is_file() == has_trained
+    assert ("train.resume=true" in last_line) == has_trained
 
 
 LIGHT = Command("light", LightSettings, "builtins:print", HelpText("Write a light."))
 
 
-def test_a_librarys_warning_is_one_line_of_a_command():
-    code = "from train.command import set_up_process\nimport warnings\nset_up_process()\nwarnings.warn('clamped')"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
-    assert (ended.returncode, ended.stderr) == (0, "warning: clamped\n")
+WARNING = """
+import warnings
+from train.command import set_up_process
+set_up_process()
+warnings.warn("clamped")
+"""
+
+
+def run_python(code: str) -> subprocess.CompletedProcess:
+    """Run code in a process of its own, in the folder of the repository."""
+    arguments = [sys.executable, "-c", code]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=100, cwd=ROOT)
+
+
+def test_a_warning_of_a_library_is_one_line_of_a_command():
+    ended = run_python(WARNING)
+    assert ended.returncode == 0
+    assert ended.stderr == "warning: clamped\n"
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
@@ -200,17 +287,26 @@ def test_an_error_of_the_program_keeps_its_traceback():
         raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("swallowed", [False, True])
-def test_ctrl_c_is_one_line_and_status_130_even_if_a_library_turns_it_into_an_error(capsys, swallowed):
-    """As trimesh does, which keeps whatever is raised while its optional parts are imported."""
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def interrupt_and_fail() -> None:
+    """Turn an interrupt into another error, as trimesh does while it imports optional parts."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        raise TypeError("unsupported operand type(s) for |") from None
+
+
+@pytest.mark.parametrize("act", [interrupt, interrupt_and_fail])
+def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys, act):
     with pytest.raises(SystemExit) as stop, LIGHT.one_line():
-        try:
-            raise KeyboardInterrupt
-        except KeyboardInterrupt:
-            if swallowed:
-                raise TypeError("unsupported operand type(s) for |") from None
-            raise
-    assert stop.value.code == 128 + signal.SIGINT and capsys.readouterr() == ("", "ended by SIGINT\n")
+        act()
+    assert stop.value.code == 128 + signal.SIGINT
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err == "ended by SIGINT\n"
 
 
 INTERRUPTED = """
@@ -228,9 +324,10 @@ runpy.run_module("MODULE", run_name="__main__")
 
 @pytest.mark.parametrize("module", ["train", "scripts.attack"])
 def test_an_interrupt_while_torch_is_imported_is_one_line(module):
-    code = INTERRUPTED.replace("MODULE", module)
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=ROOT)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, "", "ended by SIGINT\n")
+    ended = run_python(INTERRUPTED.replace("MODULE", module))
+    assert ended.returncode == 128 + signal.SIGINT
+    assert ended.stdout == ""
+    assert ended.stderr == "ended by SIGINT\n"
 
 
 def test_slow_imports_are_announced(monkeypatch, tmp_path, capsys):
@@ -238,7 +335,7 @@ def test_slow_imports_are_announced(monkeypatch, tmp_path, capsys):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(command, "IMPORT_DELAY", 0.01)
     command.import_function("slow:work")()
-    assert capsys.readouterr().err == "loading PyTorch and other libraries ...\n"
+    assert capsys.readouterr().err.endswith(" ...\n")
 
 
 def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch, tmp_path):
@@ -247,25 +344,34 @@ def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch,
     with monkeypatch.context() as patch, open(write, "w") as output:
         patch.setattr(sys, "stdout", output)
         assert call("light", "light=grace", "height=4", "out=a.hdr") == 128 + signal.SIGPIPE
-        print("what Python may still hold at its end", flush=True)
-    assert capsys.readouterr().err == "" and (tmp_path / "a.hdr").is_file()
+        print("text that Python writes at its end", flush=True)
+    assert capsys.readouterr().err == ""
+    assert (tmp_path / "a.hdr").is_file()
+
+
+FULL_DISK = OSError(28, "No space left on device")
+FULL_DISK_OF_FILE = OSError(28, "No space left", "/a/b")
+NOT_PERMITTED = PermissionError(13, "Permission denied", "/a/b")
+CLOSED_CONNECTION = RuntimeError("[/gloo/x.cc:1] Connection closed by peer")
 
 
 @pytest.mark.parametrize(
-    ("error", "sentence"),
+    ("error", "start"),
     [
-        (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
-        (OSError(28, "No space left on device"), "the output cannot be written (No space left on device): make room"),
-        (OSError(28, "No space left", "/a/b"), "/a/b cannot be written (No space left): make room and start again"),
-        (RuntimeError("[/gloo/x.cc:1] Connection closed by peer"), "another process of this run has ended: "),
-        (torch.distributed.DistBackendError("NCCL error"), "another process of this run has ended: "),
-        (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), r"'a\udcffb' has characters that this system"),
+        (NOT_PERMITTED, "/a/b cannot be read or written: Permission denied"),
+        (FULL_DISK, "the output cannot be written"),
+        (FULL_DISK_OF_FILE, "/a/b cannot be written"),
+        (CLOSED_CONNECTION, "another process of this run has ended"),
+        (torch.distributed.DistBackendError("NCCL"), "another process of this run has ended"),
+        (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), r"'a\udcffb'"),
         (torch.OutOfMemoryError("x"), "memory ran out"),
         (RuntimeError("can't allocate memory"), "memory ran out"),
     ],
 )
-def test_an_error_is_one_sentence_where_the_user_can_fix_it(error, sentence):
-    assert one_sentence(error).startswith(sentence) and "\n" not in one_sentence(error)
+def test_an_error_is_one_sentence_if_the_user_can_fix_it(error, start):
+    sentence = one_sentence(error)
+    assert sentence.startswith(start)
+    assert "\n" not in sentence
 
 
 def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -277,5 +383,5 @@ def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
 
 def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(errors.tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
-    with pytest.raises(InputError, match=rf"out={tmp_path} cannot be written to \(No space left on device\)"):
+    with pytest.raises(InputError, match=rf"out={tmp_path} .*No space left on device"):
         writable_folder(tmp_path, "out")

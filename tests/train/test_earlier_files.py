@@ -25,16 +25,20 @@ EXAMPLE = EARLIER / "attack" / "0_solid_orange_0" / "example_000"
 
 @pytest.fixture
 def earlier(tmp_path) -> Path:
-    """A copy, since commands write into the folders of runs."""
+    """Copy the files, since commands write into the folders of runs."""
     return Path(shutil.copytree(EARLIER, tmp_path / "earlier"))
 
 
 def recorded() -> dict:
-    """The first line of the attack's record, which is about its only example."""
-    return json.loads((EXAMPLE.parent / "attack.jsonl").read_text().splitlines()[0])
+    """Read what the attack recorded of its only example."""
+    first, *_ = (EXAMPLE.parent / "attack.jsonl").read_text().splitlines()
+    return json.loads(first)
 
 
-@pytest.mark.parametrize(("image", "field"), [("before", "confidence_before"), ("after", "confidence")])
+@pytest.mark.parametrize(
+    ("image", "field"),
+    [("before", "confidence_before"), ("after", "confidence")],
+)
 def test_an_earlier_network_gives_the_probabilities_that_were_recorded(image, field):
     network = load_run(EARLIER / "run")
     images = torch.from_numpy(np.load(EXAMPLE / f"{image}.npy")).view(1, 3, 16, 16)
@@ -44,33 +48,59 @@ def test_an_earlier_network_gives_the_probabilities_that_were_recorded(image, fi
     assert found == pytest.approx(recorded()[field][0], abs=1e-3)
 
 
-def test_an_earlier_adversary_is_rendered_and_gives_the_probabilities_that_were_recorded(earlier, call, capsys):
+def test_an_earlier_adversary_gives_the_probabilities_that_were_recorded(earlier, call, capsys):
     folder = earlier / "attack" / "0_solid_orange_0" / "example_000"
-    reloaded = f"reload={folder}"
-    assert call("attack", reloaded, f"classifier=run:{earlier}/run", "out=again", "renderer.rasterizer=numpy") == 0
+    classifier = f"classifier=run:{earlier}/run"
+    options = "out=again", "renderer.rasterizer=numpy"
+    assert call("attack", f"reload={folder}", classifier, *options) == 0
     assert f"{recorded()['confidence'][0]:.1%}" in capsys.readouterr().out
 
 
-def test_the_angles_of_an_earlier_adversary_are_read_as_radians_and_written_in_degrees(tmp_path):
-    [camera] = augment.reload(EXAMPLE).cameras
-    described = json.loads((EXAMPLE / "adversary.json").read_text())["cameras"][0]
-    assert math.radians(camera.polar) == pytest.approx(described["polar"], rel=1e-15)
-    assert math.radians(camera.azimuth) == pytest.approx(described["azimuth"], rel=1e-15)
-    rendered = augment.reload(EXAMPLE).render("numpy")
-    expected = torch.from_numpy(np.load(EXAMPLE / "after.npy")).view(1, 3, 16, 16)
-    assert (rendered - expected).abs().max() < 1e-5
-    write_adversary(augment.reload(EXAMPLE), tmp_path)
-    assert augment.reload(tmp_path).cameras == (camera,)
+class TestTheAnglesOfAnEarlierAdversary:
+    def test_are_read_as_radians(self):
+        (camera,) = augment.reload(EXAMPLE).cameras
+        described = json.loads((EXAMPLE / "adversary.json").read_text())["cameras"][0]
+        assert math.radians(camera.polar) == pytest.approx(described["polar"], rel=1e-15)
+        assert math.radians(camera.azimuth) == pytest.approx(described["azimuth"], rel=1e-15)
+
+    def test_give_the_same_image(self):
+        rendered = augment.reload(EXAMPLE).render("numpy")
+        expected = torch.from_numpy(np.load(EXAMPLE / "after.npy")).view(1, 3, 16, 16)
+        torch.testing.assert_close(rendered, expected, rtol=0, atol=1e-5)
+
+    def test_are_written_in_degrees(self, tmp_path):
+        adversary = augment.reload(EXAMPLE)
+        write_adversary(adversary, tmp_path)
+        assert augment.reload(tmp_path).cameras == adversary.cameras
 
 
-def test_the_angles_of_an_earlier_projector_are_read_as_radians_and_written_in_degrees(tmp_path):
-    described = {"basis": "projector", "pixels": 1, "polar": math.pi / 3, "azimuth": 0.5, "distance": 4.0}
-    described |= {"fov": math.pi / 6, "power": 1.0, "coefficients": [[0.5, 0.25, 1.0]]}
-    (tmp_path / "projector.json").write_text(json.dumps(described))
-    earlier, pattern = read_light(tmp_path / "projector.json", Projector)
-    assert (earlier.polar, earlier.azimuth, earlier.fov) == pytest.approx((60.0, math.degrees(0.5), 30.0), rel=1e-15)
-    renderer.save_light(tmp_path / "new.json", pattern, earlier)
-    assert read_light(tmp_path / "new.json", Projector)[0] == earlier
+class TestTheAnglesOfAnEarlierProjector:
+    @pytest.fixture
+    def path(self, tmp_path) -> Path:
+        described = {
+            "basis": "projector",
+            "pixels": 1,
+            "polar": math.pi / 3,
+            "azimuth": 0.5,
+            "distance": 4.0,
+            "fov": math.pi / 6,
+            "power": 1.0,
+            "coefficients": [[0.5, 0.25, 1.0]],
+        }
+        (tmp_path / "projector.json").write_text(json.dumps(described))
+        return tmp_path / "projector.json"
+
+    def test_are_read_as_radians(self, path):
+        projector, _ = read_light(path, Projector)
+        assert projector.polar == pytest.approx(60.0, rel=1e-15)
+        assert projector.azimuth == pytest.approx(math.degrees(0.5), rel=1e-15)
+        assert projector.fov == pytest.approx(30.0, rel=1e-15)
+
+    def test_are_written_in_degrees(self, path, tmp_path):
+        projector, pattern = read_light(path, Projector)
+        renderer.save_light(tmp_path / "new.json", pattern, projector)
+        written, _ = read_light(tmp_path / "new.json", Projector)
+        assert written == projector
 
 
 def test_an_earlier_light_is_read():
@@ -84,14 +114,26 @@ def test_an_earlier_run_is_reported(earlier, call):
 
 
 def test_an_earlier_run_is_scored_on_photographs(earlier, photos, call):
-    assert call("evaluate", f"run={earlier}/run", f"photos={photos}", f"out={earlier}/scores") == 0
-    summary = json.loads((earlier / "scores" / "summary.json").read_text())
+    scores = earlier / "scores"
+    assert call("evaluate", f"run={earlier}/run", f"photos={photos}", f"out={scores}") == 0
+    summary = json.loads((scores / "summary.json").read_text())
     assert summary["recall"]["value"] == 1.0
 
 
-def test_an_earlier_run_is_gone_on_from_as_initial_weights(earlier, call):
-    """Settings of the earlier run do not hinder a new one that begins with its network."""
-    small = ["data=shapes", "data.train_per_class=10", "data.test_per_class=2", "data.size=16", "train.epochs=1"]
-    small += ["model.depth=10", "model.width=1", "train.batch_size=16", "train.device=cpu", "train.threads=1"]
-    begun = f"train.init_from={earlier}/run"
-    assert call("train", *small, "augment=none", begun, f"run={earlier}/new") == 0
+def test_a_new_run_starts_from_an_earlier_network_whose_settings_were_other_ones(earlier, call):
+    small = [
+        "data=shapes",
+        "data.train_per_class=4",
+        "data.test_per_class=2",
+        "data.size=16",
+        "data.validation=0.25",
+        "model.depth=10",
+        "model.width=1",
+        "augment=none",
+        "train.epochs=1",
+        "train.batch_size=16",
+        "train.device=cpu",
+        "train.threads=1",
+    ]
+    initial = f"train.init_from={earlier}/run"
+    assert call("train", *small, initial, f"run={earlier}/new") == 0

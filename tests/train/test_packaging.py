@@ -15,20 +15,32 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("norm_balls", "renderer", "augment", "train", "conf", "scripts")
-TINY = (*("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "augment=none", "train.epochs=1"),)
+TINY = (
+    "data.train_per_class=4",
+    "data.test_per_class=2",
+    "data.validation=0.5",
+    "augment=none",
+    "train.epochs=1",
+)
+KINDS = ("*.py", "*.pyi", "py.typed", "*.yaml", "*.jinja", "*.safetensors")
 
 
-def sources() -> set[str]:
-    """Every file that an installation holds, relative to it."""
-    kinds = ("*.py", "*.pyi", "py.typed", "*.yaml", "*.jinja", "*.safetensors")
-    files = [path for name in PACKAGES for kind in kinds for path in (ROOT / name).rglob(kind)]
-    return {re.sub("^scripts/", "pnb_scripts/", path.relative_to(ROOT).as_posix()) for path in files}
+def installed_files() -> set[str]:
+    """List the paths of all files that an installation must have."""
+    names = set()
+    for package in PACKAGES:
+        for kind in KINDS:
+            for path in (ROOT / package).rglob(kind):
+                name = path.relative_to(ROOT).as_posix()
+                names.add(re.sub("^scripts/", "pnb_scripts/", name))
+    return names
 
 
 def test_every_folder_of_modules_is_a_package_that_is_installed():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    with_modules = {Path(name).parent.as_posix().replace("/", ".") for name in sources() if name.endswith(".py")}
-    assert set(settings["packages"]) == with_modules | {"train.pretrained"}
+    modules = [Path(name) for name in installed_files() if name.endswith(".py")]
+    folders = {module.parent.as_posix().replace("/", ".") for module in modules}
+    assert set(settings["packages"]) == folders | {"train.pretrained"}
 
 
 def dependencies() -> list[Requirement]:
@@ -36,50 +48,96 @@ def dependencies() -> list[Requirement]:
     return [Requirement(line) for line in project["dependencies"]]
 
 
+def oldest_versions() -> dict[str, str]:
+    """Read the versions with which the tests are run as the oldest ones."""
+    lines = (ROOT / "tests" / "oldest.txt").read_text().splitlines()
+    return dict(line.split("==") for line in lines if not line.startswith("#"))
+
+
 def test_the_versions_that_are_tested_as_the_oldest_are_the_lower_bounds():
-    lines = [line for line in (ROOT / "tests" / "oldest.txt").read_text().splitlines() if not line.startswith("#")]
-    oldest = dict(line.split("==") for line in lines)
+    oldest = oldest_versions()
     assert oldest.keys() == {requirement.name for requirement in dependencies()}
     for requirement in dependencies():
-        (lower,) = (Version(bound.version) for bound in requirement.specifier if bound.operator == ">=")
-        assert Version(oldest[requirement.name]).release[: len(lower.release)] == lower.release, requirement
+        bounds = [bound.version for bound in requirement.specifier if bound.operator == ">="]
+        (lower,) = map(Version, bounds)
+        tested = Version(oldest[requirement.name])
+        assert tested.release[: len(lower.release)] == lower.release, requirement
 
 
 @pytest.mark.parametrize("name", [requirement.name for requirement in dependencies()])
 def test_dependencies_have_permissive_licenses(name):
     about = importlib.metadata.metadata(name)
+    expression = about.get("License-Expression") or ""
+    title = (about.get("License") or "")[:100]
     classifiers = [line for line in about.get_all("Classifier", []) if line.startswith("License")]
-    words = " ".join([about.get("License-Expression") or "", (about.get("License") or "")[:100], *classifiers])
-    assert re.search(r"MIT|BSD|Apache|Python Software Foundation|MPL-2.0", words) and "GPL" not in words
+    words = " ".join([expression, title, *classifiers])
+    assert re.search(r"MIT|BSD|Apache|Python Software Foundation|MPL-2.0", words)
+    assert "GPL" not in words
+
+
+def install(folder: Path, target: Path) -> None:
+    """Install a copy of the repository, so that nothing is left in the repository itself."""
+    for name in (*PACKAGES, "pretrained"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+    for path in [*ROOT.glob("README*"), *ROOT.glob("LICENSE*"), ROOT / "pyproject.toml"]:
+        shutil.copy(path, folder)
+    offline = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet"]
+    pip = [sys.executable, "-m", "pip", "install", *offline, "--target", target, folder]
+    subprocess.run(pip, check=True)
+
+
+def write_modules_of_the_same_names(folder: Path) -> None:
+    """Write modules that end the process if they are imported."""
+    for name in (
+        "train.py",
+        "renderer.py",
+        "augment.py",
+        "conf/__init__.py",
+        "scripts/__init__.py",
+    ):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("raise SystemExit('not this')")
 
 
 @pytest.mark.slow
-def test_an_installation_holds_every_file_and_runs_from_any_folder_also_beside_other_code_of_its_names(tmp_path):
-    """Built from a copy, so that nothing is left in the repository."""
-    if importlib.util.find_spec("setuptools") is None:
-        pytest.skip("setuptools is not installed")
-    copy, target = tmp_path / "copy", tmp_path / "target"
-    for name in (*PACKAGES, "pretrained"):
-        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for path in [*ROOT.glob("README*"), *ROOT.glob("LICENSE*"), ROOT / "pyproject.toml"]:
-        shutil.copy(path, copy)
-    options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", target]
-    subprocess.run([sys.executable, "-m", "pip", "install", *options, copy], check=True)
-    assert sources() <= {path.relative_to(target).as_posix() for path in target.rglob("*.*")}
-    environment = os.environ | {"PYTHONPATH": str(target)}
-    user = tmp_path / "user"
-    for name in ("train.py", "conf/__init__.py", "renderer.py", "augment.py", "scripts/__init__.py"):
-        (user / name).parent.mkdir(parents=True, exist_ok=True)
-        (user / name).write_text("raise SystemExit('not this')")
-    small = ["attack.max_steps=1", "attack.checks=false", "attack.force=true", "renderer.shadows=false", "out=out"]
-    for name, *arguments in [
-        *([path.name, "--help"] for path in sorted((target / "bin").glob("pnb-*"))),
-        ["pnb-attack", "classifier=run:pretrained/none", *small],
-        ["pnb-train", "--multirun", "launcher=joblib", "seed=0,1", *TINY],
-    ]:
+class TestAnInstallation:
+    @pytest.fixture
+    def target(self, tmp_path) -> Path:
+        if importlib.util.find_spec("setuptools") is None:
+            pytest.skip("setuptools is not installed")
+        install(tmp_path / "copy", tmp_path / "target")
+        return tmp_path / "target"
+
+    def test_has_every_file(self, target):
+        names = {path.relative_to(target).as_posix() for path in target.rglob("*.*")}
+        assert installed_files() <= names
+
+    def test_runs_beside_modules_of_the_same_names(self, target, tmp_path):
+        user = tmp_path / "user"
+        write_modules_of_the_same_names(user)
+        for path in sorted((target / "bin").glob("pnb-*")):
+            assert path.name in self.run(target, user, path.name, "--help")
+        attack = [
+            "classifier=run:pretrained/none",
+            "attack.max_steps=1",
+            "attack.checks=false",
+            "attack.force=true",
+            "renderer.shadows=false",
+        ]
+        self.run(target, user, "pnb-attack", *attack, "out=out")
+        self.run(target, user, "pnb-train", "--multirun", "launcher=joblib", "seed=0,1", *TINY)
+        config = yaml.safe_load((user / "out" / "config.yaml").read_text())
+        assert config["command"].startswith("pnb-attack ")
+
+    def run(self, target: Path, folder: Path, command: str, *arguments: str) -> str:
+        """Run an installed command in a folder, and return its output."""
         done = subprocess.run(
-            [target / "bin" / name, *arguments], cwd=user, env=environment, capture_output=True, text=True
+            [target / "bin" / command, *arguments],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(target)},
+            capture_output=True,
+            text=True,
         )
         assert done.returncode == 0, done.stderr
-        assert name in done.stdout or "--help" not in arguments
-    assert yaml.safe_load((user / "out" / "config.yaml").read_text())["command"].startswith("pnb-attack ")
+        return done.stdout

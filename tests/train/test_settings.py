@@ -1,4 +1,4 @@
-"""Configurations: what Hydra or a dataclass refuses is one sentence with the key, and every default has one owner."""
+"""Settings are read from the command line, and a wrong one is an error in one sentence."""
 
 import re
 
@@ -16,53 +16,78 @@ from train.command import Command, as_override, quoted
 from train.data.batches import rounds_of_epoch
 from train.settings import OTHER
 
+OTHER_DATA = ["data=npz", "data.path=a.npz", "run=here"]
+EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper"]
 
-@pytest.mark.parametrize("experiment", ["best", "classifier", "cpu", "demo", "fast", "harden", "paper"])
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_takes_other_data(experiment):
-    overrides = [f"experiment={experiment}", "data=npz", "data.path=a.npz", "train.init_from=b", "run=here"]
+    overrides = [f"experiment={experiment}", *OTHER_DATA, "train.init_from=b"]
     settings = train_command.read(overrides)
-    assert (settings.data.name, settings.data.path, settings.train.init_from in ("b", None)) == ("npz", "a.npz", True)
+    assert settings.data.name == "npz"
+    assert settings.data.path == "a.npz"
+    assert settings.train.init_from == "b"
 
 
 @pytest.mark.parametrize("experiment", ["harden", "best", "classifier"])
-def test_an_experiment_that_fine_tunes_asks_for_the_network_to_begin_with(experiment):
-    overrides = [f"experiment={experiment}", "data=npz", "data.path=a.npz", "run=here"]
+def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
     with pytest.raises(InputError, match=r"^train\.init_from is empty"):
-        train_command.read(overrides)
+        train_command.read([f"experiment={experiment}", *OTHER_DATA])
+
+
+def test_an_experiment_that_fine_tunes_takes_random_weights_if_the_settings_say_so():
     settings = train_command.read(["experiment=harden", "train.init_from=null", "run=here"])
-    assert settings.train.init_from is None  # where random weights are asked for
+    assert settings.train.init_from is None
 
 
-def test_a_classifier_of_others_needs_no_class_but_the_label():
-    settings = train_command.read(["experiment=classifier", "train.init_from=b", "run=a", "label=mug", "data.path=c"])
-    assert {item.label for item in settings.objects.values()} == {"mug", OTHER} and settings.data.name == "unlabelled"
+def test_a_classifier_of_another_library_needs_no_class_but_the_label():
+    files = ["train.init_from=b", "run=a", "data.path=c"]
+    settings = train_command.read(["experiment=classifier", "label=mug", *files])
+    assert {item.label for item in settings.objects.values()} == {"mug", OTHER}
+    assert settings.data.name == "unlabelled"
 
 
-def test_the_demonstration_keeps_its_last_network_of_three_rounds_with_new_renders_each():
+def test_the_demonstration_has_one_epoch_of_three_rounds():
     settings = train_command.read(["run=here"])
-    images, renders = round(0.9 * 10 * settings.data.train_per_class), settings.augment.examples
-    rounds = rounds_of_epoch(images, renders, 0, 0, settings.train.images_per_epoch, settings.augment.every)
-    assert settings.train.epochs == 1 and [len(part.rows) for part in rounds] == [120 + 480] * 3
+    image_count = round(0.9 * 10 * settings.data.train_per_class)
+    rounds = rounds_of_epoch(
+        image_count,
+        settings.augment.examples,
+        seed=0,
+        epoch=0,
+        images_per_epoch=settings.train.images_per_epoch,
+        every=settings.augment.every,
+    )
+    assert settings.train.epochs == 1
+    # A round has 120 images and 480 renders.
+    assert [len(part.rows) for part in rounds] == [600] * 3
 
 
-def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by_default():
-    def parameters(*overrides: str) -> dict:
-        return train_command.read(overrides).augment.attack.parameters
+def attacked_parameters(*overrides: str) -> dict:
+    """Return the settings of the parameters that training attacks, by name."""
+    return train_command.read(overrides).augment.attack.parameters
 
-    light = parameters("augment.attack.step=sign", "augment.attack.step_size=0.1")
-    assert [*light] == ["lighting"] and (light["lighting"].step, light["lighting"].step_size) == ("sign", 0.1)
-    attack = attack_command.read(["attack=[geometry,lighting]"]).attack.parameters
-    assert parameters("attack@augment.attack=[geometry,lighting]") == attack
+
+def test_training_attacks_the_lighting_by_default():
+    parameters = attacked_parameters("augment.attack.step=sign", "augment.attack.step_size=0.1")
+    assert list(parameters) == ["lighting"]
+    assert parameters["lighting"].step == "sign"
+    assert parameters["lighting"].step_size == 0.1
+
+
+def test_training_takes_the_parameters_of_the_attack_command():
+    expected = attack_command.read(["attack=[geometry,lighting]"]).attack.parameters
+    assert attacked_parameters("attack@augment.attack=[geometry,lighting]") == expected
 
 
 @pytest.mark.parametrize(
-    ("overrides", "key"),
+    ("overrides", "start"),
     [
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["experimnt=best"], "experimnt is not a setting: did you mean experiment?"),
         (["+train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
         (["data=npz", "data.pth=x"], "data.pth is not a setting: did you mean data.path?"),
-        (["data=mnist"], "data=mnist is not a choice: choose one of cifar100, folder, npz"),
+        (["data=mnist"], "data=mnist is not a choice"),
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
         (["scene.meshes=[~/a.obj]"], "scene.meshes=[~/a.obj] cannot be read"),
         (["seed=0,1"], "Ambiguous value for argument 'seed=0,1'"),
@@ -72,7 +97,7 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["train=3"], "train is a group of settings"),
         (["train.epochs=abc"], "train.epochs=abc must be a whole number"),
         (["train.epochs=null"], "train.epochs=null must be a whole number"),
-        (["train.schedule=stepp"], "train.schedule=stepp: choose one of step, cosine, one_cycle"),
+        (["train.schedule=stepp"], "train.schedule=stepp"),
         (["scene.ground=[a]"], "scene.ground[0]"),
         (["compare=[[none]]"], "compare is"),
         ([f"scene.exposure={10**400}"], "scene.exposure is too large"),
@@ -86,16 +111,18 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["attack@augment.attack=[pose]"], "renderer.silhouettes=false"),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["scene.projector={pixls: 8}"], "scene.projector.pixls is not a setting"),
-        (["evaluate.photos={renders: /x}"], "evaluate.photos: renders must be a name of letters"),
+        (["evaluate.photos={renders: /x}"], "evaluate.photos: renders"),
         (["augment=folder"], "augment.folder is None"),
-        (["evaluate.photos=[/x]"], "evaluate.photos=['/x'] must be a folder, or a mapping"),
+        (["evaluate.photos=[/x]"], "evaluate.photos=['/x']"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
-def test_a_wrong_setting_is_one_sentence_that_begins_with_its_key(overrides, key):
+def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, start):
     with pytest.raises(InputError) as refusal:
         train_command.read(overrides)
-    assert str(refusal.value).startswith(key) and "\n" not in str(refusal.value)
+    sentence = str(refusal.value)
+    assert sentence.startswith(start)
+    assert "\n" not in sentence
 
 
 @pytest.mark.parametrize("path", ["solid:orange", "/a folder/örange.glb", "'a, b'"])
@@ -105,50 +132,61 @@ def test_a_single_value_for_a_list_is_a_list_of_one(path):
 
 
 def test_a_part_of_a_projector_is_set_alone_or_in_a_mapping():
-    parts = train_command.read(["scene.projector.pixels=8", "+scene.projector.power=2"]).scene.projector
-    whole = train_command.read(["scene.projector={pixels: 8, power: 2}"]).scene.projector
-    assert (parts.pixels, parts.power) == (8, 2) and parts == whole
+    parts = train_command.read(["scene.projector.pixels=8", "+scene.projector.power=2"])
+    whole = train_command.read(["scene.projector={pixels: 8, power: 2}"])
+    assert parts.scene.projector.pixels == 8
+    assert parts.scene.projector.power == 2
+    assert parts.scene.projector == whole.scene.projector
 
 
-BOTH = ["label=[orange,pear]", "scene.meshes=['solid:orange','solid:pear']", "augment.examples=null", "scene.views=1"]
+TWO_CLASSES = [
+    "label=[orange,pear]",
+    "scene.meshes=['solid:orange','solid:pear']",
+    "scene.views=1",
+    "augment.examples=null",
+]
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
-        (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, unlabelled, shapes"),
+        (["data.name=mnist"], "data.name=mnist"),
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds"),
-        (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable is not a setting"),
+        (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable"),
         (
             ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
-            "scene.hard_negatives[0] is of the class orange: name it in scene.meshes",
+            "scene.hard_negatives[0] is of the class orange",
         ),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
-        (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
-        ([*BOTH, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
+        (["label=ornage"], "'ornage' is not a class of the model"),
+        ([*TWO_CLASSES, "label=[orange,pear,lemon]"], "label: 'lemon' is not a class of the model"),
         (
-            [*BOTH, "label=[orange,pear,orange]"],
-            "label=[orange, pear, orange] must name a class, or several, each once",
+            [*TWO_CLASSES, "label=[orange,pear,orange]"],
+            "label=[orange, pear, orange]",
         ),
-        (["label=[]"], "label=[] must name a class, or several, each once"),
-        (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple: name one in scene.meshes"),
+        (["label=[]"], "label=[]"),
+        (["label=[orange,apple]"], "label=['orange', 'apple'] has no mesh of apple"),
         (
-            [*BOTH, "scene.meshes=[a.glb,'solid:pear']"],
-            "scene.meshes[0] must name its class: give {mesh: a.glb, label",
+            [*TWO_CLASSES, "scene.meshes=[a.glb,'solid:pear']"],
+            "scene.meshes[0] must name its class",
         ),
         (
-            [*BOTH, "label=[orange,pear,apple]", "scene.hard_negatives=['solid:fruit','solid:apple']"],
+            [
+                *TWO_CLASSES,
+                "label=[orange,pear,apple]",
+                "scene.hard_negatives=['solid:fruit','solid:apple']",
+            ],
             "label=['orange', 'pear', 'apple'] has no mesh of apple",
         ),
         (
             [
-                *BOTH,
+                *TWO_CLASSES,
                 "label=[orange,pear,apple]",
                 "scene.hard_negatives=['solid:fruit',{mesh: 'solid:apple', label: apple}]",
             ],
-            "leaves no class of the network for other things: leave these out",
+            "leaves no class of the network for other things",
         ),
         (["augment=folder", "augment.folder=/no/lab"], "augment.folder: /no/lab is not a folder"),
         (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),
@@ -159,7 +197,8 @@ def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, 
     with pytest.raises(InputError, match=re.escape(message)) as refusal:
         settings = tiny(*overrides)
         loaded_run(settings, tmp_path / "run")
-    assert "\n" not in str(refusal.value) and not (tmp_path / "run").exists()
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "run").exists()
 
 
 @given(st.text())
@@ -179,22 +218,51 @@ KEYS = train_command.keys | evaluate_command.keys
         ("+data.path=1e3", "data.path='1e3'"),
         ("run=a\udcff", "run='a\udcff'"),
         ("out=a;b", "out='a;b'"),
-        *((same, same) for same in ["train.epochs=3", "photos=none", "photos=2024,2025", "run=a/b.c", "2024"]),
-        *((same, same) for same in ["run='ä'", "weights=null", "evaluate.photos={lab: 1}", "out=${run}/x", "out=~/a"]),
     ],
 )
-def test_a_name_stays_text_whatever_it_looks_like_to_hydra(argument, override):
+def test_a_name_that_is_no_text_to_hydra_is_quoted(argument, override):
     assert as_override(argument, KEYS) == override
 
 
-def test_commands_that_need_outlines_take_the_samples_of_their_documented_accuracy():
-    def samples(command: Command, *overrides: str) -> int:
-        return command.read(overrides).renderer.image(8).samples
+@pytest.mark.parametrize(
+    "argument",
+    [
+        "train.epochs=3",
+        "photos=none",
+        "photos=2024,2025",
+        "run=a/b.c",
+        "2024",
+        "run='ä'",
+        "weights=null",
+        "evaluate.photos={lab: 1}",
+        "out=${run}/x",
+        "out=~/a",
+    ],
+)
+def test_other_arguments_are_overrides_as_they_are(argument):
+    assert as_override(argument, KEYS) == argument
 
-    attack = attack_command, "scene.meshes=[solid:orange]"
-    assert samples(*attack, "attack=lighting") == 2
-    assert samples(*attack, "attack=pose") == 8
-    assert samples(*attack, "attack=geometry", "renderer.silhouettes=true") == 8
-    assert samples(*attack, "attack=pose", "renderer.samples=4") == 4
-    train = train_command, "run=here", "renderer.silhouettes=true"
-    assert samples(*train, "renderer.samples=null") == 8
+
+def samples_of(command: Command, *overrides: str) -> int:
+    return command.read(overrides).renderer.image(8).samples
+
+
+@pytest.mark.parametrize(
+    ("overrides", "samples"),
+    [
+        (["attack=lighting"], 2),
+        (["attack=pose"], 8),
+        (["attack=geometry", "renderer.silhouettes=true"], 8),
+        (["attack=pose", "renderer.samples=4"], 4),
+    ],
+)
+def test_attacks_that_need_outlines_take_the_samples_of_their_documented_accuracy(
+    overrides,
+    samples,
+):
+    assert samples_of(attack_command, "scene.meshes=[solid:orange]", *overrides) == samples
+
+
+def test_training_with_outlines_takes_the_samples_of_their_documented_accuracy():
+    outlines = "renderer.silhouettes=true", "renderer.samples=null"
+    assert samples_of(train_command, "run=here", *outlines) == 8
