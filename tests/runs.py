@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from train.data.load import load_data
 from train.data.sets import DataSet
 from train.settings import ExperimentSettings
+from train.training.data import load_data
 from train.training.initial import load_initial
 from train.training.run import Run
 
@@ -13,7 +13,7 @@ def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None 
     """Make a run and load it. Without data, it loads those of the settings."""
     initial = load_initial(settings)
     if data is None:
-        data = load_data(settings, initial.size if initial else None)
+        data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
     run.load()
     return run

@@ -82,7 +82,7 @@ def folder_of(module: str) -> str:
 
 
 def test_only_commands_and_what_gets_all_their_settings_name_keys():
-    """Other modules name their Python arguments, and `renamed` and `keyed` say which setting gave the value."""
+    """Other modules name their Python arguments, and `keyed` says which setting gave the value."""
     main = importlib.import_module("train.__main__").main
     parts = {key.rpartition(".")[0] for key in main.keys}  # such as augment.attack, which is a function, too
     keys = {key for key in main.keys if "." in key} - parts

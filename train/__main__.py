@@ -41,10 +41,11 @@ class TrainCommand(Command):
 
 def name_model(words: list[str]) -> list[str]:
     """Write model=NAME as model.name=NAME."""
-    is_name = [word.startswith("model=") and not word.startswith("model={") for word in words]
-    return [
-        word.replace("model=", "model.name=", 1) if short else word for word, short in zip(words, is_name, strict=True)
-    ]
+    renamed = []
+    for word in words:
+        has_name = word.startswith("model=") and not word.startswith("model={")
+        renamed.append(word.replace("model=", "model.name=", 1) if has_name else word)
+    return renamed
 
 
 main = TrainCommand(

@@ -97,7 +97,7 @@ class Command:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """The annotation of each key of the command line. Groups of choices alone have None."""
+        """Annotations of the keys of the command line. Groups of choices alone have None."""
         return dict.fromkeys(self.help.groups) | types_below(self.settings)
 
     def __call__(self) -> None:
@@ -146,10 +146,7 @@ class Command:
         """
         words = self.words(overrides)
         try:
-            if GlobalHydra.instance().is_initialized():  # within a command
-                return hydra.compose(self.name, words)
-            with initialize_config_module("conf", version_base="1.3"):
-                return hydra.compose(self.name, words)
+            return compose(self.name, words)
         except (HydraException, OmegaConfBaseException, *INTERNAL_ERRORS) as error:
             sentence = explain(error, self.keys, words)
             if sentence is None:
@@ -189,6 +186,23 @@ class Command:
         """Return the text of --help, with the values that overrides give to the settings."""
         # Hydra's own --help lists all groups, which takes longer than to compose the settings.
         return self.help.format(self.compose(overrides))
+
+
+def compose(name: str, overrides: Sequence[str]) -> DictConfig:
+    """Compose a configuration from the files of conf/.
+
+    Args:
+        name: Name of a command without pnb-.
+        overrides: Overrides in the form that Hydra reads.
+
+    Returns:
+        The configuration.
+    """
+    # Hydra is initialized already while a command runs.
+    if GlobalHydra.instance().is_initialized():
+        return hydra.compose(name, list(overrides))
+    with initialize_config_module("conf", version_base="1.3"):
+        return hydra.compose(name, list(overrides))
 
 
 def set_up_process() -> None:
@@ -424,7 +438,12 @@ def _suggest(key: str, keys: Collection[str]) -> str:
     return f"did you mean {close[0]}?" if close else "--help shows all settings"
 
 
-def _explain_value(error: OmegaConfBaseException, key: str, keys: Mapping[str, Any], place: str) -> str:
+def _explain_value(
+    error: OmegaConfBaseException,
+    key: str,
+    keys: Mapping[str, Any],
+    place: str,
+) -> str:
     """Explain a value that does not fit the annotation of its key."""
     hint = without_none(keys.get(key))
     value = getattr(error, "value", None)

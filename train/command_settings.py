@@ -45,9 +45,12 @@ CLASSIFIERS = (
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """What pnb-attack changes, and how."""
+    """Settings of the attack of pnb-attack."""
 
-    shared: bool = setting(False, "The views share one lighting, shape or color, and their costs are summed.")
+    shared: bool = setting(
+        False,
+        "The views share one lighting, shape or color, and their costs are summed.",
+    )
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
     checks: bool = setting(
         True,
@@ -72,7 +75,7 @@ class AttackCommandSettings(AttackSettings):
 
     @property
     def renderers(self) -> list[str]:
-        """The renderers that `verify` names."""
+        """Names of the renderers in `verify`."""
         return self.verify.split("+") if self.verify else []
 
 
@@ -83,7 +86,7 @@ class AttackSceneSettings(SceneSettings):
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
         10,
-        "Number of cameras to try, in several lightings and in front of light gray, for a mesh that is misclassified.",
+        "Number of cameras to try for a mesh that is misclassified, in several lightings and in front of light gray.",
         minimum=0,
         maximum=MAX_VIEWS,
     )
@@ -97,12 +100,16 @@ class AttackSceneSettings(SceneSettings):
 
 @dataclass
 class TransferSettings(Settings):
-    """Where else successful adversaries are shown.
+    """Other meshes, views and classifiers to which pnb-attack transfers adversaries.
 
-    Another network counts those that it classified correctly before.
+    The success on another classifier counts only the images that it classified
+    correctly before.
     """
 
-    classifiers: list[Any] = setting([], "Other networks: as `classifier`, or {classifier, weights}.")
+    classifiers: list[Any] = setting(
+        [],
+        "Other networks: as `classifier`, or {classifier, weights}.",
+    )
     azimuths: list[float] = setting(
         [], "Rotations of the camera about the vertical.", "degrees", minimum=-360, maximum=360
     )
@@ -119,7 +126,10 @@ class AttackExperimentSettings(Settings):
 
     classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
     weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
-    label: str = setting("orange", "Class of the meshes. A mapping {mesh, label} names its own class.")
+    label: str = setting(
+        "orange",
+        "Class of the meshes. A mapping {mesh, label} names its own class.",
+    )
     target: Any = setting(
         None,
         "Class to reach: null (any misclassification), least_likely, a class, or a list of classes, one per view.",
@@ -136,9 +146,15 @@ class AttackExperimentSettings(Settings):
     attack: AttackCommandSettings = setting(
         AttackCommandSettings, "What is attacked, and how. attack=NAME+NAME names it."
     )
-    transfer: TransferSettings = setting(TransferSettings, "Where else successful adversaries are shown.")
+    transfer: TransferSettings = setting(
+        TransferSettings,
+        "Where else successful adversaries are shown.",
+    )
     scene: AttackSceneSettings = setting(AttackSceneSettings, "The scene.")
-    renderer: RendererSettings = setting(lambda: RendererSettings(shadows=True), "How images are rendered.")
+    renderer: RendererSettings = setting(
+        lambda: RendererSettings(shadows=True),
+        "How images are rendered.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -247,7 +263,10 @@ class LabSettings(Settings):
     spp: int = setting(32, "Paths per pixel and light.", minimum=1, maximum=10**5)
     bounces: int = setting(4, "Largest number of bounces of light.", minimum=1, maximum=1000)
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
-    overwrite: bool = setting(False, "Render into a folder that is not empty. The renders in it are replaced.")
+    overwrite: bool = setting(
+        False,
+        "Render into a folder that is not empty. The renders in it are replaced.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -274,10 +293,16 @@ class AuditSettings(Settings):
 
     classifier: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
     weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
-    hardened: str | None = setting(None, "Another classifier to show beside it, such as run:runs/harden.")
+    hardened: str | None = setting(
+        None,
+        "Another classifier to show beside it, such as run:runs/harden.",
+    )
     label: str = setting("orange", "Class of the meshes. Each class has an audit of its own.")
     meshes: list[Any] = setting([], "Meshes of the class.")
-    look_alikes: list[Any] = setting([], "Hard negatives: meshes of other classes, in the same lighting.")
+    look_alikes: list[Any] = setting(
+        [],
+        "Hard negatives: meshes of other classes, in the same lighting.",
+    )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(
         None, "Such a folder of renders. null: it is made of the meshes if Mitsuba is installed."
@@ -320,7 +345,10 @@ class CompareSettings(Settings):
     runs: list[str] = setting(REQUIRED, "Folders of finished runs.")
     exclude: list[str] = setting([], "Sources of photographs to leave out of the averages.")
     by: str = setting("source", "Groups of the tables.", choices=GROUPS)
-    photographs: str = setting("photographs", "Sub-folder of the scores to compare: its name in evaluate.photos.")
+    photographs: str = setting(
+        "photographs",
+        "Sub-folder of the scores to compare: its name in evaluate.photos.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -343,7 +371,10 @@ class EvaluateSettings(Settings):
         "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory is installed.",
     )
     run: str | None = setting(None, "A run folder, or a folder below pretrained/.")
-    model: str | None = setting(None, "python:package.module:function, if such a function made the run's network.")
+    model: str | None = setting(
+        None,
+        "python:package.module:function, if such a function made the run's network.",
+    )
     classifier: str | None = setting(None, f"Any other network instead of run: {CLASSIFIERS}.")
     weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
     label: Any = setting(
@@ -365,7 +396,10 @@ class EvaluateSettings(Settings):
     by: str = setting("source", "Groups of the tables: columns of photos.csv.", choices=GROUPS)
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
-    precision: str = setting("auto", "auto (bfloat16 if the hardware computes in it), bfloat16 or float32.")
+    precision: str = setting(
+        "auto",
+        "auto (bfloat16 if the hardware computes in it), bfloat16 or float32.",
+    )
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
 
     def __post_init__(self) -> None:
@@ -382,6 +416,10 @@ class EvaluateSettings(Settings):
 def require_calibration(rate: float | None, calibrate: str | None) -> None:
     """Check that a false-positive rate and a folder to calibrate on are given together.
 
+    Args:
+        rate: False-positive rate, or None.
+        calibrate: Folder of photographs, or None.
+
     Raises:
         InputError: If only one is given.
     """
@@ -396,7 +434,10 @@ class FitSettings(Settings):
     photograph: str = setting(REQUIRED, "An image file.")
     mesh: str = setting(REQUIRED, "A mesh file or solid:NAME:SEED, upright as in the photograph.")
     mask: str | None = setting(None, "Image of the photograph's size, white where the object is.")
-    box: list[int] = setting([], "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut.")
+    box: list[int] = setting(
+        [],
+        "Instead of mask, [left, top, right, bottom] in pixels, for OpenCV's GrabCut.",
+    )
     fov: float | None = setting(
         None,
         "Angle across a square that is 1.6 times as wide as the object. null: orthographic.",
@@ -423,7 +464,10 @@ class FitSettings(Settings):
     )
     label: str = setting("orange", "Class of the printed attack.")
     size: int = setting(64, "Pixels per side that are compared.", minimum=16, maximum=512)
-    out: str = setting("runs/fit", "Folder of background.png, mask.png, light.json and comparison.png.")
+    out: str = setting(
+        "runs/fit",
+        "Folder of background.png, mask.png, light.json and comparison.png.",
+    )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
     def __post_init__(self) -> None:
@@ -464,7 +508,11 @@ class PublishSettings(Settings):
         None,
         "Folder of photographs as for pnb-evaluate. null: the threshold that it has, if any.",
     )
-    label: Any = setting("orange", "Class of the threshold, or several, each with its own.", is_text=True)
+    label: Any = setting(
+        "orange",
+        "Class of the threshold, or several, each with its own.",
+        is_text=True,
+    )
     model: str | None = setting_like(EvaluateSettings, "model", None)
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 
@@ -477,7 +525,10 @@ class PublishSettings(Settings):
 class ReportSettings(Settings):
     """Settings of pnb-report."""
 
-    runs: list[str] = setting(REQUIRED, "Folders of runs, sweeps and attacks. Folders below them count, too.")
+    runs: list[str] = setting(
+        REQUIRED,
+        "Folders of runs, sweeps and attacks. Folders below them count, too.",
+    )
     out: str | None = setting(
         None,
         "Folder of the page and its images. null: the common parent of the runs, whose page is replaced.",

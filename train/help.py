@@ -22,7 +22,7 @@ TEXT_WIDTH = 80  # columns of the explanation beside it
 
 @dataclass(frozen=True)
 class HelpText:
-    """What a command says about itself in --help, besides its settings.
+    """Texts of a command in --help, besides its settings.
 
     Args:
         about: What the command does.
@@ -54,7 +54,15 @@ class HelpText:
 
 
 def types_below(kind: type, prefix: str = "") -> dict[str, Any]:
-    """Return the annotation of each setting and each group of settings by its dotted key."""
+    """Return the annotation of each setting and each group of settings by its dotted key.
+
+    Args:
+        kind: Class of settings.
+        prefix: Text before each key, such as "train.".
+
+    Returns:
+        Annotations, such as `int | None` for "epochs".
+    """
     found: dict[str, Any] = {}
     for name, hint in field_types(kind).items():
         found[f"{prefix}{name}"] = str if facts_of(kind, name).is_text else hint
@@ -118,8 +126,11 @@ def _facts(kind: type, name: str) -> str:
 def _format_line(left: str, right: str) -> str:
     """Put an explanation beside a key, or below it if the key is long."""
     indent = " " * (KEY_WIDTH + 2)
-    lines = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False) or [""]
-    first = f"  {left}"
-    if len(first) > KEY_WIDTH:
-        return "\n".join([first, *(indent + line for line in lines)]).rstrip()
-    return "\n".join([first.ljust(len(indent)) + lines[0], *(indent + line for line in lines[1:])]).rstrip()
+    wrapped = textwrap.wrap(right, TEXT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = [indent + line for line in wrapped]
+    key = f"  {left}"
+    if lines and len(key) <= KEY_WIDTH:
+        lines[0] = key.ljust(len(indent)) + wrapped[0]
+    else:
+        lines.insert(0, key)
+    return "\n".join(lines)

@@ -42,7 +42,10 @@ STD = (0.25, 0.25, 0.25)
 CLASSIFIER = "classifier"
 # Arguments of architectures of torchvision. Auxiliary classifiers would return
 # several outputs.
-_OPTIONS = {name: {"aux_logits": False, "init_weights": True} for name in ("googlenet", "inception_v3")}
+_OPTIONS = {
+    "googlenet": {"aux_logits": False, "init_weights": True},
+    "inception_v3": {"aux_logits": False, "init_weights": True},
+}
 
 
 class WideResNet(nn.Module):
@@ -191,7 +194,7 @@ class Dropout(nn.Dropout):
         return x * (draws[distributed.rank()] >= self.p) / (1 - self.p)
 
     def _draw_factors(self, x: Tensor) -> Tensor:
-        """Draw 0 or 1 / (1 - p) for each value of x, in the memory layout of x, from 16 random bits."""
+        """Draw 0 or 1 / (1 - p) for each value of x from 16 random bits, in the layout of x."""
         value_count = x.numel()
         batch_value_count = value_count * distributed.world_size()
         # The seed comes from torch, so that `torch.manual_seed` decides the draws.
@@ -299,7 +302,13 @@ def _require_logits(network: nn.Module, class_count: int, size: int) -> None:
         raise ValueError(f"it returned {tuple(logits.shape)} for 2 images")
 
 
-def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
+def describe(
+    network: nn.Module,
+    classes: Sequence[str],
+    size: int,
+    encoding: str,
+    **shape: Any,
+) -> dict[str, Any]:
     """Describe a network, so that it can be used without the configuration of its run.
 
     The description is stored with the weights.

@@ -46,11 +46,12 @@ MAX_WORKERS = 1024
 MAX_SEED = 2**63 - 1
 TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # named by the time at which a command starts
 
-# Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
+# Settings that say where and how a run is made. They do not decide its result,
+# and the names of the runs of a sweep leave them out.
 CIRCUMSTANCES = (
-    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hardware", "versions"),
-    *("inputs", "test_images", "overwrite"),
-    *("train.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+    *("run", "sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
+    *("hardware", "versions", "inputs", "test_images", "overwrite", "train.cache"),
+    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
     *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
@@ -87,8 +88,18 @@ class DataSettings(Settings):
         minimum=0,
         maximum=MAX_WORKERS,
     )
-    train_per_class: int = setting(300, "Training images per class of shapes.", minimum=1, maximum=MAX_IMAGES)
-    test_per_class: int = setting(60, "Test images per class of shapes.", minimum=1, maximum=MAX_IMAGES)
+    train_per_class: int = setting(
+        300,
+        "Training images per class of shapes.",
+        minimum=1,
+        maximum=MAX_IMAGES,
+    )
+    test_per_class: int = setting(
+        60,
+        "Test images per class of shapes.",
+        minimum=1,
+        maximum=MAX_IMAGES,
+    )
     seed: int = setting(0, "Seed of the shapes.", minimum=0, maximum=MAX_SEED)
 
     def __post_init__(self) -> None:
@@ -117,7 +128,7 @@ class TrainingSceneSettings(SceneSettings):
 
     @property
     def objects(self) -> int:
-        """The number of meshes and hard negatives; 0 without a mesh."""
+        """Count the meshes and the hard negatives. Return 0 without a mesh."""
         return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
 
 
@@ -125,14 +136,17 @@ class TrainingSceneSettings(SceneSettings):
 class ModelSettings(Settings):
     """The network to train."""
 
-    name: str = setting(WIDERESNET, "wideresnet, torchvision:NAME or python:package.module:function.")
+    name: str = setting(
+        WIDERESNET,
+        "wideresnet, torchvision:NAME or python:package.module:function.",
+    )
     depth: int = setting(16, "Depth of the WideResNet.")
     width: int = setting(4, "Width of the WideResNet.")
     dropout: float = setting(0.3, "Dropout of the WideResNet.")
 
     @property
     def shape(self) -> dict[str, Any]:
-        """What a network of this name is built from, and what is stored with its weights."""
+        """Return the arguments of the network's constructor. They are stored with its weights."""
         if self.name == WIDERESNET:
             return {"depth": self.depth, "width": self.width, "dropout": self.dropout}
         return {"name": self.name}
@@ -140,7 +154,7 @@ class ModelSettings(Settings):
 
 @dataclass
 class TrainSettings(Settings):
-    """How the network is trained. The defaults are the paper's recipe."""
+    """Training of the network. The defaults are the recipe of the paper."""
 
     init_from: str | None = setting(
         None,
@@ -148,7 +162,12 @@ class TrainSettings(Settings):
         "classifier: efficientnet_lite0, torchvision:NAME, timm:NAME or "
         "python:package.module:function. null: random weights.",
     )
-    epochs: int = setting(150, "Number of passes over the training images.", minimum=1, maximum=10**6)
+    epochs: int = setting(
+        150,
+        "Number of passes over the training images.",
+        minimum=1,
+        maximum=10**6,
+    )
     images_per_epoch: int | None = setting(
         None,
         "Number of training images, drawn anew for each epoch. null: all.",
@@ -158,11 +177,15 @@ class TrainSettings(Settings):
     batch_size: int = setting(128, "Images per training step.", minimum=1, maximum=10**6)
     accumulate: int = setting(
         1,
-        "Number of parts of a batch that pass through the network one after another, if memory is short.",
+        "Number of parts into which each batch is divided to save memory.",
         minimum=1,
         maximum=10**6,
     )
-    optimizer: str = setting("sgd", "Optimizer. adamw decays no biases and norms.", choices=OPTIMIZERS)
+    optimizer: str = setting(
+        "sgd",
+        "Optimizer. adamw decays no biases and norms.",
+        choices=OPTIMIZERS,
+    )
     learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=FACTOR)
     momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
     weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=FACTOR)
@@ -184,7 +207,11 @@ class TrainSettings(Settings):
         "Horizontal flips: half of the images at random, or each image in every other epoch (alternating).",
         choices=FLIPS,
     )
-    augmentation: str = setting("none", "Augmentation of every training image.", choices=AUGMENTATIONS)
+    augmentation: str = setting(
+        "none",
+        "Augmentation of every training image.",
+        choices=AUGMENTATIONS,
+    )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking: float = setting(
         0.0,
@@ -227,7 +254,11 @@ class TrainSettings(Settings):
         minimum=1,
         maximum=1024,
     )
-    compile: str = setting("auto", "Compile the training step. auto: CUDA graphs on one GPU.", choices=COMPILE)
+    compile: str = setting(
+        "auto",
+        "Compile the training step. auto: CUDA graphs on one GPU.",
+        choices=COMPILE,
+    )
     deterministic: bool = setting(
         False,
         "Compute the same bits every time on a GPU, which is slower. The results of a CPU always repeat.",
@@ -256,7 +287,7 @@ class TrainSettings(Settings):
 
 @dataclass
 class EvaluationSettings(Settings):
-    """What the trained network is scored on, besides the test set."""
+    """Photographs on which the trained network is scored, besides the test set."""
 
     # OmegaConf has no type for str | dict[str, str] | None.
     photos: Any = setting(
@@ -270,7 +301,8 @@ class EvaluationSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         photos = self.photos
-        is_mapping = isinstance(photos, dict) and all(isinstance(folder, str) for folder in photos.values())
+        is_mapping = isinstance(photos, dict)
+        is_mapping = is_mapping and all(isinstance(folder, str) for folder in photos.values())
         if not (photos is None or isinstance(photos, str) or is_mapping):
             expected = "must be a folder, or a mapping of names to folders"
             raise InputError(f"photos={photos} {expected}", "photos")
@@ -281,7 +313,7 @@ class EvaluationSettings(Settings):
 
     @property
     def folders(self) -> dict[str, Path]:
-        """The folders of photographs by the name of the run's sub-folder that gets their scores."""
+        """Return the folders of photographs by the name of the sub-folder with their scores."""
         named = self.photos if isinstance(self.photos, dict) else {}
         if isinstance(self.photos, str):
             named = {PHOTOGRAPHS: self.photos}
@@ -293,7 +325,10 @@ class ExperimentSettings(Settings):
     """Settings of pnb-train: one run."""
 
     run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
-    sweep: str = setting("runs/sweep", "Folder of the runs of a --multirun, each named by its overrides.")
+    sweep: str = setting(
+        "runs/sweep",
+        "Folder of the runs of a --multirun, each named by its overrides.",
+    )
     overwrite: bool = setting(False, "Start anew in a folder that holds a run or other results.")
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
     label: Any = setting(  # str | list[str], for which OmegaConf has no type
@@ -310,15 +345,24 @@ class ExperimentSettings(Settings):
         [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."
     )
     data: DataSettings = setting(DataSettings, "The data set.")
-    augment: AugmentationSettings = setting(AugmentationSettings, "The renders among the training images.")
+    augment: AugmentationSettings = setting(
+        AugmentationSettings,
+        "The renders among the training images.",
+    )
     scene: TrainingSceneSettings = setting(TrainingSceneSettings, "The scene of the renders.")
     renderer: RendererSettings = setting(
         lambda: RendererSettings(samples=8, normals="flat"),
         "How images are rendered. The defaults are the paper's.",
     )
-    model: ModelSettings = setting(ModelSettings, "The network. model=NAME is short for model.name=NAME.")
+    model: ModelSettings = setting(
+        ModelSettings,
+        "The network. model=NAME is short for model.name=NAME.",
+    )
     train: TrainSettings = setting(TrainSettings, "How the network is trained.")
-    evaluate: EvaluationSettings = setting(EvaluationSettings, "What the trained network is scored on.")
+    evaluate: EvaluationSettings = setting(
+        EvaluationSettings,
+        "What the trained network is scored on.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -334,7 +378,7 @@ class ExperimentSettings(Settings):
 
     @property
     def views(self) -> int:
-        """Views per mesh; see `count_views`."""
+        """Count the views of each mesh with `count_views`."""
         scene = self.scene
         backgrounds = len(scene.backgrounds)
         try:
@@ -381,7 +425,11 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
     Returns:
         The objects by the key of each, such as "scene.meshes[0]".
     """
-    return {f"{key}[{index}]": read_object(item, label, f"{key}[{index}]") for index, item in enumerate(items)}
+    objects = {}
+    for index, item in enumerate(items):
+        name = f"{key}[{index}]"
+        objects[name] = read_object(item, label, name)
+    return objects
 
 
 def read_object(item: Any, label: str, key: str) -> ObjectSettings:
@@ -457,7 +505,15 @@ def published(run: Path) -> Path:
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested settings with their dotted keys."""
+    """Yield the values of nested settings with their dotted keys.
+
+    Args:
+        node: Settings as nested dictionaries.
+        prefix: Text before each key, such as "train.".
+
+    Yields:
+        Pairs such as ("train.epochs", 150).
+    """
     for key, value in node.items():
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")

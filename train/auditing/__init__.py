@@ -1,1 +1,1 @@
-"""An audit of a classifier: what it recognizes in strange light, and what hardening it costs, on one page."""
+"""Audit of a classifier: what it recognizes under unusual lighting, and what hardening costs."""

@@ -37,7 +37,7 @@ from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import published, read_objects, solid_name
 from train.system.device import choose_device
-from train.system.user_errors import renamed, writable_folder
+from train.system.user_errors import keyed, writable_folder
 
 # Views that are rendered in environment lighting.
 VIEWS = 24
@@ -83,7 +83,7 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
     has_renders = renders.exists() and not settings.overwrite
     if page.LABORATORY not in plan.folders:
         try:
-            # Without Mitsuba, new renders are impossible.
+            # New renders need Mitsuba.
             with nullcontext() if has_renders else mitsuba():
                 plan.folders = {page.LABORATORY: renders} | plan.folders
         except InputError as error:
@@ -95,7 +95,10 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
         if plan.folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
-            _write_folder(renders, lambda folder: write_laboratory(replace(laboratory, out=str(folder))))
+            _write_folder(
+                renders,
+                lambda folder: write_laboratory(replace(laboratory, out=str(folder))),
+            )
         for key in plan.networks:
             plan.measure(key, out / key)
         names = {key: network.name for key, network in plan.networks.items()}
@@ -172,11 +175,11 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
     Raises:
         InputError: If there is no such network.
     """
-    with renamed(name="classifier"):
+    with keyed(name="classifier"):
         classifier = load_network(settings.classifier, settings.weights)
     networks = {page.CLASSIFIER: classifier}
     if settings.hardened:
-        with renamed(name="hardened"):
+        with keyed(name="hardened"):
             networks[page.HARDENED] = load_network(settings.hardened)
     return networks
 

@@ -63,7 +63,9 @@ def write_audit_page(
         for name, path in paths.items()
     }
     correct = {name: read_json(path / RECOGNIZED) for name, path in paths.items()}
-    counts = {name: {kind: read_json(path / f"{kind}.json") for kind in KINDS} for name, path in paths.items()}
+    counts = {}
+    for name, path in paths.items():
+        counts[name] = {kind: read_json(path / f"{kind}.json") for kind in KINDS}
     transfers = {}
     if len(paths) > 1:
         transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
@@ -89,7 +91,10 @@ def write_audit_page(
     )
 
 
-def _attack_pictures(paths: Mapping[str, Path], counts: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Picture]]:
+def _attack_pictures(
+    paths: Mapping[str, Path],
+    counts: Mapping[str, Mapping[str, Any]],
+) -> dict[str, list[Picture]]:
     """Read the pictures of one adversary of each network, by kind of lighting."""
     pictures: dict[str, list[Picture]] = {kind: [] for kind in KINDS}
     for name, path in paths.items():
@@ -106,7 +111,7 @@ def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
     for name, path in paths.items():
         scores = summary.read_summaries(path)
         runs[name] = [summary.RunSummary(path, name, {"network": name}, scores, None)]
-    return [scores_section(title, group) for title, group in summary.by_images(runs).items()]
+    return [scores_section(title, group) for title, group in summary.group_by_images(runs).items()]
 
 
 def _unreadable_caveats(parts: Collection[str], path: Path) -> Iterator[str]:
@@ -127,7 +132,7 @@ def _agreement(scored: Predictions) -> Proportion:
 
 
 class Finding(NamedTuple):
-    """How often a network is right, as text and as numbers.
+    """Fraction of images on which a network is right, in words and as numbers.
 
     Attributes:
         text: Sentence without a period.
@@ -195,7 +200,7 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Name the smallest radius at which an attack on each kind of lighting fools half of the views."""
+    """Name the smallest radius at which attacks on each kind of lighting fool half of the views."""
     faults = []
     for kind, light in KINDS.items():
         counts = read_json(folder / f"{kind}.json")
@@ -235,7 +240,11 @@ class _ScoredImage(NamedTuple):
     prediction: Prediction
 
 
-def _worst(label: str, folders: Mapping[str, Path], scored: Predictions) -> dict[str, list[Picture]]:
+def _worst(
+    label: str,
+    folders: Mapping[str, Path],
+    scored: Predictions,
+) -> dict[str, list[Picture]]:
     """Make two galleries for each network, by title.
 
     The first one has the images of the label with the lowest log-odds. The

@@ -220,7 +220,8 @@ def adversaries(
     """
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
-    limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", radius / STEPS_PER_RADIUS)}
+    step_size = radius / STEPS_PER_RADIUS
+    limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
     if further:
         limits |= {"max_steps": FURTHER, "margin": FACTOR}
     else:

@@ -46,7 +46,7 @@ from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
-from train.system.user_errors import keyed, keys_of, renamed, writable_folder
+from train.system.user_errors import keyed, keys_of, writable_folder
 
 # Settings that `find_scene` may change, in the order in which they are printed.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
@@ -113,7 +113,7 @@ def run(settings: AttackExperimentSettings) -> None:
         with keyed("attack"):
             settings.attack.require_parameters()
     device = choose_device(settings.device)
-    with renamed(name="classifier"):
+    with keyed(name="classifier"):
         classifier = load_network(settings.classifier, settings.weights).to(device)
     if adversary is not None:
         images = adversary.render(_start_rasterizer(settings)).to(device)
@@ -145,19 +145,19 @@ def run(settings: AttackExperimentSettings) -> None:
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
     """Start the rasterizer that the settings name."""
-    with renamed(**keys_of("renderer", settings.renderer)):
+    with keyed(**keys_of("renderer", settings.renderer)):
         return choose_rasterizer(settings.renderer)
 
 
 def _require_attack_settings(settings: AttackExperimentSettings) -> None:
     """Check settings that no file and no classifier is needed for."""
-    with keyed("transfer", vars(settings.transfer)):
+    with keyed("transfer", **keys_of("transfer", settings.transfer)):
         require_transferable(
             settings.attack.parameters,
             settings.transfer.azimuths,
             settings.transfer.meshes,
         )
-    with keyed("attack", vars(settings.attack)):
+    with keyed("attack", **keys_of("attack", settings.attack)):
         require_renderers(settings.attack.renderers)
 
 
@@ -270,7 +270,7 @@ def _attack_mesh(
             generator(settings.seed, mesh.mesh, "search"),
         )
     scene = build(scene_settings)
-    with keyed("attack", vars(settings.attack)):
+    with keyed("attack", **keys_of("attack", settings.attack)):
         result = attack(
             classifier,
             scene,
@@ -308,7 +308,7 @@ def build_attacked(
         InputError: If a setting of the scene does not fit, which the message names.
     """
     rasterizer = _start_rasterizer(settings)
-    with keyed("scene", vars(scene)):
+    with keyed("scene", **keys_of("scene", scene)):
         return build_scene(
             [item],
             size,
@@ -322,7 +322,11 @@ def build_attacked(
         )
 
 
-def load_targets(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> TransferTargets:
+def load_targets(
+    settings: AttackExperimentSettings,
+    attacked: Classifier,
+    device: torch.device,
+) -> TransferTargets:
     """Load the classifiers and the meshes to which adversaries are transferred.
 
     Args:
@@ -360,7 +364,7 @@ def _load_classifier(item: Any) -> Classifier:
         if key not in ("classifier", "weights"):
             advice = "give names, or {classifier, weights}"
             raise InputError(f"transfer.classifiers: {key} is not known: {advice}")
-    with renamed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
+    with keyed(name="transfer.classifiers", weights="transfer.classifiers: weights"):
         return load_network(str(named.get("classifier")), named.get("weights"))
 
 

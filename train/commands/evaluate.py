@@ -9,7 +9,7 @@ from train.functions.evaluate import evaluate as evaluate_network
 from train.runs.saved_networks import load_network, load_run
 from train.settings import label_names
 from train.system.device import choose_device
-from train.system.user_errors import keyed, renamed
+from train.system.user_errors import keyed
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -22,7 +22,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     with keyed("label"):
         for name in label_names(settings.label):
             network.label(name)
-    with renamed(folder="photos"):
+    with keyed(folder="photos"):
         scores = evaluate_network(
             network,
             settings.photos,
@@ -42,6 +42,6 @@ def evaluate(settings: EvaluateSettings) -> None:
 def _load_network(settings: EvaluateSettings) -> Classifier:
     """Load the network of a run, or any other classifier."""
     if settings.run is None:
-        with renamed(name="classifier"):
+        with keyed(name="classifier"):
             return load_network(str(settings.classifier), settings.weights)
     return load_run(settings.run, settings.weights, settings.model)

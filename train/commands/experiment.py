@@ -15,7 +15,6 @@ from augment import distributed
 from augment.settings import ARMS
 from train import console
 from train.command import program, read_settings
-from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import report_of
 from train.report.results import require_new_run
@@ -26,8 +25,7 @@ from train.runs.run_lock import sole_writer
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
-from train.training.initial import load_initial
-from train.training.run import Run
+from train.training.run import load_runs
 
 # Folders of conf/ from which an override can choose a file.
 CHOICES = ("experiment", "augment", "data", "launcher")
@@ -58,7 +56,10 @@ def _report_thread_error(error: threading.ExceptHookArgs) -> None:
 
 
 def _train(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Check all settings, and then train the baselines and the main run in the folder that rank 0 names."""
+    """Check all settings, and then train the baselines and the main run.
+
+    All processes use the folder that rank 0 names.
+    """
     run = broadcast(str(config.run))
     is_first = distributed.rank() == 0
     command = given_command(overrides)
@@ -78,7 +79,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     with log:
         try:
             with sole_writer("run", *arms) if is_first else nullcontext():
-                _train_arms(arms, folder, command)
+                _train_methods(arms, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
             console.info("%s%s", cause, _advise_to_resume(arms, folder))
@@ -86,7 +87,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _list_arms(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """Return the settings of the baselines and of the main run by folder. The main run is the last one."""
+    """Return the settings of the baselines and, at the end, of the main run, by folder."""
     arms = {}
     for arm in settings.compare:
         with keyed("compare"):
@@ -104,17 +105,13 @@ def _advise_to_resume(arms: Mapping[Path, ExperimentSettings], folder: Path) -> 
     return f"to go on: {shlex.join(words)}"
 
 
-def _train_arms(arms: Mapping[Path, ExperimentSettings], folder: Path, command: str) -> None:
+def _train_methods(
+    arms: Mapping[Path, ExperimentSettings],
+    folder: Path,
+    command: str,
+) -> None:
     """Train all runs in their folders, and print a table. The main run lies in `folder`."""
-    main = arms[folder]
-    initial = load_initial(main)
-    data = load_data(main, initial.size if initial else None)
-    runs = [Run(settings, data, path, initial, command) for path, settings in arms.items()]
-    # All runs are loaded before the first one is trained, so that a mistake in
-    # any of them is reported at once.
-    for run in runs:
-        run.load()
-    for run in runs:
+    for run in load_runs(arms, command):
         arm = run.settings.augment.arm
         purpose = "" if run.folder == folder else ", for comparison"
         console.info("\n== augment=%s: %s%s", arm, ARMS[arm], purpose)

@@ -39,7 +39,7 @@ GRAB_CUT_STEPS = 5
 
 
 def fit(settings: FitSettings) -> None:
-    """Fit the camera and the light of a photograph, write them, and print a command that attacks them.
+    """Fit the camera and the lighting of a photograph, and print a command that attacks them.
 
     Args:
         settings: Settings of pnb-fit.

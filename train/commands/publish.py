@@ -13,7 +13,7 @@ from train.report.results import require_replaceable
 from train.report.summary import summarize
 from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published
-from train.system.user_errors import renamed, writable_folder
+from train.system.user_errors import keyed, writable_folder
 
 
 def publish_network(settings: PublishSettings) -> None:
@@ -63,15 +63,20 @@ def _describe_run(folder: Path) -> dict[str, Any]:
 
 
 def _without_folder(text: str) -> str:
-    """Return the name of a file in place of an absolute path, which exists on this machine alone."""
+    """Replace an absolute path, which exists only on this machine, by the name of its file."""
     return Path(text).name if text.startswith("/") else text
 
 
-def _calibrate(network: Classifier, folder: str, label: Any, false_positive_rate: float) -> list[dict[str, Any]]:
+def _calibrate(
+    network: Classifier,
+    folder: str,
+    label: Any,
+    false_positive_rate: float,
+) -> list[dict[str, Any]]:
     """Choose the threshold of each label on a folder of photographs, and print it."""
     # The thresholds are those of the published weights, which have 16 bits.
     network.half().float()
-    with renamed(folder="calibrate"):
+    with keyed(folder="calibrate"):
         points = scoring.choose_operating_points(
             Predictor(network, network.classes, network.size),
             published(Path(folder)),

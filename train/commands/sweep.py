@@ -13,8 +13,6 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
-import hydra
-from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
@@ -22,9 +20,8 @@ from omegaconf import DictConfig
 from renderer.errors import InputError
 from renderer.io.files import write_whole
 from train import console
-from train.command import quoted, read_settings
+from train.command import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
-from train.data.load import load_data
 from train.report.comparison import format_table
 from train.report.report_page import PAGE, report_of
 from train.report.results import require_new_run, require_replaceable
@@ -35,8 +32,7 @@ from train.runs.run_lock import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system.user_errors import one_sentence, writable_folder
-from train.training.initial import load_initial
-from train.training.run import Run
+from train.training.run import load_runs
 
 
 def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
@@ -47,11 +43,12 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
         overrides: The words of the command line, flags included.
 
     Raises:
-        InputError: Before the first run, if two runs are the same, or a folder holds a run with other settings.
+        InputError: If two runs are the same, or a folder holds a run with other
+            settings. This is checked before the first run.
         SystemExit: With status 1, if a run is not finished at the end.
     """
     runs = _expand([word for word in overrides if not word.startswith("-")])
-    first = _compose(runs[0])
+    first = compose("train", runs[0])
     overwrite = bool(first.overwrite)
     parent = writable_folder(str(first.sweep), "sweep")
     # The folder may hold the page that an earlier call wrote about the same sweep.
@@ -84,7 +81,7 @@ def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
 def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bool) -> None:
     """Check that the folder of a run is empty, or holds the same run."""
     if is_finished(folder) or checkpoint.exists(folder):
-        settings = read_settings(ExperimentSettings, _compose(overrides))
+        settings = read_settings(ExperimentSettings, compose("train", overrides))
         require_same_run(folder, settings, finished=True)
     else:
         require_new_run(folder, "sweep", overwrite, resume=True)
@@ -106,12 +103,6 @@ def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
             values = [override.get_value_element_as_str()]
         choices_of_key[key] = [f"{key}={value}" for value in values]
     return list(product(*choices_of_key.values()))
-
-
-def _compose(overrides: Sequence[str]) -> DictConfig:
-    """Compose the configuration of one run."""
-    with initialize_config_module("conf", version_base="1.3"):
-        return hydra.compose("train", list(overrides))
 
 
 def run_in_sweep(config: DictConfig) -> None:
@@ -147,9 +138,10 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
-            # Only an error that is not the user's is shown with its traceback.
+            # An error without such a sentence is a fault of the program, and is
+            # shown with its traceback.
             console.error("failed: %s", reason, exc_info=None if sentence else error)
-            # On a full disk, only the console shows the reason.
+            # If the disk is full, the console alone shows the reason.
             with suppress(OSError):
                 write_whole(folder / FAILURE, f"{reason}\n")
 
@@ -159,10 +151,7 @@ def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
     settings = read_settings(ExperimentSettings, config)
     settings.train.resume = checkpoint.exists(folder)
     command = given_command([_unescaped(override) for override in overrides])
-    initial = load_initial(settings)
-    data = load_data(settings, initial.size if initial else None)
-    run = Run(settings, data, folder, initial, command)
-    run.load()
+    (run,) = load_runs({folder: settings}, command)
     run.fit()
     run.score()
     run.export()

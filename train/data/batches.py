@@ -57,9 +57,10 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True)
 class Draws:
-    """What is drawn for the images of a round. The draws are the same on every device.
+    """Random draws for the images of a round. They are the same on every device.
 
-    The last dimensions are the batches and the images of a batch, or the images of all batches.
+    The last dimensions are (batches, images of a batch), or (images of all
+    batches,).
 
     Attributes:
         order: The number of each image.
@@ -74,12 +75,20 @@ class Draws:
     seeds: Tensor | None = None
 
     def of_columns(self, first: int, columns: slice) -> "Draws":
-        """Return the draws of some columns of all batches from the first one on."""
+        """Return the draws of a part of each batch.
+
+        Args:
+            first: Number of the first batch that is kept.
+            columns: Images of each batch that are kept.
+
+        Returns:
+            Draws of the kept images.
+        """
         return Draws(
-            self.order[first:, columns],
-            self.shifts[:, first:, columns],
-            self.flips[first:, columns],
-            None if self.seeds is None else self.seeds[first:, columns],
+            order=self.order[first:, columns],
+            shifts=self.shifts[:, first:, columns],
+            flips=self.flips[first:, columns],
+            seeds=None if self.seeds is None else self.seeds[first:, columns],
         )
 
 
@@ -206,7 +215,10 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
                 flips[part][places],
             )
             labels[places] = renders.labels[number]
-        yield from zip(shown.split(share), labels.split(share), is_render[part].split(share), strict=True)
+        batches = shown.split(share)
+        labels_of_batches = labels.split(share)
+        is_render_of_batches = is_render[part].split(share)
+        yield from zip(batches, labels_of_batches, is_render_of_batches, strict=True)
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:

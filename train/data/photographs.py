@@ -1,4 +1,4 @@
-"""Find the images of a folder with their classes and sources, and reduce them to a network's size."""
+"""Find the images of a folder with their classes and sources, and reduce them in size."""
 
 import csv
 import os
@@ -176,11 +176,11 @@ def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a folder of photographs")
-    return [name for name in _folder_names(folder) if name in classes]
+    return [name for name in folder_names(folder) if name in classes]
 
 
-def _folder_names(folder: Path) -> list[str]:
-    """Return the names of the folders in a folder, sorted, without hidden ones."""
+def folder_names(folder: Path) -> list[str]:
+    """Return the sorted names of the folders in a folder, without hidden ones."""
     folders = [entry.name for entry in folder.iterdir() if entry.is_dir()]
     return sorted(name for name in folders if not is_hidden(name))
 
@@ -214,16 +214,17 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
 
 
 def left_out(folder: Path) -> list[PurePosixPath]:
-    """Find the files of a folder that are of no kind that is read.
+    """Find the files of a folder whose type is not supported.
 
     Args:
         folder: The folder.
 
     Returns:
-        Their paths, sorted.
+        Sorted paths, relative to the folder.
     """
     own = (PurePosixPath(TABLE), PurePosixPath(DESCRIPTION))
-    return sorted(path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in own)
+    others = [path for path in _files(folder) if path not in own]
+    return sorted(path for path in others if path.suffix.lower() not in SUFFIXES)
 
 
 @cache
@@ -276,7 +277,7 @@ def _has_class_folders(
     Raise InputError if no folder is a class, if a folder may be meant for a label, or if images
     lie beside folders.
     """
-    names = _folder_names(folder)
+    names = folder_names(folder)
     others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
     for name in others:
         if others == names or any(_is_like(name, label) for label in labels):
@@ -387,7 +388,11 @@ def load_photographs(
     return [photographs[row] for row in readable], images, [str(path) for path, _ in broken]
 
 
-def _read_into(images: Tensor, folder: Path, photographs: Sequence[Photograph]) -> list[Exception | None]:
+def _read_into(
+    images: Tensor,
+    folder: Path,
+    photographs: Sequence[Photograph],
+) -> list[Exception | None]:
     """Read photographs into the rows of a tensor; return the error of each row, if any."""
     size = images.shape[-1]
 

@@ -1,4 +1,7 @@
-"""A small labeled data set of solids, rendered here in soft, even light, so that training needs no download."""
+"""A small labeled data set of solids in soft, uniform lighting.
+
+It is rendered when it is needed, so that training needs no download.
+"""
 
 import math
 from dataclasses import replace
@@ -34,10 +37,17 @@ SETTINGS = ImageSettings(samples=4)
 VIEWS = 5
 BACKGROUNDS = 4
 # A hash of the code that renders, since other code may render other images.
-CODE = source_key(*(Path(module).parent for module in (renderer.__file__, augment.__file__, __file__)))
+_MODULES = (renderer.__file__, augment.__file__, __file__)
+CODE = source_key(*(Path(module).parent for module in _MODULES))
 
 
-def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
+def load_shapes(
+    train: int,
+    test: int,
+    size: int,
+    seed: int,
+    cache: TensorCache | None = None,
+) -> DataSet:
     """Render images of every solid in even light, or read them from a cache.
 
     Args:

@@ -1,4 +1,4 @@
-"""Images with labels (CIFAR-100, an .npz file, a folder of class folders) or without (any folder)."""
+"""Data sets of images: CIFAR-100, an .npz file, class folders, or a folder without labels."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -41,9 +41,10 @@ class Split:
 
     @cached_property
     def content_hash(self) -> str:
-        """The SHA-256 of images and labels. Files count by their names and sizes."""
+        """Hash the images and labels with SHA-256. Of files, hash names and sizes instead."""
         images = self.images
-        return content_hash([images.facts() if isinstance(images, ImageFiles) else images, self.labels])
+        content = images.facts() if isinstance(images, ImageFiles) else images
+        return content_hash([content, self.labels])
 
     def to(self, device: torch.device) -> "Split":
         """Return a copy on a device. Files stay where they are."""
@@ -253,7 +254,13 @@ def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
 
 
-def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: bool = False, workers: int = 0) -> DataSet:
+def load_folder(
+    path: str,
+    size: int,
+    test_fraction: float,
+    skip_unreadable: bool = False,
+    workers: int = 0,
+) -> DataSet:
     """Load class folders of images, or folders `train` and `test` of class folders.
 
     The central square of each image is reduced. Images of more than `RESIDENT` pixels per side
@@ -277,12 +284,12 @@ def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: boo
     if not root.is_dir():
         advice = "give a folder with one folder of images per class"
         raise InputError(f"path={path} is not a folder: {advice}", "path")
-    parts = [name for name in _folders(root) if name.lower() in PARTS]
+    parts = [name for name in folder_names(root) if name.lower() in PARTS]
     if parts not in ([], ["test", "train"]):
         advice = "divide it into train and test, or not at all"
         raise InputError(f"path={path} holds {', '.join(parts)}: {advice}", "path")
     train_root = root / "train" if parts else root
-    classes = tuple(_folders(train_root))
+    classes = tuple(folder_names(train_root))
     if len(classes) < 2:
         fault = f"path={path} holds {len(classes)} class folders"
         raise InputError(f"{fault}: it needs two or more", "path")
@@ -303,7 +310,13 @@ def load_folder(path: str, size: int, test_fraction: float, skip_unreadable: boo
     return DataSet(classes, train[~is_test], train[is_test])
 
 
-def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: bool, workers: int) -> DataSet:
+def load_unlabeled(
+    path: str,
+    size: int,
+    test_fraction: float,
+    skip_unreadable: bool,
+    workers: int,
+) -> DataSet:
     """Load all images of a folder and its sub-folders. Their classes are not known.
 
     Args:
@@ -327,12 +340,13 @@ def load_unlabeled(path: str, size: int, test_fraction: float, skip_unreadable: 
     return DataSet((), split[~is_test], split[is_test], labeled=False)
 
 
-def _folders(root: Path) -> list[str]:
-    """Return the names of the folders in a folder, sorted, without hidden ones."""
-    return sorted(entry.name for entry in root.iterdir() if entry.is_dir() and not is_hidden(entry.name))
-
-
-def _folder_split(root: Path, classes: tuple[str, ...], size: int, skip_unreadable: bool, workers: int) -> Split:
+def _folder_split(
+    root: Path,
+    classes: tuple[str, ...],
+    size: int,
+    skip_unreadable: bool,
+    workers: int,
+) -> Split:
     """Read the images of class folders, with their labels."""
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)

@@ -1,1 +1,1 @@
-"""What measures a network: scores on photographs, and a laboratory that renders them."""
+"""Evaluation of networks: scores on photographs, and a laboratory that renders test images."""

@@ -36,9 +36,15 @@ class Proportion(Estimate):
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title, which may be empty. As text: Markdown below the title, aligned on a console, too.
+    """Table with a title. `str` converts it to Markdown with aligned columns.
 
-    On a terminal that is too narrow, columns go on in further tables, which repeat the first one.
+    If the terminal is too narrow for all columns, the text has several tables
+    below each other. Each of them begins with the first column.
+
+    Attributes:
+        title: Title above the table. It may be empty.
+        header: Titles of the columns.
+        rows: Cells of each row. `as_text` converts them to text.
     """
 
     title: str
@@ -47,41 +53,73 @@ class Table:
 
     @property
     def known(self) -> "Table":
-        """Without the columns in which every cell is unknown, "-"."""
-        kept = [index for index in range(len(self.header)) if any(row[index] != "-" for row in self.rows)]
-        rows = [[row[index] for index in kept] for row in self.rows]
-        return Table(self.title, [self.header[index] for index in kept], rows)
+        """Return a copy without the columns in which every cell is "-"."""
+        kept = []
+        for column in range(len(self.header)):
+            if any(row[column] != "-" for row in self.rows):
+                kept.append(column)
+        header = [self.header[column] for column in kept]
+        rows = [[row[column] for column in kept] for row in self.rows]
+        return Table(self.title, header, rows)
 
     def __str__(self) -> str:
-        room = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
         lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
-        first, *others = (_aligned(cells) for cells in zip(*lines, strict=True))
-        parts = [[first]]
-        for column in others:
-            if len(parts[-1]) > 1 and _width([*parts[-1], column]) > room:
-                parts.append([first])
-            parts[-1].append(column)
-        tables = ("\n".join(f"| {' | '.join(cells)} |" for cells in zip(*part, strict=True)) for part in parts)
-        return "\n\n".join(filter(None, [self.title and f"{self.title}:", *tables]))
+        columns = [_align(column) for column in zip(*lines, strict=True)]
+        paragraphs = [f"{self.title}:"] if self.title else []
+        paragraphs += [_to_markdown(part) for part in _fit_terminal(columns)]
+        return "\n\n".join(paragraphs)
 
 
-def _aligned(cells: Sequence[str]) -> list[str]:
-    """A column's cells, a line beneath the first, in one width."""
+# Cells of a column, all of the same width: the header, a line, and one per row.
+Column = list[str]
+
+
+def _align(cells: Sequence[str]) -> Column:
+    """Pad the cells of a column to the same width, and add a line below the header."""
+    header, *others = cells
     width = max(map(len, cells))
-    return [cell.ljust(width) for cell in (cells[0], "-" * width, *cells[1:])]
+    return [cell.ljust(width) for cell in (header, "-" * width, *others)]
 
 
-def _width(columns: Sequence[Sequence[str]]) -> int:
+def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
+    """Divide columns into tables as wide as the terminal, each with the first column."""
+    terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+    first, *others = columns
+    tables = [[first]]
+    for column in others:
+        has_other_column = len(tables[-1]) > 1
+        if has_other_column and _width([*tables[-1], column]) > terminal_width:
+            tables.append([first])
+        tables[-1].append(column)
+    return tables
+
+
+def _width(columns: Sequence[Column]) -> int:
+    """Count the characters of a line of a table, with its separators."""
     return sum(len(column[0]) + 3 for column in columns) + 1
 
 
+def _to_markdown(columns: Sequence[Column]) -> str:
+    """Join columns to the lines of a Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
+
+
 def as_text(value: object) -> str:
-    """A cell: numbers with three significant digits, nothing for None."""
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    """Write a cell of a table as text.
+
+    Numbers get thousands separators, and fractions get three significant
+    digits. None becomes an empty text.
+    """
+    match value:
+        case None:
+            return ""
+        case float() if value >= 1000:
+            return f"{value:,.0f}"
+        case float():
+            return f"{value:.3g}"
+        case int():
+            return f"{value:,}"
+    return str(value)
 
 
 def fraction(hits: int, n: int) -> Proportion:

@@ -27,7 +27,7 @@ from train.report.results import require_replaceable
 from train.runs.run_lock import sole_writer
 from train.settings import label_names, published
 from train.system.device import MixedPrecision, choose_precision
-from train.system.user_errors import renamed, writable_folder
+from train.system.user_errors import keyed, writable_folder
 
 
 def evaluate(
@@ -150,5 +150,5 @@ def _choose_points(
 ) -> list[OperatingPoint]:
     """Choose an operating point of each label on a folder of photographs."""
     path = published(Path(folder))
-    with renamed(folder="calibrate"):
+    with keyed(folder="calibrate"):
         return scoring.choose_operating_points(predictor, path, labels, rate, skip_unreadable)

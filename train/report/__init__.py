@@ -1,1 +1,1 @@
-"""Runs and attacks, read from their folders: tables, comparisons, and a page of tables, plots and images."""
+"""Reports of runs and attacks: tables, comparisons, and a page with plots and images."""

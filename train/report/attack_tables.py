@@ -102,7 +102,8 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool) -> list[str]:
     rates = []
     for steps, rate in checks["success_by_steps"].items():
         rates.append(f"{_both_rates(rate, rates_without_noise[steps], has_noise)} in {steps}")
-    search = _both_rates(checks["random_search"], checks[f"random_search{WITHOUT_NOISE}"], has_noise)
+    search_without_noise = checks[f"random_search{WITHOUT_NOISE}"]
+    search = _both_rates(checks["random_search"], search_without_noise, has_noise)
     return [
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
@@ -115,8 +116,10 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool) -> list[str]:
 
 
 def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a rate of success and, if noise counts, that without it."""
-    return f"{rate:.0%} ({without_noise:.0%} without noise)" if has_noise else f"{rate:.0%}"
+    """Write a rate of success and, if noise counts, the rate without noise."""
+    if not has_noise:
+        return f"{rate:.0%}"
+    return f"{rate:.0%} ({without_noise:.0%} without noise)"
 
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
@@ -127,7 +130,8 @@ def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_no
     if has_noise:
         count = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
         without_noise = f" ({count} without noise)"
-    by_margin = [line["versions"][version]["success"] for line in adversaries if line["success_with_margin"]]
+    with_margin = [line for line in adversaries if line["success_with_margin"]]
+    by_margin = [line["versions"][version]["success"] for line in with_margin]
     largest = 255 * max(line["largest_difference"] for line in numbers)
     mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
     return (

@@ -1,4 +1,9 @@
-"""Finished runs side by side: metrics on photographs by source, and differences with intervals."""
+"""Tables that compare finished runs: metrics on photographs by source, and differences.
+
+Runs that differ only in their seed are the runs of one arm. An `Evaluation`
+holds the predictions of one run for one folder of photographs. `difference`
+compares a metric of two arms, with a 95% interval.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +14,15 @@ import numpy as np
 from augment.progress import progress
 from augment.settings import ARMS
 from renderer.errors import InputError
-from train.evaluation.scores.metrics import METRICS, Metrics, Pool, Pooled, estimate, metric_title, replicate_difference
+from train.evaluation.scores.metrics import (
+    METRICS,
+    Metrics,
+    Pool,
+    Pooled,
+    estimate,
+    metric_title,
+    replicate_difference,
+)
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.tables import Estimate, Table, format_interval
@@ -17,24 +30,26 @@ from train.report.summary import (
     INITIAL,
     RunSummary,
     Scored,
-    arms_of,
-    by_images,
+    group_by_images,
+    group_by_method,
     label_title,
     run_tables,
     seconds_table,
 )
 from train.settings import PHOTOGRAPHS
 
+# Titles of the columns of metrics.
 TITLES = [metric_title(name) for name in METRICS]
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the images of an evaluation, to which a row of a table belongs.
+    """Part of the images of an evaluation. Tables have a row for each part.
 
     Attributes:
-        by: "all" for the images of all sources that are not excluded, or the
-            property that they share: "label", "source" or "mesh".
+        by: "all" for the images of all sources that are not excluded.
+            Otherwise the property that the images of the part share: "label",
+            "source" or "mesh".
         name: Name of the label, the source or the mesh. Empty for all images.
     """
 
@@ -52,20 +67,23 @@ class Part:
         """
         if self == ALL:
             return overall
-        return label_title(self.name) if self.by == "label" else self.name
+        if self.by == "label":
+            return label_title(self.name)
+        return self.name
 
     @property
     def is_overall(self) -> bool:
-        """Whether the part has the images of all sources, about one label or all."""
+        """Whether the part has the images of all sources, for one label or for all labels."""
         return self.by in ("all", "label")
 
 
+# The images of all sources that are not excluded.
 ALL = Part()
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A run with the pools of its predictions on one folder of photographs.
+    """Predictions of a run for one folder of photographs, pooled by parts of the images.
 
     Attributes:
         run: Run that made the predictions.
@@ -76,24 +94,28 @@ class Evaluation:
     pools: Mapping[Part, Pool]
 
 
-# The evaluations of each arm, in the order of their seeds.
+# Evaluations by arm, in the order of their seeds.
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
 def pools_of(pooled: Pooled, *properties: str) -> dict[Part, Pool]:
-    """Return the pools of all images and of parts of them.
+    """Return the pool of all images, and a pool for each value of some properties.
 
     Args:
-        pooled: Predictions of one evaluation.
+        pooled: Pools of one evaluation.
         *properties: "label", "source" or "mesh", in the order of the pools.
 
     Returns:
         Pools by part. `ALL` is the first.
     """
-    groups = {"label": "by_label", "source": "by_source", "mesh": "by_mesh"}
+    pools_of_property = {
+        "label": pooled.by_label,
+        "source": pooled.by_source,
+        "mesh": pooled.by_mesh,
+    }
     pools = {ALL: pooled.all}
     for by in properties:
-        for name, pool in getattr(pooled, groups[by]).items():
+        for name, pool in pools_of_property[by].items():
             pools[Part(by, name)] = pool
     return pools
 
@@ -102,16 +124,18 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     """Read the predictions of runs that were scored on the same images.
 
     Args:
-        group: Scored runs of each arm, as `by_images` groups them.
+        group: Scored runs of each arm, from `group_by_images`.
         exclude: Sources that the pool of all images leaves out.
-        by: "source" or "mesh", of which each has a pool.
+        by: "source" for a pool of each source, or "mesh" for a pool of each
+            mesh.
 
     Returns:
-        Evaluations of each arm. Runs with published scores alone are left out.
+        Evaluations by arm. Published networks have no predictions and are
+        left out.
 
     Raises:
-        InputError: As of `read_predictions`, for a source to exclude that does
-            not exist, and for meshes if none is known.
+        InputError: If predictions.csv cannot be read, if a source to exclude
+            does not exist, or if `by` is "mesh" and no mesh is known.
     """
     arms: dict[str, list[Evaluation]] = {}
     for arm, scored_runs in group.items():
@@ -122,17 +146,17 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
             scores = scored.scores
             predictions = read_predictions(path, scores.labels)
             pooled = Pooled(predictions, exclude, scores.thresholds)
+            _require_sources(exclude, predictions)
             if by == "mesh" and not pooled.by_mesh:
-                raise InputError(f"by=mesh: {path} names no mesh: leave it out")
+                raise InputError(f"by=mesh: {path} names no mesh: leave by=mesh out")
             properties = ("label", by) if scores.by_label else (by,)
             pools = pools_of(pooled, *properties)
             arms.setdefault(arm, []).append(Evaluation(scored.run, pools))
-            _require_sources(exclude, predictions)
     return arms
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
-    """Raise InputError for the name of a source that no photograph has."""
+    """Raise InputError if no photograph has a source of one of these names."""
     sources = {item.photograph.source for item in predictions}
     unknown = set(names) - sources
     if unknown:
@@ -145,14 +169,14 @@ def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate 
     """Average a metric over the seeds of an arm.
 
     Args:
-        group: Evaluations of the seeds.
+        group: Evaluations of the arm, one for each seed.
         part: Part of the images.
         name: Name in `METRICS`.
 
     Returns:
-        Metric of one seed with its 95% interval, or the mean of several with
-        the lowest and the highest in place of the interval. None if no seed has
-        it.
+        With one seed, the metric and its 95% interval. With several seeds, the
+        mean, with the lowest and the highest value as the ends of the interval.
+        None if the metric is unknown for every seed.
     """
     known: list[Estimate] = []
     values: list[float] = []
@@ -175,10 +199,11 @@ def group_table(arms: Evaluations, overall: str = "all", by: str = "source") -> 
     Args:
         arms: Evaluations of each arm.
         overall: Title of the rows of all images.
-        by: "source" or "mesh", the title of the first column.
+        by: "source" or "mesh": the title of the first column.
 
     Returns:
-        Table of the metrics as `mean_metric` averages them.
+        Table with a row for each part and each arm. Cells hold the means
+        over the seeds (see `mean_metric`).
     """
     evaluations = [evaluation for group in arms.values() for evaluation in group]
     parts = dict.fromkeys(part for evaluation in evaluations for part in evaluation.pools)
@@ -190,13 +215,28 @@ def group_table(arms: Evaluations, overall: str = "all", by: str = "source") -> 
     return Table(f"by {by}", [by, "network", *TITLES], rows)
 
 
-def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
-    """Which arms to compare: each with the network that it began with, and with the first arm beside those networks."""
-    heads = {arm: group[0].run for arm, group in arms.items()}
-    given = [arm for arm, run in heads.items() if run.arm != INITIAL]
-    starts = {arm: run.before.settings for arm, run in heads.items() if run.before}
-    pairs = [(arm, base) for arm, start in starts.items() for base in arms if heads[base].settings == start]
-    return pairs + [(arm, given[0]) for arm in given[1:]]
+def choose_pairs(arms: Evaluations) -> list[tuple[str, str]]:
+    """Choose which arms are compared with which reference.
+
+    Each arm is compared with the network that its runs began with, and with
+    the first of the arms.
+
+    Args:
+        arms: Evaluations of each arm. Initial networks count as arms.
+
+    Returns:
+        Pairs of an arm and its reference.
+    """
+    first_runs = {arm: evaluations[0].run for arm, evaluations in arms.items()}
+    pairs = []
+    for arm, run in first_runs.items():
+        if run.before is None:
+            continue
+        for reference, reference_run in first_runs.items():
+            if reference_run.settings == run.before.settings:
+                pairs.append((arm, reference))
+    trained = [arm for arm, run in first_runs.items() if run.arm != INITIAL]
+    return pairs + [(arm, trained[0]) for arm in trained[1:]]
 
 
 @dataclass(frozen=True)
@@ -213,23 +253,27 @@ class Difference(Estimate):
 
 
 def difference(
-    group: Sequence[Evaluation], reference: Sequence[Evaluation], part: Part, name: str
+    group: Sequence[Evaluation],
+    reference: Sequence[Evaluation],
+    part: Part,
+    name: str,
 ) -> Difference | None:
-    """Compute how far the mean of a metric over seeds is from that of a reference.
+    """Subtract the mean of a metric over the seeds of a reference from the mean of an arm.
 
-    The interval is a 95% bootstrap interval over objects and images, the same
-    ones for all runs, and over seeds, which are drawn in pairs if both arms
-    have the same. Few seeds say little about their spread: with n, the
-    bootstrap underestimates the variance by 1/n, and with one it finds none.
+    The 95% interval comes from a bootstrap over objects, images and seeds. Each
+    replicate draws the same objects and images for all runs. If both arms
+    have the same seeds, a seed is drawn for both of them at once. The bootstrap
+    over n seeds underestimates the variance between seeds by a factor of
+    1 - 1/n. With one seed, this variance is missing altogether.
 
     Args:
-        group: Evaluations of the seeds of an arm.
-        reference: Evaluations of the seeds of the arm that it is compared with.
+        group: Evaluations of the arm, one for each seed.
+        reference: Evaluations of the reference, one for each seed.
         part: Part of the images.
         name: Name in `METRICS`.
 
     Returns:
-        Difference of the means. None if a run lacks the metric.
+        Difference of the means. None if the metric of a run has no replicates.
     """
     pools = [evaluation.pools[part] for evaluation in group]
     reference_pools = [evaluation.pools[part] for evaluation in reference]
@@ -240,41 +284,52 @@ def difference(
     replicates = replicate_difference(
         np.stack([pool.replicates[name] for pool in pools]),
         np.stack([pool.replicates[name] for pool in reference_pools]),
-        _paired(group, reference),
+        _have_equal_seeds(group, reference),
     )
-    ends = estimate(after - before, replicates)
-    return Difference(value=ends.value, low=ends.low, high=ends.high, before=before, after=after)
+    change = estimate(after - before, replicates)
+    return Difference(
+        value=change.value,
+        low=change.low,
+        high=change.high,
+        before=before,
+        after=after,
+    )
 
 
 def _known_value(metrics: Metrics, name: str) -> float:
-    """Return the value of a metric that is known, as all metrics with replicates are."""
+    """Return the value of a metric that has replicates, so that its value is known."""
     metric = metrics.find(name)
     assert metric is not None and metric.value is not None
     return metric.value
 
 
-def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
-    """Return whether both arms have the same seeds."""
+def _have_equal_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
+    """Return whether both arms have the same seeds, in the same order."""
     seeds = [evaluation.run.seed or 0 for evaluation in group]
-    return seeds == [evaluation.run.seed or 0 for evaluation in reference]
+    reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
+    return seeds == reference_seeds
 
 
 def difference_tables(
-    arms: Evaluations, overall: str = "all", by: str = "source", overall_only: bool = False
+    arms: Evaluations,
+    overall: str = "all",
+    by: str = "source",
+    overall_only: bool = False,
 ) -> list[Table]:
-    """Make a table of the differences between each two arms that are compared.
+    """Make a table of the differences for each pair of arms that is compared.
 
     Args:
         arms: Evaluations of each arm.
         overall: Title of the row of all images.
-        by: "source" or "mesh", the title of the first column.
-        overall_only: Whether to leave out single sources or meshes.
+        by: "source" or "mesh": the title of the first column.
+        overall_only: Whether to leave out the rows of single sources or meshes.
 
     Returns:
-        A table for each of `pairs_of`, with a row for each part of the images.
+        A table for each pair from `choose_pairs`, with a row for each part of
+        the images.
     """
     tables = []
-    for arm, base in progress(pairs_of(arms), "differences"):
+    for arm, base in progress(choose_pairs(arms), "differences"):
         group = arms[arm]
         reference = arms[base]
         rows = []
@@ -284,21 +339,21 @@ def difference_tables(
             differences = [difference(group, reference, part, name) for name in METRICS]
             cells = [format_interval(item, sign="+") for item in differences]
             rows.append([part.title(overall), *cells])
-        paired = ", paired" if _paired(group, reference) else ""
+        paired = ", paired" if _have_equal_seeds(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
         tables.append(Table(title, [by, *TITLES], rows))
     return tables
 
 
 def overall_differences(arms: Evaluations) -> Table:
-    """Make one table of the differences over all images.
+    """Make one table of the differences on the images of all sources.
 
     Args:
         arms: Evaluations of each arm.
 
     Returns:
-        Table with a row for each of `pairs_of` and, with several labels, for
-        each label.
+        Table with a row for each pair from `choose_pairs` and, with several
+        labels, for each label.
     """
     rows = []
     for table in difference_tables(arms, overall="", overall_only=True):
@@ -309,13 +364,34 @@ def overall_differences(arms: Evaluations) -> Table:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """`run_tables` and `overall_differences` by images as Markdown, and the paths of the contact sheets."""
-    arms = arms_of(runs)
-    groups = by_images(arms)
-    tables = run_tables(arms, groups) + [overall_differences(read_evaluations(group)) for group in groups.values()]
-    sheets = [f"image: {run.folder / name / CONTACT_SHEET}" for run in runs for name in run.photographs]
-    legend = "; ".join(f"{arm}: {renders}" for arm, renders in ARMS.items() if arm in {run.arm for run in runs})
-    return "\n\n".join(filter(None, [*(str(table.known) for table in tables if table.rows), legend, "\n".join(sheets)]))
+    """Compare runs in the tables that pnb-train prints at its end.
+
+    Args:
+        runs: Finished runs.
+
+    Returns:
+        Markdown tables of the accuracy, the metrics and their differences, a
+        line about the renders of each arm, and the paths of the contact
+        sheets.
+    """
+    arms = group_by_method(runs)
+    groups = group_by_images(arms)
+    tables = run_tables(arms, groups)
+    for group in groups.values():
+        tables.append(overall_differences(read_evaluations(group)))
+
+    used_modes = {run.arm for run in runs}
+    captions = [f"{mode}: {caption}" for mode, caption in ARMS.items() if mode in used_modes]
+    sheets = []
+    for run in runs:
+        sheets += [f"image: {run.folder / name / CONTACT_SHEET}" for name in run.photographs]
+    parts = [_format_tables(tables), "; ".join(captions), "\n".join(sheets)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _format_tables(tables: Sequence[Table]) -> str:
+    """Write the known columns of tables as Markdown. Tables without rows are left out."""
+    return "\n\n".join(str(table.known) for table in tables if table.rows)
 
 
 def format_comparison(
@@ -324,35 +400,52 @@ def format_comparison(
     photographs: str = PHOTOGRAPHS,
     by: str = "source",
 ) -> str:
-    """Tables of runs as Markdown: accuracy, metrics on photographs by source or mesh, differences, and seconds.
+    """Compare runs in the tables that pnb-compare prints.
 
-    Runs that differ only in the seed are a group; a table for each group shows how far it is from another (`pairs_of`).
-    exclude: sources that the pooled metrics leave out; photographs: the sub-folder of each run with its scores.
+    Args:
+        runs: Finished runs and scored networks.
+        exclude: Sources that the metrics on all images leave out.
+        photographs: Name of the sub-folder of each run with its scores on
+            photographs.
+        by: "source" for metrics of each source, or "mesh" for metrics of each
+            mesh.
 
-    InputError as of `read_evaluations`, for runs whose sub-folders are of different images or classes, and for a
-    sub-folder (but the usual one) that no run has.
+    Returns:
+        Markdown tables of the accuracy, the metrics, their differences, and the
+        seconds of an epoch.
+
+    Raises:
+        InputError: If the runs were scored on different photographs or classes,
+            if no run has the sub-folder and its name is not the usual one, or
+            if predictions cannot be read (see `read_evaluations`).
     """
-    arms = arms_of(runs)
-    groups = by_images(arms)
+    arms = group_by_method(runs)
+    groups = group_by_images(arms)
     tables = run_tables(arms, groups)
-    compared = [
-        group
-        for group in groups.values()
-        if any(
-            scored.name == photographs or scored.run.seed is None
-            for scored_runs in group.values()
-            for scored in scored_runs
-        )
-    ]
-    folders = [next(iter(group.values()))[0].folder for group in compared]
-    if len(folders) > 1:
-        advice = "score both networks on the same folder with pnb-evaluate"
-        raise InputError(f"{folders[1]} has other photographs or sources than {folders[0]}: {advice}")
-    if not folders and photographs != PHOTOGRAPHS:
-        raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
-    for group in compared:
-        overall = f"all but {', '.join(exclude)}" if exclude else "all"
+    overall = f"all but {', '.join(exclude)}" if exclude else "all"
+    group = _find_group(list(groups.values()), photographs)
+    if group is not None:
         evaluations = read_evaluations(group, exclude, by)
         tables.append(group_table(evaluations, overall, by))
         tables += difference_tables(evaluations, overall, by)
-    return "\n\n".join(str(table.known) for table in [*tables, seconds_table(arms)] if table.rows)
+    tables.append(seconds_table(arms))
+    return _format_tables(tables)
+
+
+def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
+    """Find the runs that were scored on the photographs of a sub-folder. None if there are none."""
+    found = [group for group in groups if _is_scored_on(group, photographs)]
+    if len(found) > 1:
+        first, second = (next(iter(group.values()))[0].folder for group in found[:2])
+        problem = f"{second} has other photographs or sources than {first}"
+        raise InputError(f"{problem}: score both networks on the same folder with pnb-evaluate")
+    if not found and photographs != PHOTOGRAPHS:
+        problem = f"photographs={photographs}: no run has a sub-folder of that name"
+        raise InputError(f"{problem} with the files of an evaluation")
+    return found[0] if found else None
+
+
+def _is_scored_on(group: Scored, photographs: str) -> bool:
+    """Return whether a group has the scores of a sub-folder, or of a network that is no run."""
+    members = [scored for scored_runs in group.values() for scored in scored_runs]
+    return any(scored.name == photographs or scored.run.seed is None for scored in members)

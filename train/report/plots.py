@@ -71,7 +71,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The whole file, as an address in a page."""
+        """Encode the bytes of the file as an address for the page."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode()}"
 
 
@@ -87,7 +87,11 @@ def style(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch") -> Picture | None:
+def curves(
+    arms: Mapping[str, Sequence[Points]],
+    title: str,
+    x_title: str = "epoch",
+) -> Picture | None:
     """Plot a quantity over epochs or rounds, with a line for each seed of an arm.
 
     Args:
@@ -114,7 +118,11 @@ def curves(arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epo
     return _plot(lambda axes: _draw_curves(axes, lines_of_arm, x_title), title, alt)
 
 
-def _draw_curves(axes: "Axes", lines_of_arm: Mapping[str, list[list[tuple[float, float]]]], x_title: str) -> None:
+def _draw_curves(
+    axes: "Axes",
+    lines_of_arm: Mapping[str, list[list[tuple[float, float]]]],
+    x_title: str,
+) -> None:
     """Draw the lines of each arm in its color; the first one is named in the legend."""
     for index, (arm, lines) in enumerate(lines_of_arm.items()):
         name: str | None = arm
@@ -139,7 +147,9 @@ def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     Returns:
         The plot. None if no seed has scores of both kinds.
     """
-    known = {arm: [pair for pair in pairs if all(map(len, pair))] for arm, pairs in arms.items()}
+    known = {}
+    for arm, pairs in arms.items():
+        known[arm] = [pair for pair in pairs if all(map(len, pair))]
     if not any(known.values()):
         return None
     styles = {arm: style(index) for index, arm in enumerate(arms)}

@@ -1,4 +1,4 @@
-"""A page of runs and attacks, report.html, which loads nothing else."""
+"""The page report.html, which shows runs and attacks. It loads no other file."""
 
 import shlex
 import traceback
@@ -23,20 +23,33 @@ from train.evaluation.tables import Table, as_text, format_fraction, format_inte
 from train.report import comparison as compare
 from train.report import plots, summary
 from train.report.plots import Picture
-from train.report.summary import Arms, RunSummary, Scored
+from train.report.summary import Methods, RunSummary, Scored
 from train.runs.epoch_metrics import attack_success
 from train.runs.run_config import CONFIG, read_config
+from train.runs.run_log import RENDERS
 from train.system.user_errors import one_sentence
 
+# Name of the file.
 PAGE = "report.html"
-MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
-MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with images
-ATTACK_EXAMPLES = 4  # with images of an attack
-GRID, SHEET = (
-    720,
-    1100,
-)  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
-HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")  # of METRICS, in the first sentences
+# Number of arms, and of seeds of an arm, in plots and comparisons.
+MOST_ARMS = 6
+MOST_SEEDS = 5
+# Number of unfinished runs in plots.
+MOST_UNFINISHED = 3
+# Number of attacks with images, and of examples of such an attack.
+MOST_ATTACKS = 12
+ATTACK_EXAMPLES = 4
+# Number of epochs of which the renders are shown.
+SHOWN_EPOCHS = 3
+# Characters at the end of the name of a folder that the legend of a plot shows.
+FOLDER_NAME_LENGTH = 24
+# Largest width of an image with a grid of renders, in pixels.
+GRID_WIDTH = 720
+# Largest width of a contact sheet and of an image of an attack, in pixels.
+SHEET_WIDTH = 1100
+# Metrics in `METRICS` that the first sentences compare.
+HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")
+# Titles of the plots of metrics by epoch.
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
@@ -52,20 +65,25 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         Path of the page. A run or attack that cannot be read is named on it.
 
     Raises:
-        InputError: As of `summary.find`.
+        InputError: If a folder is missing or none holds a run or an attack.
     """
     found = summary.find(folders)
-    arms = summary.arms_of(found.runs)
+    arms = summary.group_by_method(found.runs)
     drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
-    trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
-    title = "Attacks" if found.attacks else "Unfinished runs"
-    groups = summary.by_images(drawn)
+    renders = {}
+    examples = {}
+    for arm, runs in drawn.items():
+        first = runs[0]
+        if first.epochs:
+            renders[arm] = _pictures(first, "epoch", "Renders")
+            examples[arm] = _pictures(first, "attacks", "Renders before and after")
+    groups = summary.group_by_images(drawn)
     return write_page(
         out,
         "runs.html.jinja",
         about=_about(found, folders),
         arms=arms,
-        title=_title(arms) if arms else title,
+        title=_title(found, arms),
         lead=_accuracy_sentences(arms),
         tables=[table for table in summary.run_tables(arms, {}) if table.rows],
         captions=ARMS,
@@ -73,127 +91,184 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         curves=_curves(_drawn_epochs(drawn, found.unfinished)),
         seconds=summary.seconds_table(drawn),
         photographs=[scores_section(title, group) for title, group in groups.items()],
-        renders={arm: _pictures(run, "epoch", "Renders") for arm, run in trained.items()},
-        examples={arm: _pictures(run, "attacks", "Renders before and after") for arm, run in trained.items()},
+        renders=renders,
+        examples=examples,
         attacks=found.attacks,
         shown=[_attack(attack) for attack in found.attacks[:MOST_ATTACKS]],
     )
 
 
 def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
-    """Say how much of what is on the page, and where and when it was written."""
-    parts = []
+    """Say what the page shows, in which folders it lies, and when the newest file was written."""
+    counts = []
     if found.runs:
         plural = "s" if len(found.runs) != 1 else ""
-        parts.append(f"{len(found.runs)} network{plural}")
+        counts.append(f"{len(found.runs)} network{plural}")
     if found.unfinished:
-        parts.append(f"{len(found.unfinished)} unfinished or unreadable")
+        counts.append(f"{len(found.unfinished)} unfinished or unreadable")
     if found.attacks:
-        parts.append(f"{len(found.attacks)} attacks")
-    place = ", ".join(map(str, folders))
-    read = [run.folder for run in found.runs]
-    read += [attack.folder for attack in found.attacks]
-    files = [file for folder in read for file in folder.iterdir() if file.name != PAGE]
-    if files:
-        newest = max(file.stat().st_mtime for file in files)
-        place += f", {datetime.fromtimestamp(newest):%Y-%m-%d %H:%M}"
-    return f"{', '.join(parts)}; in {place}"
+        counts.append(f"{len(found.attacks)} attacks")
+    about = f"{', '.join(counts)}; in {', '.join(map(str, folders))}"
+
+    shown_folders = [run.folder for run in found.runs]
+    shown_folders += [attack.folder for attack in found.attacks]
+    times = []
+    for folder in shown_folders:
+        times += [file.stat().st_mtime for file in folder.iterdir() if file.name != PAGE]
+    if times:
+        about += f", {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}"
+    return about
 
 
-# The lines of the epochs of each run of each arm.
+def _title(found: summary.Findings, arms: Methods) -> str:
+    """Name the positive classes and the arms. Without runs, name what else the page shows."""
+    if not arms:
+        return "Attacks" if found.attacks else "Unfinished runs"
+    labels: set[str] = set()
+    for runs in arms.values():
+        for scores in runs[0].photographs.values():
+            labels.update(scores.labels)
+    trained = [arm for arm, runs in arms.items() if runs[0].arm != summary.INITIAL]
+    subject = " and ".join(sorted(labels)) or "Networks"
+    return f"{subject}, trained with renders: {', '.join(trained)}"
+
+
+# For each arm, the runs. For each run, its lines of metrics.jsonl, one per epoch.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
-def _drawn_epochs(drawn: Arms, unfinished: Sequence[summary.Unfinished]) -> Epochs:
-    """Return the epochs that plots show, those of some unfinished runs, too."""
-    epochs = {arm: [run.epochs for run in group] for arm, group in drawn.items()}
-    begun = [run for run in unfinished if run.epochs]
-    for run in begun[:MOST_UNFINISHED]:
-        epochs[f"unfinished: {run.folder.name[-24:]}"] = [run.epochs]
+def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
+    """Return the epochs of the runs in plots, with those of the first unfinished runs."""
+    epochs = {arm: [run.epochs for run in runs] for arm, runs in drawn.items()}
+    started = [run for run in unfinished if run.epochs]
+    for run in started[:MOST_UNFINISHED]:
+        name = run.folder.name[-FOLDER_NAME_LENGTH:]
+        epochs[f"unfinished: {name}"] = [run.epochs]
     return epochs
 
 
 def write_page(out: Path, body: str, **content: Any) -> Path:
-    """Write report.html into a folder: a template's sections in the page that all share. content: of the template, with
-    the page's `title`, and `about`, the line beneath it."""
+    """Render a template inside the frame that all pages share, and write it to report.html.
+
+    Args:
+        out: Folder of the page. If it does not exist, it is made.
+        body: File name of the template with the sections of the page.
+        **content: Values of the template. All pages need `title`, and `about`,
+            the line below the title.
+
+    Returns:
+        Path of the page.
+    """
+    # Training imports this module, and needs jinja2 only at its end.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
-    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml, "command": _command}
-    environment.filters |= {
-        "fraction": fraction,
-        "hits": format_fraction,
-        "interval": format_interval,
-    }
+    environment = Environment(
+        loader=PackageLoader("train.report", "."),
+        undefined=StrictUndefined,
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["as_text"] = as_text
+    environment.filters["command"] = _command
+    environment.filters["fraction"] = fraction
+    environment.filters["hits"] = format_fraction
+    environment.filters["interval"] = format_interval
+    environment.filters["yaml"] = OmegaConf.to_yaml
     page = environment.get_template("page.html.jinja").render(body=body, **content)
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / PAGE, page)
-    return out / PAGE
+    path = out / PAGE
+    write_whole(path, page)
+    return path
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
-    """The last line of a training: the path of its report, or why there is none, since a report never fails a run."""
+    """Write the page of finished runs, and return the last line that their command prints.
+
+    An error must not make a command fail whose runs are finished and saved. It
+    is therefore part of the line.
+
+    Args:
+        folders: Folders of the runs.
+        out: Folder that report.html is written to.
+
+    Returns:
+        The path of the page, or why there is no page.
+    """
     try:
         return f"report: {write_report(folders, out)}"
-    except Exception as error:  # the run is finished and saved
+    except Exception as error:
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
 
 
 def _command(config: Mapping[str, Any]) -> str:
-    """The command of a run or an attack, in the folder that it was given in; "" where that is not recorded."""
-    folder, command = config.get("working_folder"), config.get("command") or ""
-    return f"cd {shlex.quote(folder)}\n{command}" if folder and command else command
+    """Return the command of a run or an attack, after a cd to the folder where it was started."""
+    folder = config.get("working_folder")
+    # Earlier versions did not record the command.
+    command = config.get("command") or ""
+    if folder and command:
+        return f"cd {shlex.quote(folder)}\n{command}"
+    return command
 
 
 def _curves(arms: Epochs) -> list[Picture]:
-    """Draw accuracies by epoch, and the success of attacks by round of renders."""
+    """Plot the metrics in `CURVES` by epoch, and the success of attacks by round of renders."""
     pictures = []
     for name, title in CURVES.items():
         lines = {}
         for arm, runs in arms.items():
-            lines[arm] = [[(line["epoch"], line.get(name)) for line in run] for run in runs]
+            lines[arm] = [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
         pictures.append(plots.curves(lines, title))
     rates = {}
     for arm, runs in arms.items():
-        rates[arm] = [[*enumerate(_attacks_by_round(run), 1)] for run in runs]
+        rates[arm] = [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
     title = "attack success on clean-correct renders"
     pictures.append(plots.curves(rates, title, "round of renders"))
-    return [picture for picture in pictures if picture]
+    return [picture for picture in pictures if picture is not None]
 
 
-def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
-    """The attack's success in each round of renders of a run, or in each epoch of one with a round per epoch."""
+def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
+    """List the success of attacks in each round of renders of a run.
+
+    The names of metrics begin with the number of their round, as in
+    "round_3/attack_success". An epoch without such names has a single round.
+    """
     rates = []
-    for line in epochs:
-        rounds = sorted({int(name[6 : name.index("/")]) for name in line if name.startswith("round_")})
-        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [attack_success(line, "augment/")]
+    for epoch in epochs:
+        rounds = {name.partition("/")[0] for name in epoch if name.startswith("round_")}
+        ordered = sorted(rounds, key=lambda name: int(name.removeprefix("round_")))
+        for prefix in ordered or ["augment"]:
+            rates.append(attack_success(epoch, f"{prefix}/"))
     return rates
 
 
-def _pictures(run: RunSummary, name: str, title: str) -> list[Picture]:
-    """A run's images renders/NAME_EPOCH.png of its first, middle and last epoch with any."""
-    numbers = [(path.stem.rpartition("_")[2], path) for path in (run.folder / "renders").glob(f"{name}_*.png")]
-    files = evenly(sorted((int(number), path) for number, path in numbers if number.isdigit()), 3)
-    images = [plots.from_file(path, f"{title}, epoch {n}, {run.arm}", GRID, f"epoch {n}") for n, path in files]
-    return [image for pictures in images for image in pictures]
+def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
+    """Read renders/KIND_EPOCH.png of the first, the middle and the last epoch with this file."""
+    path_of_epoch = {}
+    for path in (run.folder / RENDERS).glob(f"{kind}_*.png"):
+        number = path.stem.removeprefix(f"{kind}_")
+        if number.isdigit():
+            path_of_epoch[int(number)] = path
+    pictures = []
+    for epoch in evenly(sorted(path_of_epoch), SHOWN_EPOCHS):
+        alt = f"{title}, epoch {epoch}, {run.arm}"
+        pictures += plots.from_file(path_of_epoch[epoch], alt, GRID_WIDTH, f"epoch {epoch}")
+    return pictures
 
 
-def _title(arms: Arms) -> str:
-    evaluations = [scores for group in arms.values() for scores in group[0].photographs.values()]
-    labels = {label for scores in evaluations for label in scores.labels}
-    names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
-    return f"{' and '.join(sorted(labels)) or 'Networks'}, trained with renders: {', '.join(names)}"
-
-
-def _accuracy_sentences(arms: Arms) -> list[str]:
-    """How the test accuracy of each arm compares with that of the network that it began with."""
+def _accuracy_sentences(arms: Methods) -> list[str]:
+    """Compare the mean test accuracy of each arm before and after training, in sentences."""
     sentences = []
-    for arm, group in arms.items():
-        if bases := [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]:
-            after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
-            images = group[0].config.get("test_images", "the test images")
-            sentences.append(f"{arm}: accuracy went from {before:.1%} to {after:.1%}, on {images}.")
+    for arm, runs in arms.items():
+        initial = [run.before.accuracy for run in runs if run.before]
+        known = [accuracy for accuracy in initial if accuracy is not None]
+        if not known:
+            continue
+        before = fmean(known)
+        after = fmean(run.scores["test/accuracy"] for run in runs)
+        images = runs[0].config.get("test_images", "the test images")
+        change = f"accuracy went from {before:.1%} to {after:.1%}"
+        sentences.append(f"{arm}: {change}, on {images}.")
     return sentences
 
 
@@ -202,16 +277,17 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
     Args:
         title: Title of the images.
-        group: Scored runs of each arm, as `summary.by_images` groups them.
+        group: Scored runs of each arm, as `summary.group_by_images` groups them.
 
     Returns:
         Values of the template: plots, tables, sentences, and a contact sheet of
         each arm.
     """
     sheets = {}
-    for arm, (first, *_) in group.items():
+    for arm, scored_runs in group.items():
+        path = scored_runs[0].folder / CONTACT_SHEET
         alt = f"predictions of {arm} on {title}"
-        sheets[arm] = plots.from_file(first.folder / CONTACT_SHEET, alt, SHEET)
+        sheets[arm] = plots.from_file(path, alt, SHEET_WIDTH)
     tables = [summary.score_table("", group)]
     rocs: list[Picture | None] = []
     sentences: list[str] = []
@@ -233,29 +309,32 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
 
 def _rocs(arms: compare.Evaluations) -> list[Picture | None]:
-    """Draw the ROC curves of all images and, with several labels, of each label."""
-    first = next(iter(arms.values()))[0]
+    """Plot the ROC curves of all images and, with several labels, of each label."""
+    first_evaluation = next(iter(arms.values()))[0]
     pictures = []
-    for part, pool in first.pools.items():
-        if part.is_overall:
-            scores = {arm: [run.pools[part].scores for run in runs] for arm, runs in arms.items()}
-            pictures.append(plots.roc(scores, pool.label))
+    for part, pool in first_evaluation.pools.items():
+        if not part.is_overall:
+            continue
+        scores = {}
+        for arm, evaluations in arms.items():
+            scores[arm] = [evaluation.pools[part].scores for evaluation in evaluations]
+        pictures.append(plots.roc(scores, pool.label))
     return pictures
 
 
 def _evaluation_tables(arms: compare.Evaluations) -> list[Table]:
-    """Make the tables of differences and, if there are any, of labels and sources."""
+    """Make the table of differences and, if the images have parts, a table of their metrics."""
     tables = [compare.overall_differences(arms)]
-    first = next(iter(arms.values()))[0]
-    if len(first.pools) > 1:
+    first_evaluation = next(iter(arms.values()))[0]
+    if len(first_evaluation.pools) > 1:
         tables.append(compare.group_table(arms))
     return tables
 
 
 def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
-    """Say how far each of HEADLINES is from that of the network that an arm is compared with."""
+    """Compare the metrics in `HEADLINES` of each pair of arms in a sentence."""
     sentences = []
-    for arm, base in compare.pairs_of(arms):
+    for arm, base in compare.choose_pairs(arms):
         parts = []
         for name in HEADLINES:
             result = compare.difference(arms[arm], arms[base], compare.ALL, name)
@@ -267,7 +346,7 @@ def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
 
 
 def _compared(result: compare.Difference) -> str:
-    """Write both means and, if the interval does not hold zero, their difference."""
+    """Write both means, and their difference if its interval does not contain zero."""
     assert result.low is not None and result.high is not None
     text = format_interval(result, sign="+")
     if result.low <= 0 <= result.high:
@@ -276,14 +355,15 @@ def _compared(result: compare.Difference) -> str:
 
 
 def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
-    """Collect what the page shows of an attack: examples, images, checks and configuration."""
+    """Collect the examples, images, checks and configuration of an attack for the template."""
     images = {}
     for row in evenly(attack.rows, ATTACK_EXAMPLES):
         title = f"Example {row.number}, {row.label}: {row.outcome}"
         alt = f"{title}; before, after, their difference and the lights; "
         alt += f"predicted {row.before}, then {row.after}"
         path = attack.folder / f"example_{row.number:03d}.png"
-        images[title] = plots.from_file(path, alt, SHEET)
+        images[title] = plots.from_file(path, alt, SHEET_WIDTH)
+    # Without config.yaml, the page shows no configuration.
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack.folder.parent / CONFIG)

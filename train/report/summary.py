@@ -14,7 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 from augment.attacks.attack_files import LINES
 from augment.settings import ARMS
 from renderer.errors import InputError, in_one_line
-from train.evaluation.scores.metrics import METRICS, AreaUnderCurve, Thresholds, metric_title, read_metric
+from train.evaluation.scores.metrics import (
+    METRICS,
+    AreaUnderCurve,
+    Thresholds,
+    metric_title,
+    read_metric,
+)
 from train.evaluation.scores.scoring import COUNTED_EACH, SUMMARY, describe_point, operating_points
 from train.evaluation.tables import Estimate, Table, format_interval
 from train.runs import checkpoint, run_config, run_lock, run_log
@@ -91,7 +97,10 @@ class PhotographScores:
             entries["thresholds"] = dict(self.thresholds)
             entries["operating_point"] = self.operating_point
         if has_several:
-            entries["by_label"] = {label: _published(metrics) for label, metrics in self.by_label.items()}
+            by_label = {}
+            for label, metrics in self.by_label.items():
+                by_label[label] = _published(metrics)
+            entries["by_label"] = by_label
         return entries
 
 
@@ -102,7 +111,10 @@ def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
 
 def _published(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
     """Convert metrics to entries that a published network carries."""
-    return {name: {} if estimate is None else asdict(estimate) for name, estimate in metrics.items()}
+    published = {}
+    for name, estimate in metrics.items():
+        published[name] = {} if estimate is None else asdict(estimate)
+    return published
 
 
 @dataclass(frozen=True)
@@ -135,7 +147,8 @@ class RunSummary:
     before: "RunSummary | None" = None
 
 
-Arms = Mapping[str, Sequence[RunSummary]]
+# Runs by the name of their arm.
+Methods = Mapping[str, Sequence[RunSummary]]
 
 
 class ScoredRun(NamedTuple):
@@ -287,7 +300,7 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
     return varied
 
 
-def arms_of(runs: Sequence[RunSummary]) -> Arms:
+def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     """Group runs that differ only in the seed.
 
     Args:
@@ -327,7 +340,7 @@ def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
     return [*networks.values()]
 
 
-def by_images(arms: Arms) -> dict[str, Scored]:
+def group_by_images(arms: Methods) -> dict[str, Scored]:
     """Group runs by the images that they were scored on.
 
     Args:
@@ -369,12 +382,12 @@ def _title_of(group: Scored) -> str:
     return title
 
 
-def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
+def run_tables(arms: Methods, groups: Mapping[str, Scored]) -> list[Table]:
     """Make tables of the accuracy, the scores and the settings of runs.
 
     Args:
         arms: Runs of each arm.
-        groups: Scored runs by a title of the images, as `by_images` groups them.
+        groups: Scored runs by a title of the images, as `group_by_images` groups them.
 
     Returns:
         Table of the accuracy, a table for each group, and a table of the
@@ -395,7 +408,7 @@ def run_tables(arms: Arms, groups: Mapping[str, Scored]) -> list[Table]:
     return tables
 
 
-def _accuracy_table(arms: Arms) -> Table:
+def _accuracy_table(arms: Methods) -> Table:
     """Make the table of the accuracy on the test images."""
     lines: dict[str, list[Line]] = {}
     tested: dict[str, None] = {}
@@ -415,7 +428,7 @@ def score_table(title: str, group: Scored) -> Table:
 
     Args:
         title: Title of the table.
-        group: Scored runs of each arm, as `by_images` groups them.
+        group: Scored runs of each arm, as `group_by_images` groups them.
 
     Returns:
         Table with a row for each run and, with several labels, for each label.
@@ -448,7 +461,7 @@ def label_title(label: str) -> str:
     return f"label={label}"
 
 
-def seconds_table(arms: Arms) -> Table:
+def seconds_table(arms: Methods) -> Table:
     """Make a table of the seconds of an epoch.
 
     Args:
@@ -524,7 +537,7 @@ class ExampleRow(NamedTuple):
 
 @dataclass(frozen=True)
 class AttackSummary:
-    """What came of an attack, as its folder says.
+    """Outcome of an attack, read from its folder.
 
     Attributes:
         folder: Folder of the attack.
@@ -626,7 +639,7 @@ class Unfinished(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """What folders hold.
+    """Runs and attacks that were found in folders.
 
     Attributes:
         runs: Finished runs and scored networks, ordered by arm, so that the
@@ -695,6 +708,7 @@ def _walk(folder: Path) -> Iterator[Path]:
         is_run = bool(names & of_run)
         if is_run:
             # os.walk goes on in the folders that this list keeps.
-            below[:] = [name for name in below if name != BEFORE and not (path / name / SUMMARY).is_file()]
+            evaluations = {name for name in below if (path / name / SUMMARY).is_file()}
+            below[:] = [name for name in below if name != BEFORE and name not in evaluations]
         if is_run or names & of_others or names >= {CONFIG, "train.log"}:
             yield path

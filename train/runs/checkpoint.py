@@ -75,7 +75,8 @@ def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
         version = state["architecture"].get("version", 1)
         finite = all(value.isfinite().all() for value in state["model"].values())
     except (LookupError, AttributeError) as error:
-        raise InputError(f"checkpoint {path} has no architecture or weights: use another one") from error
+        problem = f"checkpoint {path} has no architecture or weights"
+        raise InputError(f"{problem}: use another one") from error
     if version not in range(VERSION + 1):
         problem = f"checkpoint {path} was written by a later version ({version!r})"
         raise InputError(f"{problem}: install that version")

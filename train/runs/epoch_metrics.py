@@ -39,7 +39,10 @@ def epoch_metrics(
     if len(diagnostics) > 1:
         for number, part in enumerate(diagnostics, 1):
             groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
-    return {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+    metrics: dict[str, float] = {}
+    for group, values in groups.items():
+        metrics |= {f"{group}/{name}": value for name, value in values.items()}
+    return metrics
 
 
 def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:

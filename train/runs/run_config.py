@@ -238,7 +238,11 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
     return merged, shlex.join(dict.fromkeys(words))
 
 
-def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> DictConfig:
+def require_same_run(
+    folder: Path,
+    settings: ExperimentSettings,
+    finished: bool = False,
+) -> DictConfig:
     """Check that a training run in a folder has given settings and input files.
 
     A run that is not finished may get more epochs and another evaluation.
@@ -322,7 +326,7 @@ def fingerprints(settings: Any) -> dict[str, str]:
 
 
 def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts of a setting that may be paths. In a mesh, these are the files of it and of its props."""
+    """Collect the texts of a setting that may be paths, with the files of meshes and props."""
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("props")]
     if isinstance(value, list):
@@ -342,6 +346,6 @@ def _fingerprint(path: Path) -> str:
 
 @cache
 def _content_hash(path: Path, size: int, modified: int) -> str:
-    """Hash the contents of a file. The size and the time of the last change renew the cached hash."""
+    """Hash the contents of a file. A new size or time of change renews the cached hash."""
     with open(path, "rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

@@ -140,7 +140,12 @@ class RunLog:
         write_image(path, Image.fromarray(grid.permute(1, 2, 0).numpy()), compress_level=1)
         self._board.add_image("renders", grid, epoch)
 
-    def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
+    def attack_examples(
+        self,
+        attack_examples: AttackExamples,
+        classes: Sequence[str],
+        epoch: int,
+    ) -> None:
         """Write successful attacks to renders/attacks_EPOCH.png, one in each row.
 
         A row shows the images and white balls in the lighting, before and after
@@ -151,7 +156,9 @@ class RunLog:
             classes: Names of the classes.
             epoch: Number of the epoch, from 1.
         """
-        labels = [classes[index] if index >= 0 else "other things" for index in attack_examples.labels]
+        labels = []
+        for index in attack_examples.labels:
+            labels.append(classes[index] if index >= 0 else "other things")
         columns = {}
         for index, name in enumerate(("before", "after")):
             images = attack_examples.images[index]
@@ -169,7 +176,11 @@ class RunLog:
         write_image(self._renders / f"attacks_{epoch:03d}.png", grid)
 
 
-def _captions(probabilities: Tensor, classes: Sequence[str], labels: Sequence[str]) -> list[tuple[str, str]]:
+def _captions(
+    probabilities: Tensor,
+    classes: Sequence[str],
+    labels: Sequence[str],
+) -> list[tuple[str, str]]:
     """Write the most probable class, with its probability, and the label of each image."""
     highest, predicted = torch.max(probabilities, dim=1)
     captions = []

@@ -28,9 +28,9 @@ RUN = "run:"
 PUBLISHED = "model.safetensors"
 # The file of a network that began as a classifier, whose weights have the names of its own file.
 WEIGHTS = "weights.pt"
-# What the file of a published network tells besides the weights.
+# Facts in the file of a published network besides the weights.
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
-# What is stored in the description of a network, but does not build it.
+# Entries of the description of a network that are not needed to build it.
 FACTS = ("version", "encoding", "validation")
 # Characters of a reason in an error, at most.
 LONGEST_REASON = 300
@@ -56,7 +56,11 @@ def load_network(name: str, weights: str | Path | None = None) -> Classifier:
     return load_classifier(name, weights)
 
 
-def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:
+def load_run(
+    run: str | Path,
+    weights: str | Path | None = None,
+    model: str | None = None,
+) -> Classifier:
     """Load the network that a run selected.
 
     Args:
@@ -178,7 +182,10 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
         path: The safetensors file. Its metadata tell the architecture and other facts.
         state: The checkpoint.
     """
-    metadata = {key: json.dumps(state[key], ensure_ascii=False) for key in PUBLISHED_FACTS if key in state}
+    metadata = {}
+    for key in PUBLISHED_FACTS:
+        if key in state:
+            metadata[key] = json.dumps(state[key], ensure_ascii=False)
     weights = {}
     for name, value in state["model"].items():
         weights[name] = value.half().contiguous() if value.is_floating_point() else value

@@ -1,4 +1,4 @@
-"""Where and how to compute: device, threads, precision, and CUDA graphs."""
+"""Device, number of threads, precision and CUDA graphs of the computations."""
 
 import functools
 import os
@@ -136,10 +136,16 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
         console.warning("%s: leave precision out", slow)
     if precision != "auto":
         return precision
-    is_depthwise = trained is not None and any(
-        layer.groups == layer.in_channels > 1 for layer in trained.modules() if isinstance(layer, nn.Conv2d)
-    )
-    return "bfloat16" if is_native and not is_depthwise else "float32"
+    if is_native and not _has_depthwise_layer(trained):
+        return "bfloat16"
+    return "float32"
+
+
+def _has_depthwise_layer(network: nn.Module | None) -> bool:
+    """Return whether a network has a convolution that keeps its channels apart."""
+    modules = network.modules() if network is not None else []
+    convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
+    return any(layer.groups == layer.in_channels > 1 for layer in convolutions)
 
 
 def _computes_in_bfloat16() -> bool:

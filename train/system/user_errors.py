@@ -1,8 +1,8 @@
-"""Say in one sentence what the user can do about an error, and check that a folder can be written to."""
+"""Messages that say what a user can do about an error, and a check that a folder is writable."""
 
 import errno
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,53 +18,44 @@ TEST_SIZE = 2**16
 
 
 @contextmanager
-def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
-    """Add the key of the settings to the error messages of the library.
+def keyed(whole: str = "", /, **keys: str) -> Iterator[None]:
+    """Put keys of the command line into the error messages of the library.
 
-    The library does not know the keys of the command line. A message about
-    `radius` becomes a message about `attack.lighting.radius`, for example.
+    The library does not know these keys. Its messages begin with the name of a
+    Python argument, and a caller that took the argument from a setting says
+    which setting it was.
 
     Args:
-        key: Key of the settings that the library was given, such as "attack".
-        names: Names of the fields of these settings.
+        whole: Key that is put before messages about anything but `keys`, such
+            as "scene". If it is empty, these messages stay as they are.
+        **keys: Key that replaces the name of each argument, such as
+            `name="train.init_from"`. A part of an argument, such as
+            "lighting.radius", belongs to the key of "lighting".
 
     Raises:
-        InputError: If the block raises it. The message then starts with the key.
+        InputError: If the block raises it. The message then begins with the key.
+
+    >>> with keyed(name="train.init_from"):
+    ...     raise InputError("name=x is unknown", "name")
+    Traceback (most recent call last):
+    renderer.errors.InputError: train.init_from=x is unknown
     """
     try:
         yield
     except InputError as error:
-        if str(error).startswith(key):
-            raise
-        raise error.within(key, names) from error
-
-
-@contextmanager
-def renamed(**keys: str) -> Iterator[None]:
-    """Put keys of the settings in the place of Python arguments in error messages.
-
-    A function of the library names its own argument. A caller that took the
-    value of this argument from a setting says which setting it was. Messages
-    about other arguments stay as they are.
-
-    Args:
-        **keys: The key for each argument, such as `name="train.init_from"`.
-
-    Raises:
-        InputError: If the block raises it. The message starts with the key if
-            it started with one of the arguments.
-    """
-    try:
-        yield
-    except InputError as error:
-        key = keys.get(error.argument)
-        if key is None:
-            raise
-        raise InputError(key + str(error).removeprefix(error.argument), key) from error
+        # "light" for an argument such as "light.turbidity" or "light[0]".
+        argument = error.argument.partition(".")[0].partition("[")[0]
+        if argument in keys:
+            key = keys[argument]
+            message = key + str(error).removeprefix(argument)
+            raise InputError(message, key + error.argument.removeprefix(argument)) from error
+        if whole and not str(error).startswith(whole):
+            raise InputError(f"{whole}: {error}", whole) from error
+        raise
 
 
 def keys_of(key: str, settings: Settings) -> dict[str, str]:
-    """Return the key of each field of settings, for `renamed`.
+    """Return the key of each field of settings, for `keyed`.
 
     Args:
         key: Key of the settings, such as "train".

@@ -62,7 +62,13 @@ class Averages:
             the network that learns.
     """
 
-    def __init__(self, model: MixedPrecision, ema_decay: float, soup: bool, keeps_latest: bool = False):
+    def __init__(
+        self,
+        model: MixedPrecision,
+        ema_decay: float,
+        soup: bool,
+        keeps_latest: bool = False,
+    ):
         self._model = model
         self._ema: MovingAverage | None = None
         if ema_decay:

@@ -18,7 +18,7 @@ from train.runs.saved_networks import is_classifier, load_selected, of_one_archi
 from train.settings import WIDERESNET, ExperimentSettings
 from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
-from train.system.user_errors import renamed
+from train.system.user_errors import keyed
 
 # What a network has in common with one that begins with its weights.
 SHARED = ("classes", "size", "name", "depth", "width")
@@ -85,7 +85,8 @@ class Initial:
                 difference = f"{key} {stored[key]}, not {wanted.get(key)}"
                 if key == "classes":
                     difference = "other classes"
-                raise InputError(f"train.init_from={self.source} was trained with {difference}: give this run the same")
+                problem = f"train.init_from={self.source} was trained with {difference}"
+                raise InputError(f"{problem}: give this run the same")
         with of_one_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -110,14 +111,14 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     if settings.weights is not None:
         given = f"weights={settings.weights} is not for train.init_from={name}"
         raise InputError(f"{given}, which has its own: leave it out", "weights")
-    with renamed(run="train.init_from"):
+    with keyed(run="train.init_from"):
         path, state = load_selected(Path(name))
     return Initial(path, state["architecture"], state["model"])
 
 
 def _classifier(name: str, weights: str | None, size: int | None) -> Initial:
     """Load a classifier that was trained elsewhere, for images of its own size or another one."""
-    with renamed(name="train.init_from"):
+    with keyed(name="train.init_from"):
         classifier = load_classifier(name, weights)
     network = cast(nn.Module, classifier.function)
     shape = {"name": name, CLASSIFIER: True}
@@ -155,7 +156,11 @@ class ValidationPart:
     record: dict[str, Any] | None
 
 
-def choose_validation(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> ValidationPart:
+def choose_validation(
+    settings: ExperimentSettings,
+    data: DataSet,
+    initial: Initial | None,
+) -> ValidationPart:
     """Choose the part of the training images that validates a network.
 
     The parts of one seed are nested. The smallest part among a network and those that it began

@@ -34,7 +34,7 @@ from train.runs.run_log import PHASES, RunLog
 from train.settings import TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
 from train.system.processes import Interruption, replicated, summed
-from train.system.user_errors import renamed
+from train.system.user_errors import keyed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
@@ -53,7 +53,7 @@ Batch = tuple[Tensor, Tensor, Tensor]
 
 @dataclass
 class EpochState:
-    """How far an epoch has come.
+    """State of an epoch that has begun.
 
     Attributes:
         renders: The renders of the current round.
@@ -84,7 +84,7 @@ class EpochState:
 
 @dataclass(frozen=True)
 class EpochPlan:
-    """What an epoch shows.
+    """Images and rounds of an epoch.
 
     Attributes:
         split: The images.
@@ -100,7 +100,7 @@ class EpochPlan:
 
     @property
     def total(self) -> int:
-        """The number of steps of all rounds."""
+        """Count the steps of all rounds."""
         return sum(self.steps)
 
 
@@ -187,10 +187,15 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
         teacher = self.initial if settings.distillation else None
         self._loss = TrainingLoss(replica, settings, studied, teacher, labeled).compute
-        self._baseline = Baseline(settings.augmentation, self.model, self.seed, studied[1:])
+        self._baseline = Baseline(
+            settings.augmentation,
+            self.model,
+            self.seed,
+            studied[1:],
+        )
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
-        with renamed(choice="compile"):
+        with keyed(choice="compile"):
             is_compiled = compiles(settings.compile, self.device)
         if is_compiled:
             torch.compiler.reset()  # torch limits the graphs of all runs of a process.
@@ -200,7 +205,7 @@ class Trainer:
 
     @property
     def selected(self) -> MixedPrecision:
-        """The network that is validated and kept."""
+        """Network that is validated and kept."""
         return self.averages.selected
 
     def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
@@ -232,7 +237,13 @@ class Trainer:
                 if is_stopping:
                     interruption.stop()
 
-    def _train_epoch(self, split: Split, rows: Tensor, interruption: Interruption, log: RunLog | None) -> bool:
+    def _train_epoch(
+        self,
+        split: Split,
+        rows: Tensor,
+        interruption: Interruption,
+        log: RunLog | None,
+    ) -> bool:
         """Take the epoch's remaining steps; return whether all were taken before a signal came."""
         plan = self._plan(split, rows)
         if self._under_way is None:
@@ -309,7 +320,14 @@ class Trainer:
                 log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
         return renders
 
-    def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
+    def _step(
+        self,
+        images: Tensor,
+        labels: Tensor,
+        rendered: Tensor,
+        progress: float,
+        number: int,
+    ) -> Tensor:
         """Learn from a batch.
 
         Args:

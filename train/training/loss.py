@@ -19,7 +19,8 @@ class TrainingLoss:
     Args:
         model: The network, from images in [0, 1] to logits.
         settings: The settings, with the weights of the terms.
-        studied: The classes under study that are ranked against others; none without a ranking.
+        studied: Indices of the positive classes, which the ranking
+            loss ranks against the others. Empty without a ranking loss.
         teacher: The network whose predictions are kept; None without distillation.
         labeled: Whether the labels of the data are known. Otherwise only renders have a label
             loss, and the teacher's answers are the labels of all other images.

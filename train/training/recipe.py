@@ -32,7 +32,7 @@ def _cosine(done: float) -> float:
 
 
 def _one_cycle(done: float) -> float:
-    """Return the factor of "one_cycle", which rises and falls linearly. It suits trainings of a few epochs."""
+    """Return the factor of "one_cycle", which rises and falls linearly. It suits few epochs."""
     if done < WARMUP:
         return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
     return (1 - done) / (1 - WARMUP)

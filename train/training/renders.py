@@ -19,10 +19,14 @@ from train.data.sets import DataSet
 from train.settings import OTHER, ExperimentSettings, label_names
 from train.system.device import choose_rasterizer
 from train.system.processes import first_process_first
-from train.system.user_errors import keyed, keys_of, renamed
+from train.system.user_errors import keyed, keys_of
 
 
-def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
+def build_service(
+    settings: ExperimentSettings,
+    data: DataSet,
+    device: torch.device,
+) -> AugmentationService:
     """Build the service that regenerates a run's renders, and log the rasterizer.
 
     Args:
@@ -75,12 +79,17 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
     )
 
 
-def _build_scene(settings: ExperimentSettings, size: int, device: torch.device, phases: Phases) -> Scene:
+def _build_scene(
+    settings: ExperimentSettings,
+    size: int,
+    device: torch.device,
+    phases: Phases,
+) -> Scene:
     """Build the scene of a run's meshes, in the first process before the others."""
-    with renamed(**keys_of("renderer", settings.renderer)):
+    with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.info("rasterizer: %s", rasterizer.description)
-    with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
+    with phases("operators"), first_process_first(), keyed("scene", **keys_of("scene", settings.scene)):
         return build_scene(
             list(settings.objects.values()),
             size,

@@ -1,8 +1,10 @@
 """One training run, from its settings to its scores.
 
-`train.__main__` makes runs and calls their steps in order: `load`, `fit`, `score`, `export`.
+`load_runs` makes and loads runs. Then `fit`, `score` and `export` are called in
+this order.
 """
 
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +31,22 @@ from train.runs.run_config import require_same_run, write_config
 from train.runs.run_log import BEFORE, RunLog, remove_run
 from train.runs.saved_networks import WEIGHTS, export, without_normalization
 from train.settings import ExperimentSettings
-from train.system.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
-from train.system.user_errors import keys_of, renamed
-from train.training.initial import CachedModel, Initial, ValidationPart, choose_validation
+from train.system.device import (
+    MixedPrecision,
+    choose_device,
+    choose_precision,
+    choose_threads,
+    set_deterministic,
+)
+from train.system.user_errors import keyed, keys_of
+from train.training.data import load_data
+from train.training.initial import (
+    CachedModel,
+    Initial,
+    ValidationPart,
+    choose_validation,
+    load_initial,
+)
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
 from train.training.renders import build_service
@@ -91,9 +106,16 @@ class Run:
         set_deterministic(settings.train.deterministic)
         before = self._require_folder()
         part = choose_validation(settings, self.data, self.initial)
-        with renamed(fraction="data.validation"):
+        with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, part.fraction, seed=0)
-        self.trainer = build_trainer(settings, self.data, self.folder, self.initial, part, self._asked_threads(before))
+        self.trainer = build_trainer(
+            settings,
+            self.data,
+            self.folder,
+            self.initial,
+            part,
+            self._asked_threads(before),
+        )
         self._threads = torch.get_num_threads()
         if before is not None:
             self.trainer.resume()
@@ -120,7 +142,7 @@ class Run:
         if self.trainer.initial:
             self._score_initial(self.trainer.initial)
         split = self.data.train.to(self.trainer.device)
-        with renamed(**keys_of("train", self.settings.train)):
+        with keyed(**keys_of("train", self.settings.train)):
             self.trainer.fit(split, self.held_out, self.log)
 
     def score(self) -> dict[str, float]:
@@ -156,7 +178,8 @@ class Run:
             return None
         if not resumes:
             remedy = "set train.resume=true to go on or overwrite=true to begin anew"
-            raise InputError(f"run={self.folder} holds a run already: {remedy}, or choose another run")
+            problem = f"run={self.folder} holds a run already"
+            raise InputError(f"{problem}: {remedy}, or choose another run")
         return require_same_run(self.folder, self.settings)
 
     def _asked_threads(self, before: DictConfig | None) -> int | None:
@@ -280,7 +303,7 @@ class Run:
         return agreement
 
     def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
-        """Score a model on the folder of photographs with a name; write the scores below `folder`."""
+        """Score a model on the photographs with a name, and write the scores below a folder."""
         asked = self.settings.evaluate
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),
@@ -289,6 +312,33 @@ class Run:
             folder / name,
             asked.skip_unreadable,
         )
+
+
+def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[Run]:
+    """Load runs with the same data set and the same initial network.
+
+    All runs are loaded before the first one is trained, so that a mistake in
+    any of them is reported at once.
+
+    Args:
+        methods: Settings of each run by its folder. They agree in the data set
+            and in the initial network.
+        command: Command that was given, which each run records.
+
+    Returns:
+        Runs that are ready for `Run.fit`.
+
+    Raises:
+        InputError: If the data set, the initial network, the settings or a
+            folder cannot be used.
+    """
+    shared_settings = next(iter(methods.values()))
+    initial = load_initial(shared_settings)
+    data = load_data(shared_settings, initial)
+    runs = [Run(settings, data, folder, initial, command) for folder, settings in methods.items()]
+    for run in runs:
+        run.load()
+    return runs
 
 
 def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
@@ -329,7 +379,7 @@ def build_trainer(
         InputError: The network, the renders or the initial weights do not fit together.
     """
     keys = keys_of("train", settings.train)
-    with renamed(**keys):
+    with keyed(**keys):
         device = choose_device(settings.train.device)
     shape = _network_shape(settings, initial)
     images = data.train.images
@@ -340,7 +390,7 @@ def build_trainer(
     if initial and initial.network is not None:
         network = deepcopy(initial.network).requires_grad_(True)
     else:
-        with renamed(**keys_of("model", settings.model)):
+        with keyed(**keys_of("model", settings.model)):
             network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {
         "classes": list(data.classes),
@@ -351,9 +401,9 @@ def build_trainer(
     if initial:
         initial.copy_to(network, facts)
     if settings.train.freeze:
-        with renamed(stage="train.freeze"):
+        with keyed(stage="train.freeze"):
             freeze(without_normalization(network), settings.train.freeze)
-    with renamed(**keys):
+    with keyed(**keys):
         precision = choose_precision(settings.train.precision, device, network)
     model = MixedPrecision(network.to(device), precision)
     torch.set_num_threads(threads or choose_threads(model, settings.train.batch_size, data.size))
@@ -362,7 +412,7 @@ def build_trainer(
         recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
     description = describe(network, **facts, validation=validation.record)
     service = build_service(settings, data, device)
-    with renamed(**keys):
+    with keyed(**keys):
         return Trainer(recipe, model, description, service, folder, data.labeled)
 
 
@@ -372,8 +422,8 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
     if initial is None or not initial.is_classifier:
         return shape
     if shape.get("name", initial.name) != initial.name:
-        problem = f"model.name={shape['name']}: train.init_from={initial.source} has its own network"
-        raise InputError(f"{problem}: leave it out")
+        network = f"train.init_from={initial.source} has its own network"
+        raise InputError(f"model.name={shape['name']}: {network}: leave it out")
     return {"name": initial.name, CLASSIFIER: True}
 
 

@@ -15,9 +15,9 @@ from augment.classifiers import load_classifier
 from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command
-from train.data.load import load_data
 from train.runs.run_log import read_metrics
 from train.runs.saved_networks import load_run
+from train.training.data import load_data
 
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32

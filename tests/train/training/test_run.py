@@ -22,7 +22,6 @@ from renderer.image import to_bytes
 from tests.runs import completed_run, finish, loaded_run
 from tests.train.helpers import read_markdown
 from train.data import batches
-from train.data.load import load_data
 from train.data.sets import Split
 from train.report.comparison import format_table
 from train.report.report_page import write_report
@@ -34,6 +33,7 @@ from train.system.hashing import content_hash
 from train.system.processes import Interrupted
 from train.system.user_errors import one_sentence
 from train.training import loop
+from train.training.data import load_data
 from train.training.initial import choose_validation, load_initial
 from train.training.run import describe_test_images
 

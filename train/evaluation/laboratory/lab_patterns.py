@@ -38,37 +38,37 @@ LINE_LENGTH = 24
 LINE_SPACING = 1.2
 
 
-def solid(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _solid(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Light the whole image in the first color."""
     return patterns.solid(points)[None]
 
 
-def gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw a linear ramp along x, around the center."""
     return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
-def stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw stripes along y."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
     return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
 
 
-def checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw the squares of a chessboard."""
     scaled = points / rng.uniform(0.12, 0.5)
     shift = torch.from_numpy(rng.uniform(size=2))
     return patterns.checkers(scaled, shift[:, None, None]).double()[None]
 
 
-def half(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _half(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Light one side of a line through the object."""
     return patterns.half(points, 0.5 + rng.uniform(-0.12, 0.12)).double()[None]
 
 
-def spots(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw discs of one size at random positions, which cover about half of the image."""
+def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
+    """Draw random discs of one size that cover about half of the image."""
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
@@ -77,7 +77,7 @@ def spots(points: Tensor, rng: np.random.Generator) -> Tensor:
     return is_lit.double()[None]
 
 
-def rings(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw rings of one width around a random point."""
     center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
@@ -86,7 +86,7 @@ def rings(points: Tensor, rng: np.random.Generator) -> Tensor:
     return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
 
 
-def window(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw the light through the panes of a window. The bars and the wall around it are dark."""
     pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
     pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
@@ -98,8 +98,8 @@ def window(points: Tensor, rng: np.random.Generator) -> Tensor:
     return (is_in_window & is_in_pane).all(dim=0).double()[None]
 
 
-def leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the shadows of leaves: ellipses at random angles, which cover about half of the image."""
+def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
+    """Draw the shadows of leaves: random ellipses that cover about half of the image."""
     length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
     leaf_area = math.pi * length**2 / LEAF_RATIO
@@ -112,7 +112,7 @@ def leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
     return is_lit.double()[None]
 
 
-def text(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw lines of random capital letters, bright on a dark slide."""
     height = int(rng.integers(40, 120))
     slide = Image.new("L", (RESOLUTION, RESOLUTION))
@@ -126,44 +126,57 @@ def text(points: Tensor, rng: np.random.Generator) -> Tensor:
     return _sample(values, points, order=1)
 
 
-def colors(points: Tensor, rng: np.random.Generator) -> Tensor:
+def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw a smooth field of colors, with independent channels."""
     grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
     return _sample(grid, points, order=3).clamp(0, 1)
 
 
 def _sample(image: np.ndarray, points: Tensor, order: int) -> Tensor:
-    """Interpolate an image (H, W, C), which spans [-1, 1] and is mirrored at its borders, by splines at points."""
+    """Interpolate an image by splines of an order.
+
+    Args:
+        image: Image that spans [-1, 1] in both directions, shape (H, W, C). It
+            is mirrored at its borders.
+        points: Positions (x, y), shape (2, H', W').
+        order: Order of the splines. 1 interpolates linearly.
+
+    Returns:
+        Interpolated values, shape (C, H', W').
+    """
     size = np.array(image.shape[:2])[:, None, None]
     # (x, y) in [-1, 1] become rows and columns, in pixels.
     places = (points.flip(0).numpy() + 1) / 2 * size - 0.5
-    channels = [map_coordinates(channel, places, order=order, mode="reflect") for channel in np.moveaxis(image, -1, 0)]
+    channels = []
+    for channel in np.moveaxis(image, -1, 0):
+        channels.append(map_coordinates(channel, places, order=order, mode="reflect"))
     return torch.from_numpy(np.stack(channels))
 
 
-# Functions by the names of the families. PATTERNS in train/command_settings.py
+# Functions that draw patterns, by the names of the families. PATTERNS in train/command_settings.py
 # lists the same names.
 FAMILIES = {
-    family.__name__: family
-    for family in (
-        solid,
-        gradient,
-        stripes,
-        checkers,
-        half,
-        spots,
-        rings,
-        window,
-        leaves,
-        text,
-        colors,
-    )
+    "solid": _solid,
+    "gradient": _gradient,
+    "stripes": _stripes,
+    "checkers": _checkers,
+    "half": _half,
+    "spots": _spots,
+    "rings": _rings,
+    "window": _window,
+    "leaves": _leaves,
+    "text": _text,
+    "colors": _colors,
 }
 # Families with two colors of light. The second color of the others is black.
 TWO_COLORED = ("gradient", "stripes", "checkers")
 
 
-def draw_pattern(family: str, rng: np.random.Generator, slides: Sequence[np.ndarray] = ()) -> np.ndarray:
+def draw_pattern(
+    family: str,
+    rng: np.random.Generator,
+    slides: Sequence[np.ndarray] = (),
+) -> np.ndarray:
     """Draw a pattern of random colors, at a random angle, scale and position.
 
     Args:

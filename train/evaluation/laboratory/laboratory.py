@@ -43,11 +43,11 @@ RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"
 COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
 # Packages whose versions may change a pixel.
 PACKAGES = ("mitsuba", "numpy", "torch")
-# Half of the width that a projector lights at the object, in world units.
+# Half-width that a projector lights at the object, in world units.
 PROJECTOR_HALF_WIDTH = 2.6
 # Rows of the map of a built-in light.
 PROBE_HEIGHT = 64
-# Half of the width of the table and of the wall, in world units.
+# Half-width of the table and of the wall, in world units.
 PLANE_HALF_WIDTH = 100.0
 # Smallest cosine between the normals of a face and of a vertex at which the
 # shading is smooth. At a right-angled edge, the cosine is at most 0.82.
@@ -99,7 +99,14 @@ def _scale_albedo(albedo: np.ndarray, factor: float) -> np.ndarray:
     return np.clip(factor * albedo, 0, 1).astype(np.float32)
 
 
-def path_traced(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
+def path_traced(
+    parts: Sequence[Part],
+    shot: Shot,
+    size: int,
+    spp: int,
+    bounces: int,
+    seed: int,
+) -> np.ndarray:
     """Render an object with the path tracer of Mitsuba 3.
 
     Each light source is rendered alone, and the images are added. With all
@@ -166,7 +173,10 @@ def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
 
 def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """Rotate and scale the object, set it on the table, and make a Mitsuba shape of each part."""
-    positions_by_part = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
+    positions_by_part = []
+    for part in parts:
+        positions = shot.scale * part.positions @ shot.rotation.T
+        positions_by_part.append(positions.reshape(-1, 3))
     lowest = min(positions[:, 2].min() for positions in positions_by_part)
     shapes = []
     for part, positions in zip(parts, positions_by_part, strict=True):
@@ -209,7 +219,9 @@ def write_laboratory(settings: LabSettings) -> int:
             Mitsuba is not installed.
     """
     out = writable_folder(settings.out, "out")
-    subjects = [read_subject(item, index) for index, item in enumerate(progress(settings.meshes, "meshes"))]
+    subjects = []
+    for index, item in enumerate(progress(settings.meshes, "meshes")):
+        subjects.append(read_subject(item, index))
     paths = [Path(path) for path in settings.environments]
     environments = {path.stem: _read_environment(path) for path in paths}
     groups = _group_subjects(subjects, label_names(settings.label))
@@ -235,12 +247,13 @@ def write_laboratory(settings: LabSettings) -> int:
 
 
 def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[list[Subject]]:
-    """Group the meshes by label, with the hard negatives of all labels as the last group, if there are any."""
+    """Group the meshes by label. Hard negatives of all labels form the last group."""
     negatives = [subject for subject in subjects if subject.label not in labels]
     groups = []
     for label in labels:
         group = [subject for subject in subjects if subject.label == label]
-        # With several labels, the meshes of each label are negatives of the others.
+        # If there are several labels, the meshes of a label are negatives of the
+        # other labels.
         needs_negatives = len(labels) == 1
         if not group or (needs_negatives and not negatives):
             raise InputError(f"meshes: name at least one of label={label} and one of another class")
@@ -261,7 +274,13 @@ def _clear(out: Path, overwrite: bool) -> None:
         raise InputError(f"{fault}: {advice}")
 
 
-def _write_render(out: Path, settings: LabSettings, subject: Subject, shot: Shot, number: int) -> str:
+def _write_render(
+    out: Path,
+    settings: LabSettings,
+    subject: Subject,
+    shot: Shot,
+    number: int,
+) -> str:
     """Render a mesh in a setup, write the image, and return its path relative to the folder."""
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)

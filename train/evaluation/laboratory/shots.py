@@ -23,7 +23,7 @@ from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
 FOV = 25.0
 # Pattern of which a shot is drawn before an environment replaces its lighting.
 PLAIN_PATTERN = "solid"
-# Half of the width of the image at the object, in world units.
+# Half-width of the image at the object, in world units.
 HALF_WIDTHS = (1.2, 1.9)
 # Largest coordinate of the object, in world units.
 SCALES = (0.75, 1)
@@ -117,8 +117,22 @@ def draw_shots(
         yield shot
 
 
-def _scale_environment(radiance: np.ndarray, brightness: float, rng: np.random.Generator) -> np.ndarray:
-    """Rotate a map (H, W, 3) about the vertical axis, and scale it to a brightness of a white surface that faces up."""
+def _scale_environment(
+    radiance: np.ndarray,
+    brightness: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Rotate an environment map about the vertical axis by a random angle, and scale it.
+
+    Args:
+        radiance: Environment map, linear RGB, shape (H, W, 3).
+        brightness: Radiance of a white diffuse surface that faces up in the
+            scaled lighting.
+        rng: Random number generator.
+
+    Returns:
+        Scaled map, float32, shape (H, W, 3).
+    """
     directions, solid_angles = equirectangular(*radiance.shape[:2])
     weights = directions[..., 2].clamp(min=0) * solid_angles
     irradiance = (weights[..., None] * torch.from_numpy(radiance)).sum((0, 1))
@@ -179,14 +193,20 @@ def _draw_shot(
 
 
 def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the position (3,) of a projector around the point that it faces, from the azimuth of the camera."""
+    """Draw the position (3,) of a projector, relative to the point that it faces.
+
+    The azimuth of the projector is measured from the azimuth of the camera.
+    """
     projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
     elevation = _draw_between(settings.elevation, rng)
     return _from_angles(projector_azimuth, elevation, rng.uniform(*PROJECTOR_DISTANCES))
 
 
 def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the vector (3,) from the center to a wall behind the object, from the azimuth of the camera."""
+    """Draw the vector (3,) from the center to a wall behind the object.
+
+    The wall is on the side opposite to the azimuth of the camera, in degrees.
+    """
     wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
     return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))
 

@@ -199,7 +199,7 @@ class Pool:
         # The rank is None if the model does not have the class. It then counts
         # as worse than any rank.
         ranks = [prediction.true_rank or np.inf for prediction in self.positives]
-        false_positives = [prediction.predicted == prediction.label for prediction in self.negatives]
+        false_positives = [item.predicted == item.label for item in self.negatives]
         outcomes = {
             "recall": Outcome(self.positives, [rank == 1 for rank in ranks]),
             "top5": Outcome(self.positives, [rank <= 5 for rank in ranks]),
@@ -213,7 +213,7 @@ class Pool:
 
     def _above_threshold(self, predictions: Sequence[Prediction]) -> Outcome:
         """Return predictions and whether the log-odds of each exceed the threshold of its label."""
-        hits = [prediction.log_odds > self.thresholds[prediction.label] for prediction in predictions]
+        hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
         return Outcome(predictions, hits)
 
     @cached_property
@@ -398,7 +398,10 @@ class Pooled:
             # also have predictions about the other labels, which are negative.
             # They would be the only negatives of this mesh, so the negatives of
             # all meshes replace them.
-            negatives = [prediction for prediction in mesh_pool.negatives if prediction.photograph.label not in labels]
+            negatives = []
+            for prediction in mesh_pool.negatives:
+                if prediction.photograph.label not in labels:
+                    negatives.append(prediction)
             ranked = Ranked(
                 positives=mesh_pool.positives or self.all.positives,
                 negatives=negatives or self.all.negatives,
@@ -409,7 +412,7 @@ class Pooled:
     @cached_property
     def _included(self) -> list[Prediction]:
         """Predictions for images of sources that are not excluded."""
-        return [prediction for prediction in self.predictions if prediction.photograph.source not in self.exclude]
+        return [item for item in self.predictions if item.photograph.source not in self.exclude]
 
 
 def _group(
@@ -628,7 +631,11 @@ def auc_and_recalls(
     return np.stack([auc, *recalls])
 
 
-def thresholds(negatives: np.ndarray, counts: np.ndarray, rates: Sequence[str] = RATES) -> list[np.ndarray]:
+def thresholds(
+    negatives: np.ndarray,
+    counts: np.ndarray,
+    rates: Sequence[str] = RATES,
+) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
 
     It is the lowest score of a negative that at most this fraction of the
@@ -661,7 +668,10 @@ def thresholds(negatives: np.ndarray, counts: np.ndarray, rates: Sequence[str] =
     return thresholds_by_rate
 
 
-def roc_curve(positives: np.ndarray, negatives: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def roc_curve(
+    positives: np.ndarray,
+    negatives: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the ROC curve, from (0, 0) to (1, 1).
 
     An image is predicted as positive if its score exceeds the threshold. The

@@ -3,7 +3,7 @@
 import csv
 import hashlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -19,21 +19,44 @@ from renderer.image import to_unit
 from renderer.io.files import write_whole
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_folder, require_kind, require_whole
-from train.data.photographs import SEPARATOR, Photograph, find_photographs, left_out, load_photographs, split_sources
+from train.data.photographs import (
+    SEPARATOR,
+    Photograph,
+    find_photographs,
+    left_out,
+    load_photographs,
+    split_sources,
+)
 from train.settings import label_names
 
+# Name of the file in the folder of an evaluation.
 PREDICTIONS = "predictions.csv"
+# Number of images that `compute_logits` gives to the model at a time.
 BATCH = 256
+# A module or a function from images to logits.
 Model = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """The model's prediction for one photograph, about one class under study, `label`; ranks count from 1, the
-    predicted class.
+    """A model's prediction for a photograph, and its score for one positive class.
 
-    true_*: of the photograph's own class, None if the model lacks it. label_*, log_odds: of the class under study, the
-    last against all other classes, by which photographs are ranked.
+    Probabilities are in [0, 1]. Ranks order the classes of the model by their
+    logits. The predicted class has rank 1.
+
+    Attributes:
+        photograph: The photograph.
+        label: The positive class, a class of the model.
+        predicted: Predicted class.
+        probability: Probability of the predicted class.
+        true_probability: Probability of the class of the photograph. None if
+            the model does not have this class.
+        true_rank: Rank of the class of the photograph. None if the model does
+            not have this class.
+        label_probability: Probability of the positive class.
+        label_rank: Rank of the positive class.
+        log_odds: Log-odds of the positive class against all other classes. ROC
+            curves rank photographs by them.
     """
 
     photograph: Photograph
@@ -48,7 +71,7 @@ class Prediction:
 
     @property
     def positive(self) -> bool:
-        """Whether the photograph shows the class under study."""
+        """Whether the photograph shows the positive class."""
         return self.photograph.label == self.label
 
 
@@ -58,12 +81,12 @@ class FolderPredictions:
 
     Attributes:
         folder: Folder of the photographs.
-        predictions: Predictions about each label, one label after the other.
-            Those about one label are in the order of the images.
+        predictions: Predictions for each positive class, one class after the
+            other. The predictions for one class are in the order of the images.
         images: Photographs, uint8 sRGB, shape (N, 3, size, size).
-        labels: Classes under study.
+        labels: Positive classes.
         unreadable: Paths of the photographs that could not be read.
-        left_out: Paths of the files of kinds that are not read.
+        left_out: Paths of the files whose type is not supported.
         images_hash: Hash of the labels and the photographs. It is equal where
             the metrics of two networks can be compared.
     """
@@ -83,18 +106,18 @@ class FolderPredictions:
 
     @property
     def photographs(self) -> list[Prediction]:
-        """One prediction for each photograph, which is about the first label."""
+        """One prediction for each photograph: the prediction for the first label."""
         return self.predictions[: len(self.images)]
 
 
 @dataclass
 class Predictor:
-    """A model, and what it takes to ask it about photographs.
+    """A model that predicts the classes of photographs.
 
     Attributes:
         model: Module or function from images (N, 3, size, size), float32 sRGB
             in [0, 1], to logits (N, len(classes)). A module is called in eval
-            mode and left in its own.
+            mode. Its mode is restored afterwards.
         classes: Names of the classes of the model.
         size: Pixels per side of the images.
         device: Device of the model.
@@ -116,30 +139,41 @@ class Predictor:
         require_whole("size", self.size)
         require_range("size", self.size, 1, MAX_SIZE)
 
-    def predict(self, folder: Path, label: Label, skip_unreadable: bool = False) -> FolderPredictions:
+    def predict(
+        self,
+        folder: Path,
+        label: Label,
+        skip_unreadable: bool = False,
+    ) -> FolderPredictions:
         """Predict the classes of all photographs of a folder.
 
         Args:
             folder: Folder of photographs, as `find_photographs` takes it.
-            label: Class under study, or several.
+            label: Positive class, or a list of several.
             skip_unreadable: Whether to leave out photographs that cannot be
-                read. Otherwise they are an error.
+                read. Otherwise they raise InputError.
 
         Returns:
-            Predictions about each label, with the photographs.
+            Predictions for each positive class, with the photographs.
 
         Raises:
-            InputError: As of `find_photographs`, `load_photographs` and
-                `compute_logits`.
+            InputError: If the folder or a photograph cannot be used (see
+                `find_photographs` and `load_photographs`), or if the logits are
+                wrong (see `compute_logits`).
         """
         folder = as_folder("folder", folder)
         labels = label_names(label)
         found = find_photographs(folder, self.classes, label)
-        photographs, images, unreadable = load_photographs(folder, found, self.size, skip_unreadable)
+        photographs, images, unreadable = load_photographs(
+            folder,
+            found,
+            self.size,
+            skip_unreadable,
+        )
         logits = compute_logits(self.model, images, len(self.classes), self.device)
         return FolderPredictions(
             folder=folder,
-            predictions=predict(photographs, logits, self.classes, labels),
+            predictions=rank_classes(photographs, logits, self.classes, labels),
             images=images,
             labels=labels,
             unreadable=unreadable,
@@ -149,7 +183,7 @@ class Predictor:
 
 
 def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
-    """Hash the labels, and the files of photographs with what is known of them."""
+    """Hash the positive classes, the fields of the photographs and the bytes of their files."""
     digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
         content = (folder / photograph.path).read_bytes()
@@ -157,106 +191,197 @@ def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]
     return digest.hexdigest()
 
 
-def compute_logits(model: Model, images: torch.Tensor, classes: int, device: str | torch.device) -> torch.Tensor:
-    """The model's logits, (N, classes) float32 on the CPU, for images (N, 3, H, W) uint8 sRGB.
+def compute_logits(
+    model: Model,
+    images: torch.Tensor,
+    classes: int,
+    device: str | torch.device,
+) -> torch.Tensor:
+    """Compute the logits of a model for images.
 
-    A module is called in eval mode and left in its own. InputError: logits of another shape, NaN or infinite, or of one
-    class.
+    A module is called in eval mode. Its mode is restored afterwards.
+
+    Args:
+        model: Module or function from images, float32 sRGB in [0, 1], to logits.
+        images: Images, uint8 sRGB, shape (N, 3, H, W).
+        classes: Number of classes of the model.
+        device: Device of the model.
+
+    Returns:
+        Logits, float32 on the CPU, shape (N, classes).
+
+    Raises:
+        InputError: If there are fewer than two classes, or if the logits have
+            another shape, are NaN or are infinite.
     """
     if classes < 2:
-        raise InputError("the model has a single class, whose odds are infinite: evaluate one with other classes, too")
-    with (
-        eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(),
-        torch.inference_mode(),
-    ):
-        call = NetworkCall("model")
-        batches = [call(model, to_unit(batch.to(device))) for batch in progress(images.split(BATCH), "predictions")]
-        logits = torch.cat(batches).float().cpu()
-    if logits.shape != (shape := (len(images), classes)):
-        advice = "evaluate a checkpoint that was trained on these classes"
-        raise InputError(f"the model returned logits of shape {tuple(logits.shape)}, not {shape}: {advice}")
+        problem = "the model has a single class, so its log-odds are infinite"
+        raise InputError(f"{problem}: evaluate a model with at least two classes")
+    call = NetworkCall("model")
+    in_eval_mode = eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext()
+    batches = []
+    with in_eval_mode, torch.inference_mode():
+        for batch in progress(images.split(BATCH), "predictions"):
+            batches.append(call(model, to_unit(batch.to(device))))
+    logits = torch.cat(batches).float().cpu()
+    expected = (len(images), classes)
+    if logits.shape != expected:
+        problem = f"the model returned logits of shape {tuple(logits.shape)}, not {expected}"
+        raise InputError(f"{problem}: evaluate a checkpoint that was trained on these classes")
     if not logits.isfinite().all():
-        raise InputError("the model returned NaN or infinite logits: evaluate a checkpoint of a run that converged")
+        problem = "the model returned NaN or infinite logits"
+        raise InputError(f"{problem}: evaluate a checkpoint of a run that converged")
     return logits
 
 
-def predict(
+def rank_classes(
     photographs: Sequence[Photograph],
     logits: torch.Tensor,
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[Prediction]:
-    """Predictions from logits (N, C) in the order of `classes`: about the first of `labels` for all photographs, then
-    about the next."""
-    probabilities = logits.double().softmax(dim=1).tolist()
-    # Ranks come from the logits, whose order survives where probabilities round to 0; ties go to the first.
-    order = logits.argsort(dim=1, descending=True, stable=True)
-    ranks = (order.argsort(dim=1) + 1).tolist()
+    """Convert logits to probabilities, ranks and log-odds.
+
+    Args:
+        photographs: The N photographs.
+        logits: Logits of the photographs, shape (N, C).
+        classes: Names of the C classes of the model.
+        labels: Positive classes, all of them classes of the model.
+
+    Returns:
+        Predictions of all photographs for the first label, then for the next
+        one, and so on.
+    """
+    logits = logits.double()
+    probabilities = logits.softmax(dim=1).tolist()
+    # Ranks come from the logits, whose order survives if probabilities round to
+    # 0. Of classes with equal logits, the first one has the lower rank.
+    class_at_rank = logits.argsort(dim=1, descending=True, stable=True)
+    ranks = (class_at_rank.argsort(dim=1) + 1).tolist()
+    predicted = class_at_rank[:, 0].tolist()
+
     predictions = []
     for label in labels:
-        studied = classes.index(label)
-        odds = log_odds(logits.double(), studied).tolist()
-        for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
-            best, true = places.index(1), (None, None)
+        label_index = classes.index(label)
+        label_odds = log_odds(logits, label_index).tolist()
+        for row, photograph in enumerate(photographs):
+            true_probability = None
+            true_rank = None
             if photograph.label in classes:
-                index = classes.index(photograph.label)
-                true = by_class[index], places[index]
-            row = classes[best], by_class[best], *true, by_class[studied], places[studied], score
-            predictions.append(Prediction(photograph, label, *row))
+                true_index = classes.index(photograph.label)
+                true_probability = probabilities[row][true_index]
+                true_rank = ranks[row][true_index]
+            prediction = Prediction(
+                photograph=photograph,
+                label=label,
+                predicted=classes[predicted[row]],
+                probability=probabilities[row][predicted[row]],
+                true_probability=true_probability,
+                true_rank=true_rank,
+                label_probability=probabilities[row][label_index],
+                label_rank=ranks[row][label_index],
+                log_odds=label_odds[row],
+            )
+            predictions.append(prediction)
     return predictions
 
 
 def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
-    """The predictions about each class under study."""
-    labels = dict.fromkeys(item.label for item in predictions)
-    return {label: [item for item in predictions if item.label == label] for label in labels}
+    """Group predictions by their positive class."""
+    groups: dict[str, list[Prediction]] = {}
+    for prediction in predictions:
+        groups.setdefault(prediction.label, []).append(prediction)
+    return groups
 
 
 def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
-    """Write a row per photograph, with columns for each class under study; None becomes an empty cell."""
-    groups = by_label(predictions)
+    """Write predictions.csv, with a row for each photograph.
+
+    The columns path, label, source, hard_negatives, mesh, predicted,
+    probability, true_probability and true_rank hold what is the same for all
+    positive classes. Each positive class, such as orange, adds the columns
+    orange_probability, orange_rank and orange_log_odds. None becomes an empty
+    cell.
+
+    Args:
+        path: Path of the file.
+        predictions: Predictions of the same photographs for each positive
+            class, one class after the other.
+    """
+    predictions_of_label = by_label(predictions).values()
+    rows = [_to_row(of_photograph) for of_photograph in zip(*predictions_of_label, strict=True)]
     table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    columns = dict.fromkeys(name for label in groups for name in _columns(label))
-    writer.writerow(["path", "label", "source", "hard_negatives", "mesh", *columns])
-    for items in zip(*groups.values(), strict=True):
-        cells: dict[str, object] = {}
-        for item in items:
-            photograph, label, *values = vars(item).values()
-            cells |= zip(_columns(label), values, strict=True)
-        names = {**vars(photograph), "hard_negatives": SEPARATOR.join(photograph.hard_negatives)}
-        writer.writerow([*names.values(), *cells.values()])
+    writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     write_whole(path, table.getvalue())
 
 
+def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
+    """Return the row of a photograph, given its predictions for each positive class."""
+    photograph = predictions[0].photograph
+    row: dict[str, object] = {
+        "path": photograph.path,
+        "label": photograph.label,
+        "source": photograph.source,
+        "hard_negatives": SEPARATOR.join(photograph.hard_negatives),
+        "mesh": photograph.mesh,
+        "predicted": predictions[0].predicted,
+        "probability": predictions[0].probability,
+        "true_probability": predictions[0].true_probability,
+        "true_rank": predictions[0].true_rank,
+    }
+    for prediction in predictions:
+        label = prediction.label
+        row[f"{label}_probability"] = prediction.label_probability
+        row[f"{label}_rank"] = prediction.label_rank
+        row[f"{label}_log_odds"] = prediction.log_odds
+    return row
+
+
 def read_predictions(path: Path, label: Label) -> list[Prediction]:
-    """The predictions that `write_predictions` wrote; InputError for another file, or one about another class."""
+    """Read predictions that `write_predictions` wrote.
+
+    Args:
+        path: Path of predictions.csv.
+        label: Positive class, or a list of several.
+
+    Returns:
+        Predictions for each positive class, one class after the other.
+
+    Raises:
+        InputError: If the file is missing or damaged, or has no columns of a
+            positive class.
+    """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = [*csv.DictReader(file)]
-            return [_read_row(row, name) for name in label_names(label) for row in rows]
+            rows = list(csv.DictReader(file))
+        return [_from_row(row, name) for name in label_names(label) for row in rows]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         advice = f"score the photographs again, with label={label}"
         raise InputError(f"{path} cannot be used ({in_one_line(error)}): {advice}") from error
 
 
-def _read_row(row: dict[str, str], label: str) -> Prediction:
-    names = row["source"] or None, split_sources(row["hard_negatives"]), row.get("mesh") or None
-    cells = (kind(row[name]) if row[name] else None for name, kind in _columns(label).items())
-    return Prediction(Photograph(PurePosixPath(row["path"]), row["label"], *names), label, *cells)  # type: ignore[arg-type]
-
-
-def _columns(label: str) -> dict[str, Callable[[str], object]]:
-    """The columns of a prediction about a class, in the order of its fields, with their types."""
-    predicted = {
-        "predicted": str,
-        "probability": float,
-        "true_probability": float,
-        "true_rank": int,
-    }
-    return {
-        **predicted,
-        f"{label}_probability": float,
-        f"{label}_rank": int,
-        f"{label}_log_odds": float,
-    }
+def _from_row(row: Mapping[str, str], label: str) -> Prediction:
+    """Return the prediction for a positive class that a row of predictions.csv holds."""
+    photograph = Photograph(
+        path=PurePosixPath(row["path"]),
+        label=row["label"],
+        source=row["source"] or None,
+        hard_negatives=split_sources(row["hard_negatives"]),
+        # Files of earlier versions do not have this column.
+        mesh=row.get("mesh") or None,
+    )
+    true_probability = row["true_probability"]
+    true_rank = row["true_rank"]
+    return Prediction(
+        photograph=photograph,
+        label=label,
+        predicted=row["predicted"],
+        probability=float(row["probability"]),
+        true_probability=float(true_probability) if true_probability else None,
+        true_rank=int(true_rank) if true_rank else None,
+        label_probability=float(row[f"{label}_probability"]),
+        label_rank=int(row[f"{label}_rank"]),
+        log_odds=float(row[f"{label}_log_odds"]),
+    )

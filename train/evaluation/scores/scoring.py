@@ -22,8 +22,22 @@ from renderer.io.files import remove_unfinished, write_whole
 from renderer.io.images import write_image
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
-from train.evaluation.scores.metrics import COUNTED, RANKED, Metrics, Pool, Pooled, metric_title, thresholds
-from train.evaluation.scores.predictions import PREDICTIONS, FolderPredictions, Prediction, Predictor, write_predictions
+from train.evaluation.scores.metrics import (
+    COUNTED,
+    RANKED,
+    Metrics,
+    Pool,
+    Pooled,
+    metric_title,
+    thresholds,
+)
+from train.evaluation.scores.predictions import (
+    PREDICTIONS,
+    FolderPredictions,
+    Prediction,
+    Predictor,
+    write_predictions,
+)
 from train.evaluation.scores.sheet import contact_sheet, write_roc
 from train.evaluation.tables import Proportion, Table, format_fraction, format_interval, fraction
 from train.settings import GROUPS
@@ -84,14 +98,15 @@ class Scores:
 
     @property
     def label(self) -> str:
-        """Classes under study, such as "orange" or "orange or lemon"."""
+        """Positive classes in words, such as "orange" or "orange or lemon"."""
         return " or ".join(self.answers.labels)
 
     @property
     def point_entries(self) -> list[dict[str, Any]]:
-        """Operating points as summary.json has them.
+        """Convert the operating points to entries of summary.json.
 
-        Each says whether it was chosen on the very images that are scored.
+        The entry "in_sample" says whether a point was chosen on the very images
+        that are scored.
         """
         images_hash = self.answers.images_hash
         return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
@@ -179,7 +194,11 @@ def evaluate_photographs(
     return scores
 
 
-def score(answers: FolderPredictions, by: str = "source", points: Sequence[OperatingPoint] = ()) -> Scores:
+def score(
+    answers: FolderPredictions,
+    by: str = "source",
+    points: Sequence[OperatingPoint] = (),
+) -> Scores:
     """Score predictions for photographs.
 
     Fractions have 95% Wilson intervals. The AUC and the recall at a
@@ -299,7 +318,8 @@ def choose_operating_points(
     exact_rate = Fraction(str(rate))
     points = []
     for name in answers.labels:
-        log_odds = np.array([item.log_odds for item in answers.predictions if item.label == name and not item.positive])
+        predictions = [item for item in answers.predictions if item.label == name]
+        log_odds = np.array([item.log_odds for item in predictions if not item.positive])
         count = len(log_odds)
         if count * exact_rate < 1:
             fault = f"folder={folder} has {count} images of other things than {name}"
@@ -321,16 +341,29 @@ def choose_operating_points(
 
 
 def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Those of a summary: one, or one of each of several labels, or none."""
+    """Return the operating points of a summary as a list, which may be empty.
+
+    Args:
+        summary: Content of summary.json, which holds no point, one point or a
+            list with a point for each label.
+    """
     chosen = summary.get("operating_point", [])
     return chosen if isinstance(chosen, list) else [chosen]
 
 
 def describe_point(point: Mapping[str, Any]) -> str:
-    """How the `operating_point` of a summary was chosen."""
-    others = f"{point['folder']}, {point['negatives']} others"
-    where = "these very images, in-sample" if point.get("in_sample") else others
-    return f"{point['false_positive_rate']:.1%} FPR on {where}"
+    """Say at which false-positive rate, and on which images, an operating point was chosen.
+
+    Args:
+        point: Entry `operating_point` of a summary.
+
+    Returns:
+        Text such as "5.0% FPR on photographs, 120 others".
+    """
+    images = f"{point['folder']}, {point['negatives']} others"
+    if point.get("in_sample"):
+        images = "these very images, in-sample"
+    return f"{point['false_positive_rate']:.1%} FPR on {images}"
 
 
 def format_scores(scores: Scores) -> str:

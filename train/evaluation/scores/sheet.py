@@ -1,4 +1,4 @@
-"""The images of an evaluation: a contact sheet of photographs with their predictions, and ROC curves."""
+"""Images of an evaluation: a contact sheet of photographs with predictions, and ROC curves."""
 
 import csv
 import io
@@ -29,7 +29,10 @@ IMAGE = 96
 FRAME = 4
 # Characters of a caption, at most.
 LONGEST_CAPTION = 18
-LEGEND = "Under each image: the predicted class and its probability; in gray, where that is wrong, the true class"
+LEGEND = (
+    "Under each image: the predicted class and its probability. "
+    "If the prediction is wrong, the true class follows in gray."
+)
 # Colors of the frames.
 GREEN = "#2e9e5b"
 RED = "#d03b3b"
@@ -84,7 +87,11 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Im
     return sheet
 
 
-def _sections(label: str, predictions: Sequence[Prediction], images: torch.Tensor) -> list[_Section]:
+def _sections(
+    label: str,
+    predictions: Sequence[Prediction],
+    images: torch.Tensor,
+) -> list[_Section]:
     """Divide the predictions about a class into the sections of the contact sheet."""
     pairs = sorted(zip(predictions, images, strict=True), key=lambda pair: -pair[0].probability)
     positives = [pair for pair in pairs if pair[0].positive]
@@ -105,7 +112,9 @@ def _section_grid(label: str, section: _Section) -> Image.Image:
     heading = f"{label}: {count} {section.name} of {section.total}"
     if count > PER_SECTION:
         heading += f" ({PER_SECTION} shown, evenly by probability)"
-    tiles = [_tile(prediction, image, section.color) for prediction, image in evenly(section.shown, PER_SECTION)]
+    tiles = []
+    for prediction, image in evenly(section.shown, PER_SECTION):
+        tiles.append(_tile(prediction, image, section.color))
     rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
     return draw_grid(rows, heading=heading)
 
@@ -215,4 +224,5 @@ def draw_roc(
             rates, recalls, _ = roc_curve(*pair)
             title = None if number else f"{name}: AUC {np.mean(areas):.3f}"
             axes.plot(rates, recalls, label=title, **styles.get(name, {}))
-    axes.set(xlabel="false positive rate", ylabel=f"recall of {label}", xlim=(-0.01, 1), ylim=(0, 1.01))
+    axes.set(xlabel="false positive rate", ylabel=f"recall of {label}")
+    axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))
