@@ -15,7 +15,14 @@ from augment.random_streams import generator
 from renderer.errors import InputError, in_one_line
 from train import console
 from train.data.images import RESIDENT, ImageFiles
-from train.data.photographs import Photograph, find_photographs, find_unlabeled, is_hidden, left_out, load_photographs
+from train.data.photographs import (
+    Photograph,
+    find_photographs,
+    find_unlabeled,
+    folder_names,
+    left_out,
+    load_photographs,
+)
 from train.system.hashing import content_hash
 
 # Names of folders that divide a data set. They are not names of classes.
