@@ -49,10 +49,12 @@ from train.system.user_errors import one_sentence
 
 USER_ERROR = 2  # exit status
 INTERRUPTED = "ended by SIGINT"
-PREFIX = "pnb-"  # of the installed commands
+# Start of the names of the installed commands.
+PREFIX = "pnb-"
 SWEEP_FLAGS = {"--multirun", "-m"}
 HELP_FLAGS = {"--help", "-h"}
-IMPORT_DELAY = 5.0  # seconds of importing before it is reported
+# Seconds of importing after which a line reports it.
+IMPORT_DELAY = 5.0
 NOUNS = {
     int: "a whole number",
     float: "a number",
@@ -62,7 +64,8 @@ NOUNS = {
 }
 # Hydra and OmegaConf let these pass for some mistakes, without saying where.
 INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
-MAX_DIGITS = 300  # of a whole number that a float can hold
+# Digits of a whole number that a float can hold.
+MAX_DIGITS = 300
 # Hydra reads text between these as it is.
 QUOTES = "'\""
 Kind = TypeVar("Kind")
@@ -123,8 +126,9 @@ class Command:
         return [as_override(word, keys) for word in self.rewrite(words)]
 
     def run(self, config: DictConfig) -> None:
-        """Do the work for a composed configuration; Hydra calls this."""
-        with self.one_line():  # here, too, or Hydra adds a line to an error
+        """Run the command for a composed configuration. Hydra calls this method."""
+        # Without this, Hydra would add a line to the message of an error.
+        with self.one_line():
             self.work(config)
 
     def work(self, config: DictConfig) -> None:
@@ -166,7 +170,8 @@ class Command:
         """
         try:
             yield
-            print(end="", flush=True)  # a closed pipe is met here
+            # If the output is a closed pipe, this raises BrokenPipeError.
+            print(end="", flush=True)
         except BrokenPipeError:
             # Python flushes the output once more at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -207,17 +212,19 @@ def compose(name: str, overrides: Sequence[str]) -> DictConfig:
 
 def set_up_process() -> None:
     """Set what all commands need, before torch is imported."""
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises errors instead of printing them
-    # Threads of torch that wait do not spin on a busy machine.
+    # Hydra then raises errors instead of printing them.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    # Waiting threads of torch then sleep, so that they do not slow down others.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if Path(sys.argv[0]).stem.startswith(PREFIX):
-        # In further processes, `train` is no train.py of the current folder.
+        # Child processes must not import a train.py of the current folder.
         os.environ["PYTHONSAFEPATH"] = "1"
     warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     warnings.simplefilter("once", UserWarning, append=True)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")  # characters that the terminal lacks
+            # A terminal may lack some characters.
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -253,7 +260,9 @@ def import_function(path: str) -> Callable[..., Any]:
         if is_main:
             signal.signal(signal.SIGINT, before)
     if is_first:
-        gc.freeze()  # or Python looks for cycles among all imported objects, for seconds at its end
+        # Otherwise, Python would look for cycles among all imported objects at
+        # its end, which takes seconds.
+        gc.freeze()
     return cast(Callable[..., Any], function)
 
 
@@ -277,7 +286,8 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
             the key.
     """
     try:
-        if OmegaConf.get_type(config) is not kind:  # a saved one, whose values have no types yet
+        # The values of a saved configuration have no types yet.
+        if OmegaConf.get_type(config) is not kind:
             config = cast(DictConfig, OmegaConf.merge(OmegaConf.structured(kind), config))
         return cast(Kind, _read_node(config, ""))
     except (OmegaConfBaseException, *INTERNAL_ERRORS) as error:
@@ -331,7 +341,8 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
     if key.startswith("+") and not key.lstrip("+").startswith("hydra"):
         key = key.lstrip("+")
         argument = f"{key}{equals}{value}"
-    if keys.get(key.rpartition(".")[0]) is Any:  # a part of a mapping, such as scene.projector
+    # The key is a part of a mapping, such as scene.projector.
+    if keys.get(key.rpartition(".")[0]) is Any:
         return f"++{argument}"
     kind = without_none(keys.get(key))
     if get_origin(kind) is list:

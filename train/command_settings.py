@@ -473,7 +473,7 @@ class FitSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if bool(self.mask) == bool(self.box):
-            raise InputError("give mask=FILE or box=[left,top,right,bottom], one of them")
+            raise InputError("give either mask=FILE or box=[left,top,right,bottom]")
 
 
 @dataclass

@@ -195,6 +195,8 @@ class Dropout(nn.Dropout):
 
     def _draw_factors(self, x: Tensor) -> Tensor:
         """Draw 0 or 1 / (1 - p) for each value of x from 16 random bits, in the layout of x."""
+        # All processes draw for the whole batch, and each takes its own part.
+        # The draws then do not depend on the number of processes.
         value_count = x.numel()
         batch_value_count = value_count * distributed.world_size()
         # The seed comes from torch, so that `torch.manual_seed` decides the draws.

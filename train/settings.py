@@ -389,9 +389,9 @@ class ExperimentSettings(Settings):
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """The meshes and the hard negatives of the scene by their keys.
+        """Return the meshes and the hard negatives of the scene by their keys.
 
-        Hard negatives that name no class are of the class OTHER.
+        Hard negatives without a class get the class OTHER.
         """
         labels = label_names(self.label)
         label = labels[0] if len(labels) == 1 else ""

@@ -279,7 +279,7 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
 
 
 def _wrong_class(key: str, item: ObjectSettings, label: str) -> InputError:
-    """Return the error for a mesh that is listed under the wrong key."""
+    """Return the error for a mesh whose class does not fit the key that lists it."""
     return InputError(f"{key}: {item.mesh} is of the class {item.label}, and label={label}", key)
 
 

@@ -150,7 +150,7 @@ def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
 
 
 def _require_attack_settings(settings: AttackExperimentSettings) -> None:
-    """Check settings that no file and no classifier is needed for."""
+    """Check the settings that can be checked before any file or classifier is read."""
     with keyed("transfer", **keys_of("transfer", settings.transfer)):
         require_transferable(
             settings.attack.parameters,

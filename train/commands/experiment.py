@@ -58,7 +58,8 @@ def _report_thread_error(error: threading.ExceptHookArgs) -> None:
 def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     """Check all settings, and then train the baselines and the main run.
 
-    All processes use the folder that rank 0 names.
+    All processes write to the folder of rank 0, since the default name of the
+    folder has the time at which a process started.
     """
     run = broadcast(str(config.run))
     is_first = distributed.rank() == 0

@@ -36,8 +36,8 @@ def publish_network(settings: PublishSettings) -> None:
     is_run = path.suffix != Path(PUBLISHED).suffix
     if is_run:
         state |= _describe_run(given)
-    # A network that a function of the user makes is not built here, unless it
-    # has to be: only its user is meant to run that function.
+    # A network may be built by a Python function of the user. Publishing calls
+    # this function only if the network has to be calibrated.
     is_python = str(state["architecture"].get("name")).startswith(PYTHON)
     if settings.calibrate or not is_python:
         # Loading fails for a network that nobody could use.

@@ -95,7 +95,7 @@ class ImageFiles:
         )
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
-        """Give the images of batches of keys; raise InputError for one that cannot be read."""
+        """Yield the images of batches of keys. Raise InputError if an image cannot be read."""
         broken: Faults = {}
         loader: DataLoader = DataLoader(
             _Reader(self),

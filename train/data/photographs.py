@@ -150,7 +150,7 @@ def _require_files_of_rows(
     files: Sequence[PurePosixPath],
     example: PurePosixPath,
 ) -> None:
-    """Warn of rows for no file of the folder; raise InputError if all rows are of that kind."""
+    """Warn of rows whose file does not exist. Raise InputError if no file of any row exists."""
     unknown = sorted(rows.keys() - set(files))
     if not unknown:
         return

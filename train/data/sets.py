@@ -102,41 +102,44 @@ class DataSet:
 
 
 def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
-    """Number the labels of a data set by other classes.
+    """Return a copy of a data set whose labels are indices into other classes.
 
     Args:
-        data: The data set.
-        classes: The names of the classes to count by.
-        subject: Start of the error, which says what data it is.
+        data: Data set. Each of its classes is one of `classes`.
+        classes: Names of the classes of a network.
+        subject: Name of the data set, with which the error begins.
 
     Returns:
-        The data set with the other classes.
+        Data set with the same images and with `classes`.
 
     Raises:
-        InputError: A class of the data is not among them.
+        InputError: If a class of the data set is not in `classes`.
     """
-    numbers = torch.tensor([class_index(classes, name, subject) for name in data.classes])
-    train = Split(data.train.images, numbers[data.train.labels])
-    test = Split(data.test.images, numbers[data.test.labels])
+    indices = [class_index(classes, name, subject) for name in data.classes]
+    new_label_of_label = torch.tensor(indices)
+    train = Split(data.train.images, new_label_of_label[data.train.labels])
+    test = Split(data.test.images, new_label_of_label[data.test.labels])
     return replace(data, classes=tuple(classes), train=train, test=test)
 
 
 def held_out_rows(split: Split, fraction: float, seed: int, argument: str = "fraction") -> Tensor:
-    """Choose a fraction of the images of every class.
+    """Choose a fraction of the images of every class at random.
 
-    The images that a smaller fraction chooses are among those of a larger one.
+    A larger fraction chooses the same images and more.
 
     Args:
-        split: The images.
-        fraction: The fraction, between 0 and 1, which is rounded to whole images of each class.
-        seed: The seed of the choice.
+        split: Images and labels.
+        fraction: Fraction between 0 and 1. For each class, it is rounded to
+            whole images.
+        seed: Seed of the choice.
         argument: Name of the argument that holds the fraction, for the error.
 
     Returns:
-        Which images are chosen, bool, shape (N,).
+        Mask of the chosen images, bool, shape (N,).
 
     Raises:
-        InputError: The fraction is out of range, or it chooses none or all images of a class.
+        InputError: If the fraction is out of range, or if it chooses none or
+            all of the images of a class.
     """
     if not 0 < fraction < 1:
         raise InputError(f"{argument}={fraction} must lie between 0 and 1", argument)
@@ -248,7 +251,7 @@ def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
-    """Check the images and labels of one part; raise ValueError if they are of another kind."""
+    """Make a split of arrays. Raise ValueError if a shape, a type or a label is wrong."""
     is_square = images.ndim == 4 and images.shape[1] == 3 and images.shape[2] == images.shape[3]
     if not is_square or images.dtype != np.uint8:
         given = f"images are {images.dtype} of shape {images.shape}"

@@ -72,7 +72,7 @@ def studied_classes(label: str | int | None, meshes: Sequence[dict[str, Any]], c
 
 
 def _class_of(mesh: dict[str, Any], classifier: Classifier) -> str:
-    """Return the class of a mesh: its label, or else the class that its name is."""
+    """Return the label of a mesh or, without a label, the class that its file is named after."""
     if mesh.get("label"):
         return str(mesh["label"])
     name = solid_name(mesh["mesh"]) or Path(mesh["mesh"]).stem

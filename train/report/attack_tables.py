@@ -157,7 +157,8 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     for found in transfers:
         clean = found["clean_correct"]
         rate = fraction(_count_correct(found["success"], clean), sum(clean))
-        # The first entry says where the adversaries are shown.
+        # The key of the first entry is what the adversaries are transferred to,
+        # such as a classifier. Its value is the name.
         kind = next(iter(found))
         entry = {kind: found[kind], **asdict(rate), **found}
         lines.append(json.dumps(entry) + "\n")

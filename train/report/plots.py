@@ -28,7 +28,8 @@ WIDTH = 440
 SMALL = 192
 # Lines with fewer points than this have markers.
 MARKED = 30
-# The color of text and axes in matplotlib's file. The color of the reader's scheme replaces it.
+# Color of text and axes in the file of matplotlib. `_plot` replaces it by the text
+# color of the page, which is light or dark.
 INK = "#123456"
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
 PLOT = {

@@ -273,15 +273,20 @@ def _accuracy_sentences(arms: Methods) -> list[str]:
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
-    """Collect what the page shows of scores on the same images.
+    """Collect the plots, tables and images of runs that were scored on the same images.
 
     Args:
         title: Title of the images.
-        group: Scored runs of each arm, as `summary.group_by_images` groups them.
+        group: Scored runs of each arm, from `summary.group_by_images`.
 
     Returns:
-        Values of the template: plots, tables, sentences, and a contact sheet of
-        each arm.
+        Values of the macro `scores` in page.html.jinja:
+
+        - "name": the title;
+        - "sheets": contact sheet of the first run of each arm;
+        - "rocs": plots of ROC curves;
+        - "tables": tables of metrics and of their differences;
+        - "sentences": differences in words, or why they are unknown.
     """
     sheets = {}
     for arm, scored_runs in group.items():

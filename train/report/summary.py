@@ -411,15 +411,17 @@ def run_tables(arms: Methods, groups: Mapping[str, Scored]) -> list[Table]:
 def _accuracy_table(arms: Methods) -> Table:
     """Make the table of the accuracy on the test images."""
     lines: dict[str, list[Line]] = {}
-    tested: dict[str, None] = {}
+    test_images = []
     for arm, runs in arms.items():
         for run in runs:
-            tested[run.config.get("test_images", "")] = None
+            test_images.append(run.config.get("test_images", ""))
             if runs[0].accuracy is not None:
                 last = run.scores.get("test/accuracy_last")
                 line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
                 lines.setdefault(arm, []).append(line)
-    title = " or ".join(f"accuracy on {images}" for images in tested if images)
+    # A dictionary keeps each name once, in order.
+    names = dict.fromkeys(name for name in test_images if name)
+    title = " or ".join(f"accuracy on {name}" for name in names)
     return _run_table(title, ["test accuracy", "of the last epoch"], lines)
 
 

@@ -18,7 +18,12 @@ from renderer.io.files import write_whole
 from train.networks import VERSION
 from train.system.hashing import content_hash
 
-LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
+# Files of the last and the second to last checkpoint, and of the network that
+# validated best.
+LAST = "last.pt"
+PREVIOUS = "previous.pt"
+BEST = "best.pt"
+# Key of the hash in a checkpoint.
 HASH = "sha256"
 
 
@@ -26,9 +31,9 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
     """Write a checkpoint with `write_whole`.
 
     Args:
-        path: The file.
+        path: Path of the file.
         state: Tensors and plain values.
-        previous: Where the file that is replaced is kept; None for nowhere.
+        previous: Path to which an existing file is moved. None replaces it.
     """
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
@@ -52,9 +57,10 @@ def load(path: Path) -> dict[str, Any]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict) or state.pop(HASH, None) != content_hash(state):
             raise ValueError("its content does not match its hash")
-    except Exception as error:  # torch raises many types for a damaged or foreign file.
+    except Exception as error:
+        # torch raises errors of many types if a file is damaged or no checkpoint.
         problem = f"checkpoint {path} is damaged or not a checkpoint"
-        raise InputError(f"{problem}; use another one of the run") from error
+        raise InputError(f"{problem}: use another checkpoint of the run") from error
     return checked(state, path)
 
 

@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from train.runs.run_log import PHASES
 
-# The diagnostics of each round that metrics.jsonl shows.
+# Diagnostics of the attack that metrics.jsonl has for each round.
 SHOWN = ("attack_success_before", "attack_success", "steps")
 
 
@@ -20,16 +20,22 @@ def epoch_metrics(
     """Name the metrics of an epoch as metrics.jsonl and TensorBoard have them.
 
     Args:
-        trained: The metrics on the training images.
-        validated: The metrics on the validation images.
-        diagnostics: The diagnostics of the renders of each round.
-        seconds: The time that each phase took.
+        trained: Metrics on the training images.
+        validated: Metrics on the validation images.
+        diagnostics: Diagnostics of the attack, for each round of renders.
+        seconds: Time that each phase of the epoch took.
 
     Returns:
-        The metrics by group/name. Groups are train, validation, augment (means over the rounds),
-        seconds and, with several rounds, round_1, round_2 and so on.
+        Metrics by names such as "train/loss". The part before the slash is:
+
+        - "train" or "validation";
+        - "augment", for means of the diagnostics over the rounds;
+        - "seconds";
+        - "round_1", "round_2" and so on, if there are several rounds.
     """
-    augment = {name: fmean(part[name] for part in diagnostics) for name in diagnostics[0]}
+    augment = {}
+    for name in diagnostics[0]:
+        augment[name] = fmean(of_round[name] for of_round in diagnostics)
     groups = {
         "train": trained,
         "validation": validated,
@@ -37,8 +43,9 @@ def epoch_metrics(
         "seconds": seconds,
     }
     if len(diagnostics) > 1:
-        for number, part in enumerate(diagnostics, 1):
-            groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
+        for number, of_round in enumerate(diagnostics, 1):
+            shown = {name: of_round[name] for name in SHOWN if name in of_round}
+            groups[f"round_{number}"] = shown
     metrics: dict[str, float] = {}
     for group, values in groups.items():
         metrics |= {f"{group}/{name}": value for name, value in values.items()}

@@ -28,8 +28,8 @@ PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": t
 # The batch sizes for which `GraphedModel` records graphs. Validation has the largest. The batches
 # of an attack shrink, since examples leave on success.
 SIZES = (16, 32, 64, 128, 512)
-# torch compiles a function at most 8 times by default. Each size is compiled with and without
-# gradients.
+# Number of times that torch may compile a function, instead of its default of 8.
+# Each size is compiled with and without gradients.
 RECOMPILE_LIMIT = 4 * len(SIZES)
 
 
@@ -70,7 +70,7 @@ def most_threads() -> int:
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
     except (OSError, ValueError):
-        # There is no such file, or it says "max 100000".
+        # Without a quota, the file is missing or contains "max 100000".
         permitted = bound
     return min(THREADS, bound, permitted)
 
@@ -95,10 +95,10 @@ def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
 
 
 def set_deterministic(deterministic: bool) -> None:
-    """Choose whether a GPU's results repeat bit for bit. A CPU's always do.
+    """Choose whether a GPU computes the same bits every time. A CPU always does.
 
     Args:
-        deterministic: Whether they repeat, which costs some time.
+        deterministic: Whether to compute the same bits, which is slower.
     """
     if deterministic:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS asks for it.
@@ -142,7 +142,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
 
 
 def _has_depthwise_layer(network: nn.Module | None) -> bool:
-    """Return whether a network has a convolution that keeps its channels apart."""
+    """Return whether a network has a depthwise convolution, with one group per channel."""
     modules = network.modules() if network is not None else []
     convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
     return any(layer.groups == layer.in_channels > 1 for layer in convolutions)

@@ -13,11 +13,11 @@ from train.system.device import MixedPrecision
 class MovingAverage(AveragedModel):
     """The exponential moving average of a model's weights and statistics.
 
-    It begins with those of the first update.
+    The first update copies the parameters and buffers of the model.
 
     Args:
         model: The model.
-        decay: The share of the average that an update keeps, at least 0 and below 1.
+        decay: Weight of the old average in an update, in [0, 1).
     """
 
     def __init__(self, model: nn.Module, decay: float):
@@ -25,22 +25,25 @@ class MovingAverage(AveragedModel):
         self._average = get_ema_multi_avg_fn(decay)
 
     def update_parameters(self, model: nn.Module) -> None:
-        """Move the average towards a model.
+        """Move the average toward a model.
 
-        torch's own method makes a GPU wait at every step, since it moves its counter there.
+        The method of torch copies its counter to the GPU at every step, and the
+        GPU waits for it. This method keeps the counter on the CPU.
         """
         if self.n_averaged == 0:
             return super().update_parameters(model)
         averages = [*self.module.parameters(), *self.module.buffers()]
         latest = [*model.parameters(), *model.buffers()]
-        for is_floating in (True, False):  # A call takes tensors of one type.
-            pairs = [
-                (average.detach(), value.detach())
-                for average, value in zip(averages, latest, strict=True)
-                if average.is_floating_point() == is_floating
-            ]
-            if pairs:
-                self._average([old for old, _ in pairs], [new for _, new in pairs], None)
+        # `_average` takes tensors of one type at a time.
+        for is_floating in (True, False):
+            old = []
+            new = []
+            for average, value in zip(averages, latest, strict=True):
+                if average.is_floating_point() == is_floating:
+                    old.append(average.detach())
+                    new.append(value.detach())
+            if old:
+                self._average(old, new, None)
         self.n_averaged += 1
 
 

@@ -20,21 +20,24 @@ from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
 from train.system.user_errors import keyed
 
-# What a network has in common with one that begins with its weights.
+# Entries of its description that a network shares with a network that begins with
+# its weights.
 SHARED = ("classes", "size", "name", "depth", "width")
-# The fraction of the training images that validates, where nothing else says it.
+# Default fraction of the training images that validate.
 VALIDATION = 0.1
 
 
 @dataclass(frozen=True)
 class Initial:
-    """The network that `train.init_from` names.
+    """Network with whose weights a run begins. `train.init_from` names it.
 
     Attributes:
-        source: The file of a run's network, or the name of a classifier.
-        architecture: What rebuilds the network (see `train.networks.describe`).
-        weights: Its state dict.
-        network: The network itself, of which the run trains a copy. None if its name builds it.
+        source: File of the network of another run, or name of a classifier.
+        architecture: Arguments that build the network (see
+            `train.networks.describe`).
+        weights: State dict of the network.
+        network: The network itself. The run trains a copy. None if the name in the
+            architecture builds it.
     """
 
     source: Path
@@ -44,39 +47,40 @@ class Initial:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The names of the network's classes, in the order of its outputs."""
+        """Return the names of the classes, in the order of the outputs of the network."""
         return tuple(self.architecture["classes"])
 
     @property
     def size(self) -> int:
-        """The pixels per side of the images that the network takes."""
+        """Return the pixels per side of the images that the network takes."""
         return self.architecture["size"]
 
     @property
     def is_classifier(self) -> bool:
-        """Whether the network is, or began as, a classifier that was trained elsewhere."""
+        """Return whether the network is, or began as, a pretrained classifier of another library."""
         return CLASSIFIER in self.architecture
 
     @property
     def name(self) -> str:
-        """The name by which the network is built."""
+        """Return the name of the architecture."""
         return self.architecture["name"]
 
     @property
     def validation(self) -> dict[str, Any] | None:
-        """The record of the images that the network never learned from; None if unknown."""
+        """Return the record of the images that it did not learn from. None if it is unknown."""
         stored = self.architecture.get("validation")
         return stored if isinstance(stored, dict) else None
 
     def copy_to(self, network: nn.Module, description: Mapping[str, Any]) -> None:
-        """Give a network the initial network's weights and normalization.
+        """Copy the weights and the normalization to another network.
 
         Args:
-            network: The network whose weights are replaced.
-            description: What rebuilds that network.
+            network: Network whose weights are replaced.
+            description: Arguments that build this network.
 
         Raises:
-            InputError: The two differ in classes, image size or shape.
+            InputError: If the two networks differ in classes, image size or
+                architecture.
         """
         stored = {"name": WIDERESNET, **self.architecture}
         wanted = {"name": WIDERESNET, **description}
@@ -92,16 +96,17 @@ class Initial:
 
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
-    """Load the network that a run's settings begin with.
+    """Load the network with whose weights a run begins.
 
     Args:
-        settings: The settings of the run.
+        settings: Settings of the run. `train.init_from` names the network.
 
     Returns:
-        The network, or None for random weights.
+        The network. None if the run begins with random weights.
 
     Raises:
-        InputError: There is no such network, or `weights` is set for a run, which has its own.
+        InputError: If there is no such network, or if `weights` is set although
+            `train.init_from` names a run. A run has its own weights.
     """
     name = settings.train.init_from
     if not name:

@@ -157,9 +157,9 @@ class Trainer:
         self._random_state: dict[str, Any] = {}
         # The network that is selected, but not yet written.
         self._best: dict[str, Any] | None = None
-        # The time at which the last checkpoint was written, or the training began.
+        # Time of the last checkpoint or, before the first one, of the start.
         self._saved_at = time.perf_counter()
-        # The seconds that the last checkpoint took.
+        # Seconds that it took to write the last checkpoint.
         self._saving_took = 0.0
 
         self.model = model
@@ -171,7 +171,9 @@ class Trainer:
             model,
             settings.ema_decay,
             settings.soup,
-            keeps_latest=not labeled,  # Agreement is best without any training.
+            # Without labels, validation measures the agreement with the initial
+            # network, which is best before any training.
+            keeps_latest=not labeled,
         )
         self._build_step(labeled)
 
@@ -497,10 +499,10 @@ class Trainer:
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 
     def resume(self) -> None:
-        """Go on from the folder's newest whole checkpoint.
+        """Continue from the newest undamaged checkpoint in the folder.
 
         Raises:
-            InputError: The checkpoint does not belong to this run.
+            InputError: If the checkpoint does not belong to this run.
         """
         state, problem = checkpoint.load_newest(self.folder)
         try:
@@ -514,16 +516,17 @@ class Trainer:
         self._require_own_best()
         if problem:
             console.warning("%s: going on from the one before", problem)
-            # Otherwise it would take the place of the whole one.
+            # The next checkpoint keeps this file as previous.pt. A damaged file
+            # must not replace the whole one there.
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)
         steps = self._under_way.step if self._under_way else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
 
     def _require_own_best(self) -> None:
-        """Raise InputError where best.pt is missing, damaged or another run's.
+        """Raise InputError if best.pt is missing, damaged or of another run.
 
-        The scores at the end are those of its network, so this is checked before any training.
-        The file is first written at the end of an epoch.
+        At the end, the network in this file is scored. The check comes before
+        the training. The file exists from the end of the first epoch.
         """
         if not self.epoch:
             return
@@ -545,13 +548,13 @@ class Trainer:
             raise InputError(f"{fault}: {remedy}") from error
 
     def _require_own_architecture(self, state: Mapping[str, Any]) -> None:
-        """Raise ValueError where a checkpoint holds another network than this run's."""
+        """Raise ValueError if the network of a checkpoint is not the network of this run."""
         if self.architecture | state["architecture"] != self.architecture:
             raise ValueError("it has another architecture or other classes")
 
 
 def _require_equal_shares(settings: TrainSettings) -> None:
-    """Raise InputError where a batch cannot be divided among processes and parts."""
+    """Raise InputError if a batch cannot be divided equally among processes and parts."""
     processes = distributed.world_size()
     if settings.batch_size % (processes * settings.accumulate):
         divisor = f"{processes} processes × accumulate={settings.accumulate}"

@@ -58,7 +58,8 @@ def build_service(
         is_ranked = len(labels.unique()) > 1
     elif settings.augment.renders:
         numbers = _class_numbers(settings, data)
-        # The service and the loss know what is none of the other studied classes.
+        # Objects without a class have a complementary label: they belong to none
+        # of the studied classes.
         numbers[OTHER] = complementary_label(studied[0])
         scene = _build_scene(settings, data.size, device, phases)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)

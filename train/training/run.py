@@ -51,7 +51,7 @@ from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
 from train.training.renders import build_service
 
-# Images whose channels are measured where all of them are on disk.
+# Number of images whose channels are measured if the images are on disk.
 SAMPLED = 1000
 
 
@@ -126,7 +126,7 @@ class Run:
             self._write_config()
 
     def fit(self) -> None:
-        """Train to the last epoch. The network that the run begins with is scored before."""
+        """Score the initial network, if there is one, and train to the last epoch."""
         torch.set_num_threads(self._threads)  # Other runs may have been loaded since.
         console.info(
             "%d images, %d classes; %s, %s, threads: %d, processes: %d",
@@ -171,7 +171,7 @@ class Run:
             console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
 
     def _require_folder(self) -> DictConfig | None:
-        """Return the settings of the run that goes on in the folder; None if none does."""
+        """Return the settings of the run that is resumed in the folder. None for a new run."""
         resumes = self.settings.train.resume
         begins_anew = self.settings.overwrite and not resumes
         if begins_anew or not checkpoint.exists(self.folder):
@@ -183,7 +183,7 @@ class Run:
         return require_same_run(self.folder, self.settings)
 
     def _asked_threads(self, before: DictConfig | None) -> int | None:
-        """Return the threads that the settings ask for, or those of the run that goes on."""
+        """Return the number of threads in the settings, or of the run that is resumed."""
         asked = self.settings.train.threads
         if asked or before is None:
             return asked
@@ -289,7 +289,7 @@ class Run:
         }
 
     def _agreement(self, answers: Tensor) -> float:
-        """Return how often the selected network answers test images as the initial one did."""
+        """Return the fraction of test images that both networks predict as the same class."""
         agreement = self._scores["test/accuracy"]
         if self.data.labeled:
             answered = Split(self.data.test.images, answers).to(self.trainer.device)
@@ -417,7 +417,7 @@ def build_trainer(
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
-    """Return what the run's network is built from: its settings, or the initial classifier's."""
+    """Return the arguments that build the network: the settings, or the initial classifier."""
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:
         return shape
@@ -428,19 +428,20 @@ def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dic
 
 
 def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
-    """Say in words what the test accuracy is of.
+    """Name the images on which the test accuracy is measured.
 
     Args:
-        settings: The settings of a run.
-        data: Its data, in the classes of its network.
+        settings: Settings of a run.
+        data: Data set of the run, with the classes of its network.
 
     Returns:
-        The words, such as "the test images of cifar100".
+        Text such as "the test images of cifar100".
     """
     if not data.labeled:
         return f"the answers of {settings.train.init_from} to held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
-    # The labels of the test images are looked at once, later.
+    # The test images are read only at the end of the run, so the classes are
+    # counted in the training images.
     others = len(data.classes) - len(data.train.labels.unique())
     return f"{kind}, not of the network's {others} other classes" if others else kind
 

@@ -43,7 +43,8 @@ RENDERS = "*/[0-9][0-9][0-9][0-9]*_*.png"
 COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
 # Packages whose versions may change a pixel.
 PACKAGES = ("mitsuba", "numpy", "torch")
-# Half-width that a projector lights at the object, in world units.
+# A projector lights a square around the object with this half-width, in world
+# units.
 PROJECTOR_HALF_WIDTH = 2.6
 # Rows of the map of a built-in light.
 PROBE_HEIGHT = 64

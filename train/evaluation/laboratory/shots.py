@@ -35,7 +35,8 @@ PROJECTOR_DISTANCES = (5, 8)
 CAMERA_ELEVATIONS = (18, 60)
 # Largest Euler angles of the object's rotation about z, x and z in degrees.
 MAX_EULER_ANGLES = (360, 60, 360)
-# Largest azimuth of a wall off the direction that is opposite to the camera.
+# Largest angle between the wall and the direction away from the camera, in
+# degrees of azimuth.
 MAX_WALL_TURN = 30
 WALL_DISTANCES = (1.8, 3.5)
 
@@ -107,6 +108,7 @@ def draw_shots(
     for kind, index in product(kinds, range(per_kind)):
         rng = np.random.default_rng(stream_seed(settings.seed, "shot", kind, index))
         extra_rng = np.random.default_rng(stream_seed(settings.seed, "more", kind, index))
+        # Each shot has its own part of the range of log(brightness).
         position = (index + rng.uniform()) / per_kind
         brightness = dimmest * (brightest / dimmest) ** position
         pattern = PLAIN_PATTERN if kind in environments else kind

@@ -236,7 +236,7 @@ def score(
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of pools, which takes a while for the intervals."""
+    """Compute the metrics of each pool. Their bootstrap intervals take a while."""
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
 

@@ -211,7 +211,7 @@ def draw_roc(
         axes: The axes to draw on.
         scores: The scores of positives and negatives by name. A name has several pairs if it has
             several seeds.
-        label: The classes under study, as the axes name them.
+        label: Positive classes in words, for the title of an axis.
         styles: matplotlib's keywords for the lines of a name.
     """
     # A classifier that guesses has this line.
@@ -220,9 +220,11 @@ def draw_roc(
         axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
     for name, pairs in scores.items():
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
-        for number, pair in enumerate(pairs):
+        # The legend names the curve of the first seed only.
+        title: str | None = f"{name}: AUC {np.mean(areas):.3f}" if areas else None
+        for pair in pairs:
             rates, recalls, _ = roc_curve(*pair)
-            title = None if number else f"{name}: AUC {np.mean(areas):.3f}"
             axes.plot(rates, recalls, label=title, **styles.get(name, {}))
+            title = None
     axes.set(xlabel="false positive rate", ylabel=f"recall of {label}")
     axes.set(xlim=(-0.01, 1), ylim=(0, 1.01))
