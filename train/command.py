@@ -127,7 +127,7 @@ class Command:
 
     def run(self, config: DictConfig) -> None:
         """Run the command for a composed configuration. Hydra calls this method."""
-        # Without this, Hydra would add a line to the message of an error.
+        # Hydra would add a line to the message of an error.
         with self.one_line():
             self.work(config)
 

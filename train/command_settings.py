@@ -24,12 +24,16 @@ from renderer.settings import (
 )
 from train.settings import GROUPS, MAX_IMAGES, MAX_SEED, TIME_FOLDER, label_names
 
-ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")  # of an audit
-RENDERERS = ("reload", "mitsuba")  # of written adversaries
-LAMP_POWER = 2.0  # of the default lamps if only their positions are attacked
+# Default environment maps of an audit.
+ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
+# Renderers that can verify written adversaries.
+RENDERERS = ("reload", "mitsuba")
+# Power of the default lamps if only their positions are attacked.
+LAMP_POWER = 2.0
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
 OTHER_PATTERNS = ("rings", "window", "leaves", "text", "colors")
-SLIDES = "slides"  # pattern of the images that the user names
+# Name of the pattern that projects images of the user.
+SLIDES = "slides"
 PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
 LAB_MESHES = [
     *(f"solid:orange:{seed}" for seed in range(101, 107)),

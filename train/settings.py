@@ -26,11 +26,16 @@ from renderer.settings import (
     settings_from,
 )
 
-OTHER = "other"  # class of a hard negative that the classifier has no class for
-PHOTOGRAPHS = "photographs"  # sub-folder of a run with the scores on photographs without a name
-RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
+# Class of a hard negative for which the classifier has no class.
+OTHER = "other"
+# Sub-folder of a run with the scores on photographs, if evaluate.photos gives no names.
+PHOTOGRAPHS = "photographs"
+# Names that evaluate.photos cannot give. They name other sub-folders and scores of a run.
+RESERVED = ("renders", "test", "before")
 WIDERESNET = "wideresnet"
-ALL_BUT_LAST = "all_but_last"  # only the last layer learns, as in Kirichenko et al. 2023
+# Value of train.freeze with which the last layer alone is trained, as by Kirichenko
+# et al. (2023).
+ALL_BUT_LAST = "all_but_last"
 DATA_SETS = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 DATA_SETS_WITH_PATH = ("npz", "folder", "unlabelled")
 SCHEDULES = ("step", "cosine", "one_cycle")
@@ -39,12 +44,15 @@ TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 OPTIMIZERS = ("sgd", "adamw")
 COMPILE = ("auto", "always", "never")
-GROUPS = ("source", "mesh")  # columns of photos.csv by which scores are grouped
-MIN_SIZE = 5  # pixels per side, since images are padded by reflection
+# Columns of photos.csv by which scores are grouped.
+GROUPS = ("source", "mesh")
+# Pixels per side of the smallest images that can be padded by reflection.
+MIN_SIZE = 5
 MAX_IMAGES = 10**6
 MAX_WORKERS = 1024
 MAX_SEED = 2**63 - 1
-TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # named by the time at which a command starts
+# Folder that is named by the time at which a command starts.
+TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
 
 # Settings that say where and how a run is made. They do not decide its result,
 # and the names of the runs of a sweep leave them out.

@@ -393,23 +393,25 @@ def _read_into(
     folder: Path,
     photographs: Sequence[Photograph],
 ) -> list[Exception | None]:
-    """Read photographs into the rows of a tensor; return the error of each row, if any."""
-    size = images.shape[-1]
-
-    def read(row: int) -> Exception | None:
-        try:
-            # np.array copies, since Pillow's memory is read-only.
-            pixels = np.array(read_square(folder / photographs[row].path, size))
-        except Exception as error:  # Pillow's decoders raise almost anything at a broken file.
-            return error
-        images[row] = torch.from_numpy(pixels).permute(2, 0, 1)
-        return None
-
-    # Threads help, since Pillow releases the interpreter while it decodes and resizes.
+    """Read photographs into the rows of a tensor, and return the error of each row or None."""
+    paths = [folder / photograph.path for photograph in photographs]
+    # Pillow releases Python's lock while it decodes and resizes, so threads help.
     pool = ThreadPoolExecutor()
     try:
-        results = pool.map(read, range(len(photographs)))
-        shown = progress(photographs, "photographs")
-        return [error for _, error in zip(shown, results, strict=True)]
+        errors = pool.map(_read_image, images, paths)
+        return list(progress(errors, "photographs", len(paths)))
     finally:
-        pool.shutdown(cancel_futures=True)  # Ctrl-C does not wait for the other images.
+        # After Ctrl-C, the images that remain are not read.
+        pool.shutdown(cancel_futures=True)
+
+
+def _read_image(image: Tensor, path: Path) -> Exception | None:
+    """Read a photograph into a tensor (3, size, size), and return the error if it is broken."""
+    try:
+        # The memory of Pillow is read-only, and np.array copies it.
+        pixels = np.array(read_square(path, image.shape[-1]))
+    except Exception as error:
+        # The decoders of Pillow raise errors of almost any type.
+        return error
+    image.copy_(torch.from_numpy(pixels).permute(2, 0, 1))
+    return None

@@ -20,7 +20,7 @@ from train.report.plots import COLORS, LINES, MARKERS
 TRANSFERS = "transfer.jsonl"
 TABLE = "sweep.csv"
 FIGURE = "sweep.png"
-# How the images of each version of an adversary were made.
+# Origin of the images of each version of an adversary, in words.
 VERSIONS = {
     "float": "computed",
     "reload": "rendered again from the saved files",

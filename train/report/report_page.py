@@ -133,7 +133,7 @@ def _title(found: summary.Findings, arms: Methods) -> str:
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-# For each arm, the runs. For each run, its lines of metrics.jsonl, one per epoch.
+# Lines of metrics.jsonl of the epochs of each run of each arm.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
@@ -368,7 +368,7 @@ def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
         alt += f"predicted {row.before}, then {row.after}"
         path = attack.folder / f"example_{row.number:03d}.png"
         images[title] = plots.from_file(path, alt, SHEET_WIDTH)
-    # Without config.yaml, the page shows no configuration.
+    # The folder of an attack may have no config.yaml.
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack.folder.parent / CONFIG)

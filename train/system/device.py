@@ -70,7 +70,7 @@ def most_threads() -> int:
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
     except (OSError, ValueError):
-        # Without a quota, the file is missing or contains "max 100000".
+        # If there is no quota, the file is missing or contains "max 100000".
         permitted = bound
     return min(THREADS, bound, permitted)
 

@@ -121,9 +121,10 @@ class Interruption:
 
     def __init__(self) -> None:
         self._number: int | None = None
-        # What all processes had noted when they were asked the last time.
+        # Sum of the signals of all processes at the last call of `requested`, which
+        # may still be under way.
         self._asked: tuple[dist.Work, Tensor] | None = None
-        # The handlers before the block.
+        # Handlers of the signals before the block.
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> "Interruption":

@@ -171,7 +171,7 @@ class Trainer:
             model,
             settings.ema_decay,
             settings.soup,
-            # Without labels, validation measures the agreement with the initial
+            # Validation without labels measures the agreement with the initial
             # network, which is best before any training.
             keeps_latest=not labeled,
         )
@@ -482,7 +482,7 @@ class Trainer:
         for network in (self.model, self.initial, self.selected):
             if network:
                 network.precision = state["precision"]
-        # Without values, the next attack begins at the scene, which settings may change.
+        # If there are no values, the next attack begins at those of the scene.
         if "values" in state["service"]:
             self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])

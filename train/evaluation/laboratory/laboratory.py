@@ -48,7 +48,7 @@ PACKAGES = ("mitsuba", "numpy", "torch")
 PROJECTOR_HALF_WIDTH = 2.6
 # Rows of the map of a built-in light.
 PROBE_HEIGHT = 64
-# Half-width of the table and of the wall, in world units.
+# The table and the wall are squares of this half-width, in world units.
 PLANE_HALF_WIDTH = 100.0
 # Smallest cosine between the normals of a face and of a vertex at which the
 # shading is smooth. At a right-angled edge, the cosine is at most 0.82.

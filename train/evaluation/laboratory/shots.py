@@ -23,21 +23,24 @@ from train.evaluation.laboratory.lab_patterns import draw_color, draw_pattern
 FOV = 25.0
 # Pattern of which a shot is drawn before an environment replaces its lighting.
 PLAIN_PATTERN = "solid"
-# Half-width of the image at the object, in world units.
+# Range of the half-width of the image at the object, in world units.
 HALF_WIDTHS = (1.2, 1.9)
-# Largest coordinate of the object, in world units.
+# Range of the largest coordinate of the object, in world units.
 SCALES = (0.75, 1)
 # Height of the point that the projectors face, in units of the scale.
 CENTER_HEIGHT = 0.8
 # Largest offset of the point that the camera faces, per coordinate.
 MAX_AIM_OFFSET = 0.25
+# Range of the distance of a projector from the point that it faces, in world units.
 PROJECTOR_DISTANCES = (5, 8)
+# Range of the elevation of the camera in degrees.
 CAMERA_ELEVATIONS = (18, 60)
 # Largest Euler angles of the object's rotation about z, x and z in degrees.
 MAX_EULER_ANGLES = (360, 60, 360)
 # Largest angle between the wall and the direction away from the camera, in
 # degrees of azimuth.
 MAX_WALL_TURN = 30
+# Range of the distance of a wall from the object, in world units.
 WALL_DISTANCES = (1.8, 3.5)
 
 

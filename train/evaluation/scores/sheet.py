@@ -166,7 +166,8 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
             name is empty.
         label: Classes under study, as axes name them.
     """
-    from matplotlib.figure import Figure  # half a second
+    # This import takes half a second.
+    from matplotlib.figure import Figure
 
     known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
     has_overall = all(map(len, overall))
