@@ -237,7 +237,7 @@ def test_nothing_is_written_to_a_folder_without_a_run(call, capsys, tmp_path, ov
 @pytest.mark.parametrize(
     ("function", "has_trained"),
     [
-        ("train.commands.experiment.load_data", False),
+        ("train.training.run.load_data", False),
         ("train.training.run.evaluate_photographs", True),
     ],
 )

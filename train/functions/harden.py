@@ -26,7 +26,6 @@ from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
 from train.command import read_settings
-from train.data.load import load_data
 from train.functions.meshes import MeshItem, as_mappings, studied_classes
 from train.report.report_page import report_of
 from train.report.results import require_new_run
@@ -41,7 +40,8 @@ from train.settings import (
     solid_name,
 )
 from train.system.folders import folder_or_temporary
-from train.system.user_errors import renamed
+from train.system.user_errors import keyed
+from train.training.data import load_data
 from train.training.initial import initial_of
 from train.training.run import Run
 
@@ -196,8 +196,8 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
     """Train a copy of a classifier in the folder of the run, and return its network."""
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
-    with renamed(**{"data.path": "photographs"}):
-        data = load_data(settings, initial.size)
+    with keyed(**{"data.path": "photographs"}):
+        data = load_data(settings, initial)
     run = Run(settings, data, folder, initial)
     run.load()
     run.fit()

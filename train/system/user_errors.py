@@ -43,8 +43,10 @@ def keyed(whole: str = "", /, **keys: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        # "light" for an argument such as "light.turbidity" or "light[0]".
-        argument = error.argument.partition(".")[0].partition("[")[0]
+        argument = error.argument
+        if argument not in keys:
+            # "light" for an argument such as "light.turbidity" or "light[0]".
+            argument = argument.partition(".")[0].partition("[")[0]
         if argument in keys:
             key = keys[argument]
             message = key + str(error).removeprefix(argument)
