@@ -1,4 +1,8 @@
-"""What tests attack: a small scene of the mesh that has few faces and no symmetry, and linear classifiers."""
+"""Fixtures that several tests of augment use: a small scene, classifiers, and an attack.
+
+The scene shows an icosahedron, which has few faces. It is turned and scaled, so that it has no
+symmetry. The classifiers are linear, so that their gradients are known.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -26,21 +30,30 @@ FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth 
 
 @pytest.fixture(scope="session")
 def stone() -> Mesh:
-    """A turned icosahedron whose faces have a color each."""
-    solid, rng = trimesh.creation.icosahedron(), np.random.default_rng(0)
-    vertices = solid.vertices @ Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() * [1.0, 0.9, 0.8]
-    corners = Mesh.plain(vertices, solid.faces)
-    corners.corner_colors[:] = rng.uniform(0.3, 0.8, (len(solid.faces), 1, 3))
-    return corners
+    """Return a turned icosahedron whose faces have different colors."""
+    solid = trimesh.creation.icosahedron()
+    turn = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
+    vertices = solid.vertices @ turn * [1.0, 0.9, 0.8]
+    mesh = Mesh.plain(vertices, solid.faces)
+    draws = np.random.default_rng(0)
+    mesh.corner_colors[:] = draws.uniform(0.3, 0.8, (len(solid.faces), 1, 3))
+    return mesh
 
 
 @pytest.fixture(scope="session")
 def make_scene(stone) -> Callable[..., Scene]:
-    """Three examples of two views each, in light and before backgrounds that nothing clamps. Keywords change that."""
+    """Return a function that builds a scene of three examples with two views each.
+
+    No pixel of the scene is clamped. Keywords change the scene.
+    """
 
     def build(
         mesh: Mesh = stone,
-        cameras: Sequence[Sequence[OrthographicCamera]] = ((FRONT, SIDE), (SIDE, BACK), (FRONT, BACK)),
+        cameras: Sequence[Sequence[OrthographicCamera]] = (
+            (FRONT, SIDE),
+            (SIDE, BACK),
+            (FRONT, BACK),
+        ),
         backgrounds: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
         encoding: str = "linear",
@@ -48,43 +61,55 @@ def make_scene(stone) -> Callable[..., Scene]:
         size: int = SIZE,
     ) -> Scene:
         draws = torch.Generator().manual_seed(0)
-        light = ambient(torch.full((3,), 0.22)) + 0.03 * torch.randn(49, 3, generator=draws)
+        even_light = ambient(torch.full((3,), 0.22))
+        light = even_light + 0.03 * torch.randn(49, 3, generator=draws)
         if backgrounds is None:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
         settings = ImageSettings(size, samples=2, encoding=encoding)
-        rows = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
+        examples = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
         objects = [SceneObject("", mesh, albedo_scale)]
-        return Scene(objects, rows, backgrounds, light.to(dtype), settings, choose("numpy"))
+        return Scene(objects, examples, backgrounds, light.to(dtype), settings, choose("numpy"))
 
     return build
 
 
 @pytest.fixture(scope="session")
 def make_linear() -> Callable[..., nn.Module]:
-    """A classifier whose logits are linear in the image: random weights (classes, 3·size²), a bias for class 0."""
+    """Return a function that builds a classifier whose logits are linear in the image.
+
+    Its weights (classes, 3 · size²) are random, and only class 0 has a bias.
+    """
 
     def build(
-        classes: int, bias: float = 0.0, size: int = SIZE, dtype: torch.dtype = torch.float64, seed: int = 1
+        classes: int,
+        bias: float = 0.0,
+        size: int = SIZE,
+        dtype: torch.dtype = torch.float64,
+        seed: int = 1,
     ) -> nn.Module:
-        network = nn.Sequential(nn.Flatten(), nn.Linear(3 * size**2, classes)).to(dtype)
+        linear = nn.Linear(3 * size**2, classes)
         draws = torch.Generator().manual_seed(seed)
         with torch.no_grad():
-            network[1].weight.copy_(torch.randn(network[1].weight.shape, generator=draws) / size)
-            network[1].bias.zero_()[0] = bias
-        return network
+            linear.weight.copy_(torch.randn(linear.weight.shape, generator=draws) / size)
+            linear.bias.zero_()
+            linear.bias[0] = bias
+        return nn.Sequential(nn.Flatten(), linear).to(dtype)
 
     return build
 
 
+def logits_of_mean_color(images: Tensor) -> Tensor:
+    """Return the logits (N, 4) of red, green, blue and dark images."""
+    means = 30 * images.mean((2, 3))
+    darkness = 12 - means.sum(1, keepdim=True)
+    return torch.cat([means, darkness], dim=1)
+
+
 @pytest.fixture(scope="session")
 def by_color() -> augment.Classifier:
-    """Orange is red, lime is green, sky is blue, night is dark."""
-
-    def mean_color(images: Tensor) -> Tensor:
-        means = 30 * images.mean((2, 3))
-        return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
-
-    return augment.Classifier(mean_color, 8, ("orange", "lime", "sky", "night"), "by_color")
+    """Return a classifier that takes red for orange, green for lime, and blue for sky."""
+    classes = ("orange", "lime", "sky", "night")
+    return augment.Classifier(logits_of_mean_color, 8, classes, "by_color")
 
 
 STEPS = {
@@ -96,44 +121,68 @@ STEPS = {
     "pixels": augment.StepSettings("linf", 0.3, "sign", 0.05),
 }
 OTHER_STEPS = augment.StepSettings(step_size=0.1)
-LOCAL = {
-    "projector": augment.ProjectorSettings(pixels=4, pattern=0.2),
-    "lamps": augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5),
+LAMPS = augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5)
+PROJECTOR = augment.ProjectorSettings(pixels=4, pattern=0.2)
+# The local light that the attack on each of these parameters requires in the scene.
+REQUIRED_LIGHTS = {
+    "projector": {"projector": PROJECTOR},
+    "lamps": {"lamps": LAMPS},
+    "positions": {"lamps": LAMPS},
 }
 
 
 @pytest.fixture(scope="session")
 def attacked(by_color) -> Callable[..., augment.AttackResult]:
-    """An attack on parameters by name, or with their steps, of an orange of 80 faces, until the classifier errs.
+    """Return a function that attacks an image of an orange of 80 faces.
 
-    scene: keywords of `build_scene`. Further keywords are those of `AttackSettings`.
+    The attack ends when the classifier errs.
     """
     ball = trimesh.creation.icosphere(subdivisions=1)
     orange = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.1))
 
-    def run(parameters, scene=None, classifier=by_color, target=None, seed=0, force=False, **settings):
-        steps = (
-            parameters
-            if isinstance(parameters, dict)
-            else {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}
-        )
-        local = {light: LOCAL[light] for name in steps if (light := name.replace("positions", "lamps")) in LOCAL}
-        shown = augment.build_scene(
-            [(orange, classifier.classes[0])],
-            classifier.size,
-            **{
-                "rasterizer": "numpy",
-                "degree": 6,
-                "width": 2.4,
-                "normals": "flat",
-                "silhouettes": "pose" in steps,
-                **local,
-                **(scene or {}),
-            },
-        )
-        defaults = {"allow_negative": True, "margin": 0.0, "rounded": False, "sensor_noise": 0.0}
-        defaults["max_steps"] = 8
-        settings = augment.AttackSettings(**steps, **defaults | settings)
-        return augment.attack(classifier, shown, target, settings, seed=seed, force=force)
+    def run(
+        parameters: str | dict,
+        scene: dict | None = None,
+        classifier: augment.Classifier = by_color,
+        target: str | list[str] | None = None,
+        seed: int = 0,
+        force: bool = False,
+        **settings,
+    ) -> augment.AttackResult:
+        """Attack the orange.
+
+        Args:
+            parameters: Names joined by "+", or settings by name.
+            scene: Keywords of `build_scene`.
+            classifier: What is attacked.
+            target: Class to reach; None for any error.
+            seed: Of the random draws.
+            force: Whether images that are misclassified from the start are attacked.
+            **settings: Keywords of `AttackSettings`.
+        """
+        steps = parameters
+        if isinstance(parameters, str):
+            steps = {name: STEPS.get(name, OTHER_STEPS) for name in parameters.split("+")}
+        options = {
+            "rasterizer": "numpy",
+            "degree": 6,
+            "width": 2.4,
+            "normals": "flat",
+            "silhouettes": "pose" in steps,
+        }
+        for name in steps:
+            options |= REQUIRED_LIGHTS.get(name, {})
+        options |= scene or {}
+        label = classifier.classes[0]
+        shown = augment.build_scene([(orange, label)], classifier.size, **options)
+        choices = {
+            "allow_negative": True,
+            "margin": 0.0,
+            "rounded": False,
+            "sensor_noise": 0.0,
+            "max_steps": 8,
+        }
+        chosen = augment.AttackSettings(**steps, **choices | settings)
+        return augment.attack(classifier, shown, target, chosen, seed=seed, force=force)
 
     return run

@@ -1,9 +1,8 @@
-"""Parameters of an attack, alone and side by side: gradients, norm-balls, domains, draws, and descents on them."""
+"""Attack parameters have exact gradients, stay in their balls, and end where theory says."""
 
-import itertools
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -35,40 +34,74 @@ from renderer.settings import TURBIDITY
 from renderer.transport.operators import build_operators
 
 EPS = torch.finfo(torch.float64).eps
-SKY = (51.6, 22.9, 3.0)
+SKY = (51.6, 22.9, 3.0)  # zenith and azimuth in degrees, turbidity
 EVERY = torch.arange(3)
-ZERO = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)  # no effect on diffuse surfaces
 FRONT, SIDE, BACK = orbit_cameras(3, 2.2)
-ONE_VIEW, TWO_VIEWS = [[FRONT], [SIDE], [BACK]], [[FRONT, SIDE], [SIDE, BACK], [FRONT, BACK]]
+ONE_VIEW = [[FRONT], [SIDE], [BACK]]
+TWO_VIEWS = [[FRONT, SIDE], [SIDE, BACK], [FRONT, BACK]]
+
+# Mask of the coefficients (49,) that do not reach diffuse surfaces.
+IS_WITHOUT_EFFECT = torch.ones(49, dtype=torch.bool)
+IS_WITHOUT_EFFECT[nonzero_coefficients(6)] = False
+
+VALUE_COUNTS = {
+    "lighting": 49 * 3,
+    "skylight": 3,
+    "geometry": 12 * 3,
+    "albedo": 20 * 3,
+    "pixels": 2 * 3 * 6 * 6,
+}
 
 
 def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
-    """Zenith and azimuth in degrees, turbidity."""
+    """Return the settings of a sky whose start is (zenith, azimuth, turbidity)."""
     zenith, azimuth, turbidity = start
     return SkylightSettings(zenith=zenith, azimuth=azimuth, turbidity=turbidity, **steps)
 
 
 def split(problem: AttackProblem, values: Tensor) -> list[Tensor]:
+    """Return the values of each parameter."""
     return [part for _, part in problem.by_parameter(values)]
 
 
 def problem_of(scene: Scene, **settings: StepSettings) -> AttackProblem:
-    return AttackProblem(scene, [make_parameter(name, scene, steps) for name, steps in settings.items()])
+    """Return an attack problem on the named parameters with these settings."""
+    parameters = [make_parameter(name, scene, steps) for name, steps in settings.items()]
+    return AttackProblem(scene, parameters)
 
 
 def free(*names: str) -> dict[str, StepSettings]:
-    """Without a radius."""
-    return {name: sky_at(SKY) if name == "skylight" else StepSettings() for name in names}
+    """Return settings without a radius for each named parameter."""
+    settings = {name: StepSettings() for name in names}
+    if "skylight" in names:
+        settings["skylight"] = sky_at(SKY)
+    return settings
 
 
-def attack(model: nn.Module, problem: AttackProblem, goal: Goal, steps: int, **settings) -> DescentResult:
-    return descend(model, problem, goal, AttackSettings(max_steps=steps, **{"margin": 0.0, **settings}))
+def attack(
+    model: nn.Module,
+    problem: AttackProblem,
+    goal: Goal,
+    steps: int,
+) -> DescentResult:
+    """Run the descent until the classifier errs, without a margin."""
+    return descend(model, problem, goal, AttackSettings(max_steps=steps, margin=0.0))
 
 
 def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
-    """Every image's class 0 falls and another, or none in particular, rises."""
-    classes = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
-    return Goal(classes, None if target is None else classes + target)
+    """Return the goal that class 0 of every image falls and the target, if any, rises."""
+    source = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
+    if target is None:
+        return Goal(source, None)
+    return Goal(source, torch.full_like(source, target))
+
+
+def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
+    """Draw normal numbers in float64."""
+    return torch.randn(*shape, generator=draws, dtype=torch.float64)
+
+
+# --------------------------------------------------------------- settings and starting points
 
 
 @pytest.mark.parametrize("name", PARAMETER_NAMES)
@@ -85,72 +118,114 @@ def test_a_parameter_that_does_not_exist_is_refused():
         parameter_class("settings")
 
 
-@pytest.mark.parametrize("wrong", [{"zenith": 120}, {"zenith": -1}, {"turbidity": 1}, {"azimuth": math.nan}])
-def test_a_sky_outside_of_the_model_is_refused_when_its_settings_are_made_in_their_units(wrong):
-    [(name, value)] = wrong.items()
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("zenith", 120), ("zenith", -1), ("turbidity", 1), ("azimuth", math.nan)],
+)
+def test_a_sky_outside_of_the_model_is_refused_when_its_settings_are_made(name, value):
     with pytest.raises(InputError, match=f"{name}={value}"):
-        SkylightSettings(**wrong)
+        SkylightSettings(**{name: value})
+
+
+def test_the_angles_of_a_sky_are_in_degrees():
     assert SkylightSettings(zenith=90, azimuth=-180, turbidity=10).zenith == 90
 
 
 def test_each_example_gets_a_sky_of_its_own_mean_luminance(make_scene):
     scene = make_scene()
-    lights = scene.lights * torch.tensor([1.0, 0.3, 2.5]).double()[:, None, None]
-    scene = scene.changed(lights=lights)
-    problem = problem_of(scene, skylight=sky_at(SKY))
+    factors = torch.tensor([1.0, 0.3, 2.5]).double()
+    lights = scene.lights * factors[:, None, None]
+    problem = problem_of(scene.changed(lights=lights), skylight=sky_at(SKY))
     skies = problem.conditions(problem.start, EVERY).light
     for sky, light in zip(skies, lights, strict=True):
         assert mean_luminance(sky) == pytest.approx(mean_luminance(light), rel=1e-9)
 
 
-SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", VALUE_COUNTS)
+def test_a_parameter_has_the_dtype_of_the_light(make_scene, name, dtype):
+    (parameter,) = problem_of(make_scene(dtype=dtype), **free(name)).parameters
+    assert parameter.start.shape == (3, VALUE_COUNTS[name])
+    assert parameter.start.dtype == dtype
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", SIZES)
-def test_a_parameter_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scene, name, dtype):
-    """Under a sky the light is another, of the same mean luminance."""
+@pytest.mark.parametrize("name", [name for name in VALUE_COUNTS if name != "skylight"])
+def test_a_parameter_starts_at_the_scene_as_it_is(make_scene, name, dtype):
     scene = make_scene(dtype=dtype)
     (parameter,) = problem_of(scene, **free(name)).parameters
-    assert parameter.start.shape == (3, SIZES[name]) and parameter.start.dtype == dtype
     conditions = parameter.apply(parameter.start, scene.conditions(EVERY), EVERY)
-    if name == "skylight":
-        light = conditions.light[0]
-        assert mean_luminance(light) == pytest.approx(mean_luminance(scene.lights[0]), rel=1e-6)
-        expected = coefficients(*SKY)
-        expected *= mean_luminance(scene.lights[0]) / mean_luminance(expected)
-        assert (light - expected).norm() < 1e-6 * expected.norm()
-    else:
-        images = scene.render(scene.conditions(EVERY), EVERY)
-        rounding = 64 * torch.finfo(dtype).eps
-        torch.testing.assert_close(scene.render(conditions, EVERY), images, rtol=0, atol=rounding)
+    expected = scene.render(scene.conditions(EVERY), EVERY)
+    rounding = 64 * torch.finfo(dtype).eps
+    torch.testing.assert_close(scene.render(conditions, EVERY), expected, rtol=0, atol=rounding)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_attack_on_the_sky_starts_at_the_sky_of_its_settings(make_scene, dtype):
+    scene = make_scene(dtype=dtype)
+    (parameter,) = problem_of(scene, skylight=sky_at(SKY)).parameters
+    conditions = parameter.apply(parameter.start, scene.conditions(EVERY), EVERY)
+    light = conditions.light[0]
+    luminance = mean_luminance(scene.lights[0])
+    assert mean_luminance(light) == pytest.approx(luminance, rel=1e-6)
+    expected = coefficients(*SKY)
+    expected *= luminance / mean_luminance(expected)
+    assert (light - expected).norm() < 1e-6 * expected.norm()
+
+
+# --------------------------------------------------------------- gradients
 
 
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
-    """Whatever moves, each camera sees what it saw first, which is what the analytic gradient assumes."""
-    build, seen = reshading.build_fragments, {}
+    """Show each camera what it saw first, which is what the analytic gradient assumes."""
+    build = reshading.build_fragments
+    seen_by_camera = {}
 
-    def still(vertices, faces, cameras, settings, rasterizer, closed=False):
-        if cameras[0] not in seen:
-            seen[cameras[0]] = build(vertices, faces, cameras, settings, rasterizer, closed=closed)
-        return seen[cameras[0]]
+    def build_once(vertices, faces, cameras, settings, rasterizer, closed=False):
+        camera = cameras[0]
+        if camera not in seen_by_camera:
+            fragments = build(vertices, faces, cameras, settings, rasterizer, closed=closed)
+            seen_by_camera[camera] = fragments
+        return seen_by_camera[camera]
 
-    monkeypatch.setattr(reshading, "build_fragments", still)
+    monkeypatch.setattr(reshading, "build_fragments", build_once)
 
 
 MIXTURE = ["skylight", "geometry", "albedo", "pixels"]
-COMBINATIONS = [*([name] for name in SIZES), ["lighting", "geometry", "albedo"], MIXTURE]
+SINGLE = [[name] for name in VALUE_COUNTS]
+COMBINATIONS = [*SINGLE, ["lighting", "geometry", "albedo"], MIXTURE]
 
 
-def differences(function: Callable[[Tensor], Tensor], at: Tensor, directions: Tensor) -> Tensor:
-    """(N,) derivatives at a point (D,) in directions (N, D), by Richardson from central differences at h and 2h."""
+def derivatives(
+    function: Callable[[Tensor], Tensor],
+    at: Tensor,
+    directions: Tensor,
+) -> Tensor:
+    """Return the derivatives of a function at a point in several directions.
+
+    Central differences at h and 2h are combined by Richardson's rule. The error is a fourth
+    power of h, times a fifth derivative, and rounding divided by h.
+
+    Args:
+        function: Maps points (N, D) to numbers (N,).
+        at: The point, shape (D,).
+        directions: The directions, shape (N, D).
+    """
 
     def central(h: float) -> Tensor:
-        ahead, behind = function(torch.cat([at + h * directions, at - h * directions])).split(len(directions))
+        ahead = function(at + h * directions)
+        behind = function(at - h * directions)
         return (ahead - behind) / (2 * h)
 
     return (4 * central(2e-4) - central(4e-4)) / 3
+
+
+def gradient_at(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the gradient (D,) by autograd of a function of points (N, D)."""
+    values = at[None].clone().requires_grad_(True)
+    (gradient,) = torch.autograd.grad(function(values).sum(), values)
+    return gradient[0]
 
 
 @pytest.mark.parametrize(
@@ -159,179 +234,276 @@ def differences(function: Callable[[Tensor], Tensor], at: Tensor, directions: Te
     ids=lambda value: value if isinstance(value, str) else "+".join(value),
 )
 def test_gradients_are_central_differences(make_scene, fixed_visibility, names, encoding):
-    """Away from the start, with two views that share the values; by each value, or along eight mixtures of several
-    parameters'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
-    scene, draws = make_scene(encoding=encoding), torch.Generator().manual_seed(2)
-    scene.render(replace(scene.conditions(EVERY), albedo=scene.lights.new_zeros(3, 20, 3)), EVERY)  # is what is seen
+    """Two views share the values. Several parameters are compared along eight directions."""
+    scene = make_scene(encoding=encoding)
+    # The first render decides what `fixed_visibility` keeps in sight.
+    unchanged_albedo = scene.lights.new_zeros(3, 20, 3)
+    scene.render(replace(scene.conditions(EVERY), albedo=unchanged_albedo), EVERY)
     problem = problem_of(scene, **free(*names))
+    draws = torch.Generator().manual_seed(2)
     at = problem.start[1] + 0.02 * torch.randn(problem.start.shape[1], generator=draws)
-    weights = torch.randn(2, 3, 6, 6, generator=draws, dtype=torch.float64)
-    directions = torch.eye(len(at)) if len(names) == 1 else torch.randn(8, len(at), generator=draws)
-    directions = directions.double()
+    weights = float64_noise(2, 3, 6, 6, draws=draws)
+    directions = torch.eye(len(at), dtype=torch.float64)
+    if len(names) > 1:
+        directions = float64_noise(8, len(at), draws=draws)
 
-    def weighed(values: Tensor) -> Tensor:
-        return (problem.render(values, torch.ones(len(values), dtype=torch.int64)) * weights).sum((1, 2, 3, 4))
+    def weighted_sum(values: Tensor) -> Tensor:
+        example = torch.ones(len(values), dtype=torch.int64)
+        return (problem.render(values, example) * weights).sum((1, 2, 3, 4))
 
-    values = at[None].clone().requires_grad_(True)
-    (gradient,) = torch.autograd.grad(weighed(values), values)
-    expected = differences(weighed, at, directions)
-    assert expected.abs().max() > 0.01
-    torch.testing.assert_close(directions @ gradient[0], expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
+    expected = derivatives(weighted_sum, at, directions)
+    largest = float(expected.abs().max())
+    assert largest > 0.01
+    found = directions @ gradient_at(weighted_sum, at)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9 * largest)
 
 
-def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_rendered_anew(make_scene):
-    """No outline moves then, and so every change is one of normals: the one test in which nothing stays fixed."""
-    scene, draws = make_scene(), torch.Generator().manual_seed(2)
+@pytest.mark.parametrize("view", [0, 1])
+def test_vertices_that_move_along_the_view_have_the_gradient_of_new_images(make_scene, view):
+    """No outline moves then, so that every change is one of normals and nothing is kept fixed."""
+    scene = make_scene()
     (geometry,) = problem_of(scene, **free("geometry")).parameters
-    weights = torch.randn(3, 6, 6, generator=draws, dtype=torch.float64)
-    for view, camera in enumerate(scene.cameras[1]):
-        away = torch.from_numpy(camera.axes()[2])
-        directions = torch.kron(torch.eye(12, dtype=torch.float64), away)
+    weights = float64_noise(3, 6, 6, draws=torch.Generator().manual_seed(2))
+    camera = scene.cameras[1][view]
+    away = torch.from_numpy(camera.axes()[2])
+    directions = torch.kron(torch.eye(12, dtype=torch.float64), away)
 
-        def weighed(values: Tensor, view: int = view) -> Tensor:
-            example = torch.ones(len(values), dtype=torch.int64)
-            images = scene.render(geometry.apply(values, scene.conditions(example), example), example)
-            return (images[:, view] * weights).sum((1, 2, 3))
+    def weighted_sum(values: Tensor) -> Tensor:
+        example = torch.ones(len(values), dtype=torch.int64)
+        conditions = geometry.apply(values, scene.conditions(example), example)
+        images = scene.render(conditions, example)[:, view]
+        return (images * weights).sum((1, 2, 3))
 
-        values = geometry.start[:1].clone().requires_grad_(True)
-        (gradient,) = torch.autograd.grad(weighed(values), values)
-        expected = differences(weighed, geometry.start[0], directions)
-        assert expected.abs().max() > 0.01
-        torch.testing.assert_close(directions @ gradient[0], expected, rtol=0, atol=1e-9)
+    expected = derivatives(weighted_sum, geometry.start[0], directions)
+    assert expected.abs().max() > 0.01
+    found = directions @ gradient_at(weighted_sum, geometry.start[0])
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+
+
+# --------------------------------------------------------------- pixels
 
 
 @pytest.mark.parametrize("gray", [0.0, 0.5, 1.0])
 def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
-    """x + ε sign(∂CE/∂x), clamped, with ∂CE/∂x = Σ (p_c - [c = y]) W_c; before black and white backgrounds too."""
-    scene, epsilon = make_scene(backgrounds=torch.full((3, 3, 6, 6), gray)), 8 / 255
-    model, before = make_linear(4), scene.render(scene.conditions(EVERY), EVERY)
+    """The gradient of the cross entropy is the sum of (p_c - [c = y]) W_c over the classes c."""
+    scene = make_scene(backgrounds=torch.full((3, 3, 6, 6), gray))
+    epsilon = 8 / 255
+    model = make_linear(4)
+    before = scene.render(scene.conditions(EVERY), EVERY)
     logits = model(before.flatten(0, 1)).detach()
-    truth = logits.argmax(1)
-    slopes = (logits.softmax(1) - torch.nn.functional.one_hot(truth, 4)) @ model[1].weight.detach()
+    labels = logits.argmax(1)
+    residuals = logits.softmax(1) - torch.nn.functional.one_hot(labels, 4)
+    gradient = residuals @ model[1].weight.detach()
+    expected = (before + epsilon * gradient.sign().view_as(before)).clamp(0, 1)
+
     problem = problem_of(scene, pixels=StepSettings("linf", epsilon, "sign", epsilon))
-    images = attack(model, problem, Goal(truth.view(3, 2)), steps=1).images
-    expected = (before + epsilon * slopes.sign().view_as(before)).clamp(0, 1)
+    images = attack(model, problem, Goal(labels.view(3, 2)), steps=1).images
     assert torch.equal(images, expected)
-    assert ((images - before).abs() > 0.99 * epsilon).double().mean() > 0.4
+    is_changed = (images - before).abs() > 0.99 * epsilon
+    assert is_changed.double().mean() > 0.4
 
 
-def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball(make_scene, make_linear):
-    """Every restart ends in the corner that lies downhill of the middle, not of where it began."""
-    scene = make_scene()
-    problem = problem_of(scene, pixels=StepSettings("linf", 0.03, "sign", 0.01))
+def test_descent_from_a_random_start_stays_in_the_ball_about_the_scene(make_scene, make_linear):
+    """Every example ends in the corner downhill of the ball's center, not of its own start."""
+    problem = problem_of(make_scene(), pixels=StepSettings("linf", 0.03, "sign", 0.01))
     problem.start = problem.sample(torch.Generator().manual_seed(0))
-    assert problem.start.abs().max() <= 0.03 and problem.start.std() > 0.01
+    assert problem.start.abs().max() <= 0.03
+    assert problem.start.std() > 0.01
     model = make_linear(2, bias=50.0)
     values = attack(model, problem, towards(problem), steps=7).values
-    downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign()
-    assert torch.equal(values, (0.03 * downhill).expand(3, 2, -1).flatten(1))
+    weight = model[1].weight.detach()
+    downhill = (weight[1] - weight[0]).sign()
+    corner = (0.03 * downhill).expand(3, 2, -1).flatten(1)
+    assert torch.equal(values, corner)
 
 
-def ringing(scene: Scene) -> Scene:
-    """The same in the light of a sun, which dips below zero where harmonics of degree 6 cut it short."""
-    sun = directional(torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64), 0.3 * torch.ones(3, dtype=torch.float64))
-    return scene.changed(lights=sun)
+# --------------------------------------------------------------- nonnegative light
 
 
-@pytest.mark.parametrize("norm", ["linf", "l2"])
-def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
-    """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
-    into it, the center, and the light's own way there and beyond."""
-    scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
-    light = make_parameter("lighting", scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
+def in_sunlight(scene: Scene) -> Scene:
+    """Return a copy of the scene in the light of a sun.
+
+    Harmonics of degree 6 cut this light off, so that it is negative in places.
+    """
+    direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    color = torch.full((3,), 0.3, dtype=torch.float64)
+    return scene.changed(lights=directional(direction, color))
+
+
+def norms(offsets: Tensor, norm: str) -> Tensor:
+    """Return the norms (N,) of rows (N, D)."""
+    return offsets.norm(dim=1) if norm == "l2" else offsets.abs().amax(1)
+
+
+@pytest.mark.parametrize(("norm", "radius"), [("linf", 0.05), ("l2", 0.4)])
+def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm, radius):
+    """The point q nearest to v has (v - q)·(p - q) ≤ 0 for all points p of the convex set.
+
+    Here p are other lights of the set: projected ones, the center, and a point on the way.
+    """
+    scene = in_sunlight(make_scene())
+    draws = torch.Generator().manual_seed(3)
+    light = make_parameter("lighting", scene, StepSettings(norm, radius), nonnegative=True)
     assert not torch.equal(light.start, scene.lights.flatten(1))
-    values = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
-    nearest, offset = light.project(values, EVERY), light.start - values
-    reach = nearest - light.start
-    assert torch.all((reach.norm(dim=1) if norm == "l2" else reach.abs().amax(1)) <= light.settings.radius * (1 + 1e-9))
+    values = light.start + 0.1 * float64_noise(3, 147, draws=draws)
+    nearest = light.project(values, EVERY)
+    offset = nearest - light.start
+    assert (norms(offset, norm) <= radius * (1 + 1e-9)).all()
     torch.testing.assert_close(light.domain(nearest), nearest, rtol=0, atol=TOLERANCE)
-    others = [light.sample(draws) for _ in range(2)] + [light.start, light.start + reach / 2]
+
+    distance = (light.start - values).norm(dim=1)
+    others = [light.sample(draws), light.sample(draws), light.start, light.start + offset / 2]
     for other in others:
         product = ((values - nearest) * (other - nearest)).sum(1)
-        assert (product <= 1e-3 * offset.norm(dim=1) * (other - nearest).norm(dim=1)).all()
-    torch.testing.assert_close(light.project(nearest, EVERY), nearest, rtol=0, atol=10 * TOLERANCE)
+        assert (product <= 1e-3 * distance * (other - nearest).norm(dim=1)).all()
+    again = light.project(nearest, EVERY)
+    torch.testing.assert_close(again, nearest, rtol=0, atol=10 * TOLERANCE)
 
 
-def test_a_descent_in_nonnegative_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
-    """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
-    scene = ringing(make_scene())
-    light = make_parameter("lighting", scene, StepSettings(step_size=0.5), nonnegative=True)
-    problem = AttackProblem(scene, [light])
+def test_an_attack_in_nonnegative_light_ends_in_light_that_a_map_holds(
+    make_scene,
+    make_linear,
+    tmp_path,
+):
+    """The map's format, RGBE, has no negative numbers. The map gives the images back."""
+    scene = in_sunlight(make_scene())
+    settings = StepSettings(step_size=0.5)
+    problem = AttackProblem(
+        scene,
+        [make_parameter("lighting", scene, settings, nonnegative=True)],
+    )
     result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=4)
     assert (result.values - problem.start).norm(dim=1).min() > 1
-    written = []
-    for light in result.values:
-        write_map(tmp_path / "light.hdr", to_map(light.unflatten(0, (49, 3)), 128))
-        written.append(project(read_map(tmp_path / "light.hdr"), DEGREE))
-    read = scene.render(Conditions(torch.stack(written)), EVERY)
-    torch.testing.assert_close(read, result.images, rtol=0, atol=0.5 / 255)
+    lights = []
+    for values in result.values:
+        write_map(tmp_path / "light.hdr", to_map(values.unflatten(0, (49, 3)), 128))
+        lights.append(project(read_map(tmp_path / "light.hdr"), DEGREE))
+    images = scene.render(Conditions(torch.stack(lights)), EVERY)
+    torch.testing.assert_close(images, result.images, rtol=0, atol=0.5 / 255)
 
 
+# --------------------------------------------------------------- skies
+
+SKY_STARTS = st.tuples(st.floats(*ZENITH), st.floats(-400, 400), st.floats(*TURBIDITY))
 FINITE = st.floats(-50, 50)
+RADII = st.one_of(st.none(), st.floats(0, 4))
+# Values of a sky are zenith and azimuth in radians, and a quarter of the turbidity.
+LOWEST_SKY = [0.0, -99.0, 0.5]
+HIGHEST_SKY = [math.pi / 2, 99.0, 2.5]
+SKY_UNITS = [math.degrees(1), math.degrees(1), 4.0]
+
+
+@pytest.fixture(scope="session")
+def scenes_by_dtype(make_scene) -> dict[torch.dtype, Scene]:
+    """Return a scene for each floating-point type."""
+    return {dtype: make_scene(dtype=dtype) for dtype in (torch.float32, torch.float64)}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("norm", ["linf", "l2"])
-def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
-    """Wherever it starts, the horizon and the clearest and haziest air included; the sky model refuses any other."""
-    scene = make_scene(dtype=dtype)
-    rounding = 64 * torch.finfo(dtype).eps
+@given(start=SKY_STARTS, values=st.tuples(FINITE, FINITE, FINITE), radius=RADII)
+@settings(max_examples=30, deadline=None)
+def test_a_sky_stays_in_its_domain_and_its_ball(
+    scenes_by_dtype,
+    norm,
+    dtype,
+    start,
+    values,
+    radius,
+):
+    """Starts include the horizon and the clearest and haziest air of the sky model."""
+    scene = scenes_by_dtype[dtype]
+    sky = make_parameter("skylight", scene, sky_at(start, norm=norm, radius=radius))
+    problem = AttackProblem(scene, [sky])
+    center = sky.start[0]
+    lowest = torch.tensor(LOWEST_SKY, dtype=dtype)
+    highest = torch.tensor(HIGHEST_SKY, dtype=dtype)
+    units = torch.tensor(SKY_UNITS, dtype=dtype)
+    torch.testing.assert_close(center * units, torch.tensor(start, dtype=dtype))
 
-    @given(
-        start=st.tuples(st.floats(*ZENITH), st.floats(-400, 400), st.floats(*TURBIDITY)),
-        values=st.tuples(FINITE, FINITE, FINITE),
-        radius=st.one_of(st.none(), st.floats(0, 4)),
-    )
-    @settings(max_examples=30, deadline=None)
-    def check(start: tuple, values: tuple, radius: float | None):
-        sky = make_parameter("skylight", scene, sky_at(start, norm=norm, radius=radius))
-        problem = AttackProblem(scene, [sky])
-        center, ends = sky.start[0], torch.tensor([[0, -99, 0.5], [math.pi / 2, 99, 2.5]], dtype=dtype)
-        units = torch.tensor([math.degrees(1), math.degrees(1), 4], dtype=dtype)
-        torch.testing.assert_close(center * units, torch.tensor(start, dtype=dtype))
-        anywhere = torch.tensor(values, dtype=dtype).expand(3, 3)
-        projected = problem.project(anywhere, EVERY)
-        assert projected.dtype == dtype
-        moved = [projected] if radius is None else [projected, problem.sample(torch.Generator().manual_seed(0))]
-        for sky_values in moved:
-            assert sky.apply(sky_values, scene.conditions(EVERY), EVERY).light.isfinite().all()
-            assert (ends[0] <= sky_values).all() and (sky_values <= ends[1]).all()
-            offset = (sky_values - center).abs()
-            reach = offset.norm(dim=1) if norm == "l2" else offset.amax(1)
-            assert radius is None or (reach <= radius + rounding * 20).all()
-        if norm == "linf":  # boxes both, so that the nearest point of what they share is that of each axis
-            low, high = (ends[0], ends[1]) if radius is None else (center - radius, center + radius)
-            nearest = anywhere.clamp(torch.maximum(low, ends[0]), torch.minimum(high, ends[1]))
-            torch.testing.assert_close(projected, nearest, rtol=0, atol=0)
+    projected = problem.project(torch.tensor(values, dtype=dtype).expand(3, 3), EVERY)
+    assert projected.dtype == dtype
+    candidates = [projected]
+    if radius is not None:
+        candidates.append(problem.sample(torch.Generator().manual_seed(0)))
+    for candidate in candidates:
+        conditions = sky.apply(candidate, scene.conditions(EVERY), EVERY)
+        assert conditions.light.isfinite().all()
+        assert (lowest <= candidate).all()
+        assert (candidate <= highest).all()
+        if radius is not None:
+            rounding = 20 * 64 * torch.finfo(dtype).eps
+            assert (norms(candidate - center, norm) <= radius + rounding).all()
 
-    check()
+
+@given(start=SKY_STARTS, values=st.tuples(FINITE, FINITE, FINITE), radius=RADII)
+@settings(max_examples=30, deadline=None)
+def test_in_a_cube_the_nearest_sky_is_that_of_each_axis(scenes_by_dtype, start, values, radius):
+    scene = scenes_by_dtype[torch.float64]
+    sky = make_parameter("skylight", scene, sky_at(start, norm="linf", radius=radius))
+    low = torch.tensor(LOWEST_SKY, dtype=torch.float64)
+    high = torch.tensor(HIGHEST_SKY, dtype=torch.float64)
+    if radius is not None:
+        low = torch.maximum(low, sky.start[0] - radius)
+        high = torch.minimum(high, sky.start[0] + radius)
+    anywhere = torch.tensor(values, dtype=torch.float64).expand(3, 3)
+    nearest = sky.project(anywhere, EVERY)
+    torch.testing.assert_close(nearest, anywhere.clamp(low, high), rtol=0, atol=0)
+
+
+# --------------------------------------------------------------- light and a linear classifier
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:
-    """(E, 49, 3) the derivative by the light of weight · images, summed over views, from the operators alone."""
+    """Return the derivative (E, 49, 3) of weight · images by the light.
+
+    The images of all views are summed. The derivative comes from the operators alone.
+    """
     slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
+    coefficients = nonzero_coefficients(6)
     for row, cameras in enumerate(scene.cameras):
-        operators = build_operators(scene.mesh(row), cameras, scene.settings, scene.rasterizer, dtype=weight.dtype)
+        mesh = scene.mesh(row)
+        operators = build_operators(
+            mesh,
+            cameras,
+            scene.settings,
+            scene.rasterizer,
+            dtype=weight.dtype,
+        )
         for operator in operators:
-            transfer, seen = operator.transfer * operator.albedo[:, None], weight.view(3, -1)[:, operator.pixels]
-            slope[row, nonzero_coefficients(6)] += torch.einsum("ckp,cp->kc", transfer, seen)
+            transfer = operator.transfer * operator.albedo[:, None]  # (3, K, P)
+            pixel_weights = weight.view(3, -1)[:, operator.pixels]  # (3, P)
+            slope[row, coefficients] += torch.einsum("ckp,cp->kc", transfer, pixel_weights)
     return slope
 
 
-CASES = {  # cameras, classes, bias of the first class, the one to increase
-    "one view, untargeted": (ONE_VIEW, 2, 4.0, None),
-    "one view": (ONE_VIEW, 5, 50.0, 1),
-    "two views": (TWO_VIEWS, 5, 50.0, 1),
+@dataclass
+class LinearCase:
+    """A linear classifier and what it looks at."""
+
+    cameras: list
+    classes: int
+    bias: float
+    """Logit of the first class, which is the right one, that no pixel changes."""
+    target: int | None
+
+
+LINEAR_CASES = {
+    "one view, untargeted": LinearCase(ONE_VIEW, 2, 4.0, None),
+    "one view": LinearCase(ONE_VIEW, 5, 50.0, 1),
+    "two views": LinearCase(TWO_VIEWS, 5, 50.0, 1),
 }
+BALL_RADIUS = 0.01
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", LINEAR_CASES.values(), ids=LINEAR_CASES)
 @pytest.mark.parametrize(
     ("norm", "step", "step_size", "steps"),
     [
         ("linf", "sign", 0.004, 3),
-        ("linf", "unit", 1e5, 1),  # so far that the smallest derivative reaches its face of the cube too
+        # This step is so long that the smallest derivative reaches its face of the cube too.
+        ("linf", "unit", 1e5, 1),
         ("l2", "unit", 0.004, 3),
         ("l2", "raw", 1e5, 1),
     ],
@@ -339,98 +511,157 @@ CASES = {  # cameras, classes, bias of the first class, the one to increase
 def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
     make_scene, make_linear, norm, step, step_size, steps, case, dtype
 ):
-    """Where no pixel clamps, the margin is s · U + const, summed over the views that share the light. The ball's lowest
-    point is its corner U₀ - r sign(s), to the bit, or U₀ - r s/|s|, to rounding; coefficients without effect stay."""
-    radius, (cameras, classes, bias, target) = 0.01, CASES[case]
-    scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(classes, bias, dtype=dtype)
-    problem = problem_of(scene, lighting=StepSettings(norm, radius, step, step_size))
-    result = attack(model, problem, towards(problem, target=target), steps)
-    assert not result.success.any() and result.steps.eq(steps).all()
-    assert result.images.min() > 0 and result.images.max() < 1
+    """Without clamped pixels the margin is s · U + constant, with the light U and a slope s.
 
-    weight, eps = (model[1].weight[0] - model[1].weight[1]).detach().double(), torch.finfo(dtype).eps
-    slope, start = light_slope(scene, weight), scene.lights
+    The lowest point of the ball about U₀ is its corner U₀ - r sign(s), or U₀ - r s / |s|.
+    """
+    scene = make_scene(cameras=case.cameras, dtype=dtype)
+    model = make_linear(case.classes, case.bias, dtype=dtype)
+    problem = problem_of(scene, lighting=StepSettings(norm, BALL_RADIUS, step, step_size))
+    result = attack(model, problem, towards(problem, case.target), steps)
+    assert not result.success.any()
+    assert result.steps.eq(steps).all()
+    assert result.images.min() > 0
+    assert result.images.max() < 1
+
+    eps = torch.finfo(dtype).eps
+    weight = model[1].weight.detach()
+    slope = light_slope(scene, (weight[0] - weight[1]).double())
+    has_effect = slope.abs() > 100 * eps  # Rounding of the sum of 108 products is smaller.
+    assert torch.equal(has_effect, ~IS_WITHOUT_EFFECT[:, None].expand(3, 49, 3))
     lights = result.values.unflatten(1, (49, 3))
-    nonzero = slope.abs() > 100 * eps  # a sum of 108 products of each view has a sign then
-    assert torch.equal(nonzero, ~ZERO[:, None].expand(3, 49, 3))
-    assert torch.equal(lights[:, ZERO], start[:, ZERO])
+    start = scene.lights
+    assert torch.equal(lights[:, IS_WITHOUT_EFFECT], start[:, IS_WITHOUT_EFFECT])
     if norm == "linf":
-        corner = torch.where(slope > 0, start - radius, start + radius)
-        assert torch.equal(lights[nonzero], corner[nonzero])
-        reach = slope.abs().sum((1, 2))
+        corner = torch.where(slope > 0, start - BALL_RADIUS, start + BALL_RADIUS)
+        assert torch.equal(lights[has_effect], corner[has_effect])
+        dual_norm = slope.abs().sum((1, 2))
     else:
-        reach = slope.flatten(1).norm(dim=1)
-        surface = start - radius * slope / reach[:, None, None]
-        torch.testing.assert_close(lights.double(), surface, rtol=0, atol=16 * eps)
-    if target is not None:  # then the cost is the margin itself
-        lowest = result.cost_before.double() - radius * reach
-        torch.testing.assert_close(result.cost.double(), lowest, rtol=0, atol=4 * 50 * eps)
+        dual_norm = slope.flatten(1).norm(dim=1)
+        lowest_light = start - BALL_RADIUS * slope / dual_norm[:, None, None]
+        torch.testing.assert_close(lights.double(), lowest_light, rtol=0, atol=16 * eps)
+    if case.target is not None:  # The cost is the margin itself.
+        lowest_cost = result.cost_before.double() - BALL_RADIUS * dual_norm
+        torch.testing.assert_close(result.cost.double(), lowest_cost, rtol=0, atol=200 * eps)
 
 
-def test_a_deep_optical_illusion_shows_each_view_another_class(make_scene, make_linear):
-    """One light per example makes two views of one thing two other things, in each way; it ends only when both are."""
-    targets = torch.tensor([[1, 2], [2, 1], [1, 1]])
-    scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=torch.full((3, 3, 6, 6), 0.5))
-    model, goal = make_linear(3, seed=6), Goal(torch.zeros_like(targets), targets)
-    problem = problem_of(scene, lighting=StepSettings())
+TARGETS_OF_VIEWS = torch.tensor([[1, 2], [2, 1], [1, 1]])
+
+
+@pytest.fixture
+def illusion(make_scene, make_linear) -> tuple[nn.Module, AttackProblem, Goal]:
+    """Return a model, a problem of two views per example, and a target for each view."""
+    gray = torch.full((3, 3, 6, 6), 0.5)
+    scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=gray)
+    goal = Goal(torch.zeros_like(TARGETS_OF_VIEWS), TARGETS_OF_VIEWS)
+    return make_linear(3, seed=6), problem_of(scene, lighting=StepSettings()), goal
+
+
+def test_one_light_shows_each_view_as_another_class(illusion):
+    model, problem, goal = illusion
     result = attack(model, problem, goal, steps=30)
-    assert result.success.all() and not result.success_before.any()
-    assert torch.equal(model(result.images.flatten(0, 1)).argmax(1).view(3, 2), targets)
-    assert torch.equal(result.predicted, targets)
-    last = result.steps.argmax()
-    before = attack(model, problem, goal, steps=int(result.steps[last]) - 1)
-    assert not before.success[last] and (before.predicted[last] == targets[last]).sum() < 2
+    assert result.success.all()
+    assert not result.success_before.any()
+    predicted = model(result.images.flatten(0, 1)).argmax(1).view(3, 2)
+    assert torch.equal(predicted, TARGETS_OF_VIEWS)
+    assert torch.equal(result.predicted, TARGETS_OF_VIEWS)
 
 
-def mixed(scene: Scene, **steps) -> AttackProblem:
-    """Light, shape, paint and pixels at once, with balls of their own."""
-    balls = {"lighting": ("linf", 0.02), "geometry": ("l2", 0.03), "albedo": ("l2", 0.1), "pixels": ("linf", 0.01)}
-    return problem_of(scene, **{name: StepSettings(*ball, **steps) for name, ball in balls.items()})
+def test_an_attack_on_two_views_ends_only_when_both_have_their_class(illusion):
+    model, problem, goal = illusion
+    steps = attack(model, problem, goal, steps=30).steps
+    slowest = steps.argmax()
+    before = attack(model, problem, goal, steps=int(steps[slowest]) - 1)
+    assert not before.success[slowest]
+    is_reached = before.predicted[slowest] == TARGETS_OF_VIEWS[slowest]
+    assert is_reached.sum() < 2
 
 
-def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
-    """A unit step is one of each parameter. Examples may have starts of their own."""
-    problem, draws = mixed(make_scene()), torch.Generator().manual_seed(0)
-    for size, parameter in enumerate(problem.parameters, start=1):
+# --------------------------------------------------------------- several parameters
+
+
+@pytest.fixture
+def mixed(make_scene) -> AttackProblem:
+    """Return a problem on light, shape, albedo and pixels, each with a ball of its own."""
+    return problem_of(
+        make_scene(),
+        lighting=StepSettings("linf", 0.02),
+        geometry=StepSettings("l2", 0.03),
+        albedo=StepSettings("l2", 0.1),
+        pixels=StepSettings("linf", 0.01),
+    )
+
+
+def test_each_parameter_is_projected_as_if_it_were_alone(mixed):
+    chosen = torch.tensor([2, 0])
+    draws = torch.Generator().manual_seed(0)
+    values = mixed.start + 0.1 * torch.randn(mixed.start.shape, generator=draws)
+    before = split(mixed, values[chosen])
+    after = split(mixed, mixed.project(values[chosen], chosen))
+    for parameter, part, projected in zip(mixed.parameters, before, after, strict=True):
+        center = parameter.start[chosen]
+        expected = norm_ball.project(parameter.settings, part, center)
+        assert torch.equal(projected, expected)
+
+
+def test_each_parameter_steps_by_its_own_gradient_from_starts_of_each_example(mixed):
+    for size, parameter in enumerate(mixed.parameters, start=1):
         parameter.settings = replace(parameter.settings, step_size=size)
         parameter.start = parameter.start + torch.arange(3)[:, None]
-    values = problem.start + 0.1 * torch.randn(problem.start.shape, generator=draws)
-    parts = split(problem, values)
     chosen = torch.tensor([2, 0])
-    length = torch.tensor([[0.5], [2.0]]).double()
-    projected = split(problem, problem.project(values[chosen], chosen))
-    stepped = split(problem, problem.take_step(values[chosen], values[chosen], chosen, length))
-    for parameter, part, nearest, after in zip(problem.parameters, parts, projected, stepped, strict=True):
-        part, center = part[chosen], parameter.start[chosen]
-        assert torch.equal(nearest, norm_ball.project(parameter.settings, part, center))
+    lengths = torch.tensor([[0.5], [2.0]]).double()
+    draws = torch.Generator().manual_seed(0)
+    values = mixed.start + 0.1 * torch.randn(mixed.start.shape, generator=draws)
+    gradient = values[chosen]
+    before = split(mixed, values[chosen])
+    after = split(mixed, mixed.take_step(values[chosen], gradient, chosen, lengths))
+    for parameter, part, stepped in zip(mixed.parameters, before, after, strict=True):
         unit = part / part.norm(dim=1, keepdim=True)
-        expected = norm_ball.project(parameter.settings, part - length * parameter.settings.step_size * unit, center)
-        torch.testing.assert_close(after, expected, rtol=0, atol=64 * EPS)
+        moved = part - lengths * parameter.settings.step_size * unit
+        expected = norm_ball.project(parameter.settings, moved, parameter.start[chosen])
+        torch.testing.assert_close(stepped, expected, rtol=0, atol=64 * EPS)
 
 
 def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
-    scene, draws = make_scene(), torch.Generator().manual_seed(0)
-    problem = problem_of(scene, **free("lighting", "geometry"), albedo=StepSettings("l2", 0.1))
-    values = problem.start + torch.randn(problem.start.shape, generator=draws) * torch.tensor([[0.1], [0.0], [0.3]])
-    drawn = problem.sample(torch.Generator().manual_seed(1), values)
-    pairs = zip(split(problem, values - problem.start), split(problem, drawn - problem.start), strict=True)
-    for there, here in itertools.islice(pairs, 2):
-        torch.testing.assert_close(here.norm(dim=1), there.norm(dim=1), rtol=0, atol=64 * EPS)
-        assert there[0].norm() > 0 and (here[0] != there[0]).all() and not here[1].any()
-    assert (split(problem, drawn)[2].norm(dim=1) <= 0.1 + 1e-6).all()
+    albedo = StepSettings("l2", 0.1)
+    problem = problem_of(make_scene(), **free("lighting", "geometry"), albedo=albedo)
+    draws = torch.Generator().manual_seed(0)
+    lengths = torch.tensor([[0.1], [0.0], [0.3]])
+    offsets = lengths * torch.randn(problem.start.shape, generator=draws)
+    drawn = problem.sample(torch.Generator().manual_seed(1), problem.start + offsets)
+    attacked_parts = split(problem, offsets.double())
+    drawn_parts = split(problem, drawn - problem.start)
+    for index in (0, 1):  # light and shape, which have no radius
+        attacked = attacked_parts[index]
+        random = drawn_parts[index]
+        expected = attacked.norm(dim=1)
+        torch.testing.assert_close(random.norm(dim=1), expected, rtol=0, atol=64 * EPS)
+        assert expected[0] > 0
+        assert (random[0] != attacked[0]).all()
+        assert not random[1].any()
+    assert (drawn_parts[2].norm(dim=1) <= 0.1 + 1e-6).all()
 
 
-def test_an_attack_on_light_rasterizes_a_camera_once_and_one_on_shape_every_view_and_step(
-    make_scene, make_linear, rasterized
+# --------------------------------------------------------------- rasterization
+
+
+@pytest.mark.parametrize(
+    ("names", "steps", "expected"),
+    [
+        (("lighting", "pixels"), 9, [3]),  # All cameras at once.
+        (("lighting", "albedo"), 9, [1, 1, 1]),  # Each camera once.
+        (("lighting", "geometry"), 4, [1] * 5 * 6),  # Six views of five images.
+    ],
+)
+def test_only_an_attack_on_shape_rasterizes_in_every_step(
+    make_scene,
+    make_linear,
+    rasterized,
+    names,
+    steps,
+    expected,
 ):
-    model = make_linear(3, bias=50.0)
-    scene = make_scene(cameras=TWO_VIEWS)
-    problem = problem_of(scene, **free("lighting", "pixels"))
-    attack(model, problem, towards(problem), steps=9)
-    assert rasterized == [3]
-    problem = problem_of(scene, **free("lighting", "albedo"))
-    attack(model, problem, towards(problem), steps=9)
-    assert rasterized == [3] + [1] * 3
-    problem = problem_of(scene, **free("lighting", "geometry"))
-    result = attack(model, problem, towards(problem), steps=4)
-    assert result.steps.tolist() == [4, 4, 4] and rasterized == [3] + [1] * (3 + 5 * 6)
+    problem = problem_of(make_scene(cameras=TWO_VIEWS), **free(*names))
+    result = attack(make_linear(3, bias=50.0), problem, towards(problem), steps)
+    assert result.steps.tolist() == [steps] * 3
+    assert rasterized == expected
