@@ -31,8 +31,8 @@ from augment.settings import PropSettings as PropSettings
 from augment.settings import RandomLightSettings as RandomLightSettings
 from augment.settings import RendererSettings as RendererSettings
 from augment.settings import SceneSettings as SceneSettings
+from augment.settings import SpecularLayerSettings as SpecularLayerSettings
 from augment.settings import TrainingAttackSettings as TrainingAttackSettings
 from augment.settings import VariationSettings as VariationSettings
-from augment.settings import VarnishSettings as VarnishSettings
 
 __version__: str

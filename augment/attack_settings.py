@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from augment.parameter_settings import PARAMETER_NAMES, ParameterSettings
-from renderer.errors import FACTOR, InputError
+from renderer.errors import MAX_SCALE, InputError
 from renderer.settings import Settings, setting
 
 MAX_NOISE = 255.0  # steps of 8 bits, the whole range of values
@@ -39,7 +39,7 @@ class AttackSettings(ParameterSettings):
     """What an attack changes, and how it descends.
 
     The defaults are careful: the lighting stays physically possible, and a success survives the
-    noise of a camera and its 8 bits. The paper has allow_negative=True, margin=0, rounded=False
+    noise of a camera and its 8 bits. The paper has allow_negative=True, margin=0, quantized=False
     and sensor_noise=0.
     """
 
@@ -49,7 +49,9 @@ class AttackSettings(ParameterSettings):
         minimum=0,
         maximum=10**6,
     )
-    shorten: bool = setting(False, "Take back a step that did not lower the cost, and try half of it (backtracking).")
+    backtracking: bool = setting(
+        False, "Take back a step that did not lower the cost, and try half of it (backtracking)."
+    )
     restarts: int = setting(
         0,
         "Number of additional starts, drawn from the norm-balls, for examples without success.",
@@ -60,9 +62,9 @@ class AttackSettings(ParameterSettings):
         2.0,
         "Stop an example when the adversarial logit leads by this margin in every view.",
         minimum=0,
-        maximum=FACTOR,
+        maximum=MAX_SCALE,
     )
-    rounded: bool = setting(True, "Round the images to 8 bits before the classifier.")
+    quantized: bool = setting(True, "Round the images to 8 bits before the classifier.")
     sensor_noise: float = setting(
         1.0,
         "Standard deviation of the noise of a camera. A success counts only if it survives three "
@@ -77,9 +79,11 @@ class AttackSettings(ParameterSettings):
         "times the range of these leads. null is 2 if the pose or the material is attacked, "
         "and otherwise 0.",
         minimum=0,
-        maximum=FACTOR,
+        maximum=MAX_SCALE,
     )
-    eot: EOTSettings = setting(EOTSettings, "Attack the mean over random transformations of the image.")
+    eot: EOTSettings = setting(
+        EOTSettings, "Attack the mean over random transformations of the image."
+    )
     allow_negative: bool = setting(
         False,
         "Permit lighting with negative radiance, as in the paper. Otherwise the lighting stays physically possible.",

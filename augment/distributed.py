@@ -34,7 +34,7 @@ def shard(total: int, rank: int, world_size: int) -> Tensor:
     return torch.arange(rank % total, total, world_size)
 
 
-def merged(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tensor:
+def all_gather_rows(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tensor:
     """Gather the rows of all examples from all processes.
 
     Args:

@@ -44,7 +44,7 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """Compute by how much an attack's goal is reached.
+    """Compute by how much an attack's criterion is reached.
 
     Args:
         logits: The logits, shape (..., classes).
@@ -53,7 +53,7 @@ def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> T
 
     Returns:
         The lead of the target's logit over all others. Without a target, the lead of the best
-        other class over the source. It is negative if the goal is not reached. Shape (...).
+        other class over the source. It is negative if the criterion is not reached. Shape (...).
     """
     wanted = torch.full_like(source, NO_CLASS) if target is None else target
     has_no_target = wanted == NO_CLASS
@@ -113,7 +113,9 @@ def label_loss(
     for index in absent:
         logits_of_others[:, index] = -torch.inf
     complementary = logits.logsumexp(1) - logits_of_others.logsumexp(1)
-    cross_entropy = F.cross_entropy(logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing)
+    cross_entropy = F.cross_entropy(
+        logits, classes[:, 0], reduction="none", label_smoothing=label_smoothing
+    )
     return torch.where(labels < 0, complementary, cross_entropy)
 
 
@@ -155,7 +157,7 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
     return losses.sum() / is_pair.sum().clamp(min=1)
 
 
-def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
+def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     """Compute how far the predictions of a network are from another's.
 
     This is the Kullback–Leibler divergence Σ q log(q / p) of the probabilities p of the network
@@ -169,11 +171,13 @@ def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     Returns:
         The divergence of each image, shape (N,).
     """
-    terms = F.kl_div(logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True)
+    terms = F.kl_div(
+        logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True
+    )
     return terms.sum(1)
 
 
-def is_right(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
+def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
     """Say which predictions agree with the labels.
 
     Args:

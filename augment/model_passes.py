@@ -90,7 +90,7 @@ def eval_mode(model: nn.Module) -> Iterator[None]:
 
 
 @contextmanager
-def as_found(model: nn.Module) -> Iterator[None]:
+def frozen_eval_mode(model: nn.Module) -> Iterator[None]:
     """Set a model to eval mode, without gradients of its parameters, inside a `with` block.
 
     The mode of each module, `requires_grad` of each parameter and the state of

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
 from renderer.settings import TURBIDITY, Settings, setting
 
 NORMS = ("linf", "l2")
@@ -21,11 +21,11 @@ MAX_JOINT_ANGLE = 180.0  # degrees
 
 # Names of the parts of a pose, without the joints, in the order of their values.
 # The fields of `PoseSettings` with these names are their units.
-POSE = ("rotation", "shift", "scale", "view", "distance")
+POSE_PARTS = ("rotation", "shift", "scale", "view", "distance")
 
 # Names of the four values of an attack on the material, in their order. The
 # fields of `MaterialSettings` with these names are their units.
-MATERIAL = ("roughness", "metallic", "strength", "hue")
+MATERIAL_PARTS = ("roughness", "metallic", "specular_factor", "hue")
 
 
 @dataclass
@@ -50,14 +50,16 @@ class StepSettings(Settings):
         None,
         "Radius of the norm-ball. null permits all values.",
         minimum=0,
-        maximum=FACTOR,
+        maximum=MAX_SCALE,
     )
     step: str = setting(
         "unit",
         "Direction of a step: the gradient with L2 norm 1 (unit), the gradient (raw) or its sign.",
         choices=STEPS,
     )
-    step_size: float = setting(0.05, "Factor of each step.", minimum=1 / LARGEST, maximum=FACTOR)
+    step_size: float = setting(
+        0.05, "Factor of each step.", minimum=1 / MAX_MAGNITUDE, maximum=MAX_SCALE
+    )
 
 
 @dataclass
@@ -69,13 +71,15 @@ class SkylightSettings(StepSettings):
     degrees and by 0.4. Step sizes have the same units.
     """
 
-    zenith: float = setting(45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90)
+    zenith: float = setting(
+        45.0, "Zenith angle of the sun at the start.", "degrees", minimum=0, maximum=90
+    )
     azimuth: float = setting(
         0.0,
         "Azimuth of the sun at the start.",
         "degrees",
-        minimum=-FACTOR,
-        maximum=FACTOR,
+        minimum=-MAX_SCALE,
+        maximum=MAX_SCALE,
     )
     turbidity: float = setting(
         3.0,
@@ -149,8 +153,8 @@ class PoseSettings(StepSettings):
                 raise InputError(message, "joints")
             argument = "joints" if name == "joints" else f"joints.{name}"
             require_range(argument, degrees, 0, MAX_JOINT_ANGLE)
-        if not any([*limits.values(), *(getattr(self, name) for name in POSE)]):
-            parts = f"{', '.join(POSE)} and joints"
+        if not any([*limits.values(), *(getattr(self, name) for name in POSE_PARTS)]):
+            parts = f"{', '.join(POSE_PARTS)} and joints"
             raise InputError(f"{parts} are all 0: nothing of the pose would change")
 
 
@@ -177,7 +181,7 @@ class MaterialSettings(StepSettings):
         minimum=0,
         maximum=1,
     )
-    strength: float = setting(
+    specular_factor: float = setting(
         1.0,
         "Change of the strength of the highlight for a value of 1. "
         "The strength is the specularFactor of KHR_materials_specular.",
@@ -194,8 +198,8 @@ class MaterialSettings(StepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not any(getattr(self, name) for name in MATERIAL):
-            message = f"{', '.join(MATERIAL)} are all 0: nothing of the material would change"
+        if not any(getattr(self, name) for name in MATERIAL_PARTS):
+            message = f"{', '.join(MATERIAL_PARTS)} are all 0: nothing of the material would change"
             raise InputError(message)
 
 

@@ -100,7 +100,7 @@ class _Progress:
 
 
 @contextmanager
-def announced(description: str) -> Iterator[None]:
+def progress_message(description: str) -> Iterator[None]:
     """Show `progress` of a `with` block.
 
     Args:

@@ -18,15 +18,15 @@ from torch.utils.data import Dataset
 
 from augment import distributed
 from augment.attacks.attack import fooled_in_views, logits_of, warn_of_changed_light
-from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.descent import Criterion, DescentResult, descend
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers.adapter import NetworkCall
-from augment.losses import NO_CLASS, is_right, label_loss, require_known
-from augment.model_passes import as_found
+from augment.losses import NO_CLASS, is_correct, label_loss, require_known
+from augment.model_passes import frozen_eval_mode
 from augment.progress import Phases
 from augment.random_streams import generator, stream_seed
-from augment.scene.build import Shown, build_scene
+from augment.scene.build import MeshSource, build_scene
 from augment.scene.conditions import Conditions
 from augment.scene.degree import with_needed_degree
 from augment.scene.scene import Scene
@@ -133,14 +133,14 @@ class AugmentationService:
         labels: Labels, shape (E,), int64, as in `augment.losses`.
         seed: Seed of all random numbers.
         phases: Timer of the attacks.
-        studied: The positive classes. Examples of all other labels, which are
+        positive_classes: The positive classes. Examples of all other labels, which are
             hard negatives, are attacked towards one of these classes in turn.
             Without positive classes, every attack leads away from the class of
             its example.
         rank: Index of this process among those that train together. Each
             process attacks its share of the examples and gets all renders.
         world_size: Number of these processes.
-        images: Images of `arm="folder"`, shape (E, 3, H, W), uint8.
+        images: Images of `mode="folder"`, shape (E, 3, H, W), uint8.
     """
 
     settings: AugmentationSettings
@@ -148,7 +148,7 @@ class AugmentationService:
     labels: Tensor
     seed: int
     phases: Phases
-    studied: Sequence[int] = ()
+    positive_classes: Sequence[int] = ()
     rank: int = 0
     world_size: int = 1
     images: Tensor | None = None
@@ -167,15 +167,17 @@ class AugmentationService:
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
         require_kind("phases", self.phases, Phases, "augment.progress.Phases()")
         self.labels = as_integers("labels", self.labels)
-        self.studied = [int(label) for label in as_integers("studied", self.studied)]
+        self.positive_classes = [
+            int(label) for label in as_integers("positive_classes", self.positive_classes)
+        ]
         if self.scene is not None and self.labels.shape != (len(self.scene),):
             fault = f"labels has shape {tuple(self.labels.shape)}"
             raise InputError(f"{fault}: give one of each of {len(self.scene)} examples")
         if self.images is not None:
             self.images = self._checked_images(self.images)
-        source = "images" if self.settings.arm == "folder" else "scene"
+        source = "images" if self.settings.mode == "folder" else "scene"
         if self.settings.renders and getattr(self, source) is None:
-            fault = f"{source} is None, and arm={self.settings.arm} needs examples"
+            fault = f"{source} is None, and mode={self.settings.mode} needs examples"
             raise InputError(f"{fault}: give a scene, or images for a folder")
         attack = self.settings.attack
         if self.scene is not None and self.settings.renders:
@@ -195,7 +197,7 @@ class AugmentationService:
     @classmethod
     def from_meshes(
         cls,
-        meshes: Sequence[tuple[Shown, int]],
+        meshes: Sequence[tuple[MeshSource, int]],
         size: int,
         settings: AugmentationSettings | None = None,
         *,
@@ -233,7 +235,9 @@ class AugmentationService:
         expected = "augment.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_seed("seed", seed)
-        expected = "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
+        expected = (
+            "a list of pairs of a mesh and the index of its class, such as ('solid:orange', 53)"
+        )
         members = as_list("meshes", meshes, tuple | list, expected)
         for index, member in enumerate(members):
             if len(member) != 2:
@@ -286,7 +290,7 @@ class AugmentationService:
             return self._from_folder(model, self.images, number)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
-        is_random = self.settings.arm == "random"
+        is_random = self.settings.mode == "random"
         draws = generator(self.seed, number, "rows")
         scene = vary(self.scene, self.settings.vary, draws, once=is_random)
         problem = build_problem(self.settings.attack, scene)
@@ -329,7 +333,9 @@ class AugmentationService:
             values = as_tensor("state", values)
             if values.ndim != 2 or len(values) != len(self.labels):
                 counts = f"{len(values)} examples and the scene has {len(self.labels)}"
-                raise InputError(f"state: it continues {counts}; resume with the settings of the run")
+                raise InputError(
+                    f"state: it continues {counts}; resume with the settings of the run"
+                )
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
             remedy = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene: {remedy}")
@@ -342,7 +348,7 @@ class AugmentationService:
         Numbers are rounded before, so that the same settings have the same hash
         on all machines.
         """
-        shown: list[object] = [self.labels.tolist(), list(self.studied)]
+        shown: list[object] = [self.labels.tolist(), list(self.positive_classes)]
         if self.images is not None:
             shown.append(tuple(self.images.shape))
         if self.scene is not None:
@@ -367,16 +373,20 @@ class AugmentationService:
         _, diagnostics = self._classify(model, selected, labels)
         return Renders(selected, labels, diagnostics)
 
-    def _random(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
+    def _random(
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+    ) -> Renders:
         """Render random conditions. This process renders the examples with the indices in shard."""
         values = self._random_values(problem, number)
         images = self._gather(problem.images(values, shard)[:, 0], shard)
         is_error, diagnostics = self._classify(model, images, self.labels)
-        examples = choose_attack_examples(model, problem, values, is_error, self.labels)
+        examples = select_examples_to_log(model, problem, values, is_error, self.labels)
         diagnostics |= _changes(problem, values)
         return Renders(images, self.labels, diagnostics, examples)
 
-    def _classify(self, model: nn.Module, images: Tensor, labels: Tensor) -> tuple[Tensor, dict[str, float]]:
+    def _classify(
+        self, model: nn.Module, images: Tensor, labels: Tensor
+    ) -> tuple[Tensor, dict[str, float]]:
         """Classify up to `CLASSIFIED` evenly spaced images.
 
         Args:
@@ -390,21 +400,23 @@ class AugmentationService:
         """
         count = min(CLASSIFIED, len(labels))
         rows = torch.linspace(0, len(labels) - 1, count).round().long().to(labels.device)
-        with as_found(model), self.phases("attack_classifier"):
+        with frozen_eval_mode(model), self.phases("attack_classifier"):
             attacked_model = preprocessed_model(self.settings.attack, model)
             batch_size = self.settings.attack.batch_size
             logits = logits_of(attacked_model, images[rows, None], batch_size)[:, 0]
         require_known(labels, logits)
-        is_misclassified = ~is_right(logits.argmax(1), labels[rows], self.studied[1:])
-        loss = label_loss(logits, labels[rows], absent=self.studied[1:])
+        is_misclassified = ~is_correct(logits.argmax(1), labels[rows], self.positive_classes[1:])
+        loss = label_loss(logits, labels[rows], absent=self.positive_classes[1:])
         is_error = torch.zeros_like(labels, dtype=torch.bool)
         is_error = is_error.index_copy(0, rows, is_misclassified)
         return is_error, {"attack_success": _mean(is_misclassified), "loss": _mean(loss)}
 
-    def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor) -> Renders:
+    def _adversarial(
+        self, model: nn.Module, problem: AttackProblem, number: int, shard: Tensor
+    ) -> Renders:
         """Attack the examples. This process attacks the examples with the indices in shard."""
         attack = self.settings.attack
-        goal = self._attack_goal().of(shard)
+        criterion = self._attack_criterion().select(shard)
         attacked_model = preprocessed_model(attack, model)
         start = self._attack_start(problem, number)
         draws = generator(self.seed, number, "restart")
@@ -413,7 +425,7 @@ class AugmentationService:
         result = descend(
             attacked_model,
             problem,
-            goal,
+            criterion,
             attack,
             self.phases,
             examples=shard,
@@ -421,13 +433,13 @@ class AugmentationService:
             restarts=restarts,
             seed=seed,
         )
-        with as_found(model), self.phases("attack_classifier"):
+        with frozen_eval_mode(model), self.phases("attack_classifier"):
             is_fooled = fooled_in_views(
                 attacked_model,
                 result.images,
                 result.predicted,
                 shard,
-                goal,
+                criterion,
                 attack,
                 seed,
             )
@@ -451,25 +463,27 @@ class AugmentationService:
             diagnostics["attack_success_without_noise"] = _mean(result.success)
         diagnostics |= _changes(problem, result.values)
         is_new_success = success & ~result.success_before
-        examples = choose_attack_examples(model, problem, result.values, is_new_success, self.labels)
+        examples = select_examples_to_log(
+            model, problem, result.values, is_new_success, self.labels
+        )
         return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _gather(self, part: Tensor, shard: Tensor) -> Tensor:
         """Join the rows of all processes, where this process has those of the shard."""
-        return distributed.merged(part, shard, len(self.labels), self.world_size)
+        return distributed.all_gather_rows(part, shard, len(self.labels), self.world_size)
 
-    def _attack_goal(self) -> Goal:
+    def _attack_criterion(self) -> Criterion:
         """Return the source and the target class of each example."""
-        if not self.studied:
-            return Goal(self.labels[:, None])
-        studied = torch.tensor(self.studied, device=self.labels.device)
+        if not self.positive_classes:
+            return Criterion(self.labels[:, None])
+        positive_classes = torch.tensor(self.positive_classes, device=self.labels.device)
         # Negative labels are complementary labels, which name no class of the example.
         source = torch.where(self.labels < 0, NO_CLASS, self.labels)
         indices = torch.arange(len(self.labels), device=self.labels.device)
-        target_in_turn = studied[indices % len(studied)]
-        is_positive = torch.isin(self.labels, studied)
+        target_in_turn = positive_classes[indices % len(positive_classes)]
+        is_positive = torch.isin(self.labels, positive_classes)
         target = torch.where(is_positive, NO_CLASS, target_in_turn)
-        return Goal(source[:, None], target[:, None])
+        return Criterion(source[:, None], target[:, None])
 
     def _attack_start(self, problem: AttackProblem, number: int) -> Tensor:
         """Return the values (E, D) with which the attack of a regeneration begins."""
@@ -483,7 +497,7 @@ class AugmentationService:
         """Draw the values (E, D) of all attacked parameters of a regeneration."""
         settings = self.settings.random_light
         parts = []
-        for parameter, start in problem.by_parameter(problem.start):
+        for parameter, start in problem.split_by_parameter(problem.start):
             if parameter.name == "lighting":
                 zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
@@ -492,7 +506,7 @@ class AugmentationService:
             else:
                 draws = generator(self.seed, number, parameter.name)
                 parts.append(parameter.sample(draws).to(start))
-        return problem.project(torch.cat(parts, dim=1), problem.everything)
+        return problem.project(torch.cat(parts, dim=1), problem.all_examples)
 
 
 def _describe_scene(scene: Scene) -> list[object]:
@@ -545,7 +559,7 @@ class CheckedNetwork(nn.Module):
         return self._call_network(self.model, images)
 
 
-def choose_attack_examples(
+def select_examples_to_log(
     model: nn.Module,
     problem: AttackProblem,
     values: Tensor,
@@ -574,7 +588,7 @@ def choose_attack_examples(
     after = problem.conditions(values[rows], rows)
     images = []
     predictions = []
-    with as_found(model), torch.no_grad():
+    with frozen_eval_mode(model), torch.no_grad():
         for conditions in (before, after):
             rendered = problem.scene.render(conditions, rows)[:, 0]
             images.append(rendered)
@@ -593,8 +607,8 @@ def choose_attack_examples(
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
     """Return the mean L2 norm of the change of each condition, as diagnostics."""
-    before = problem.conditions(problem.start, problem.everything)
-    after = problem.conditions(values, problem.everything)
+    before = problem.conditions(problem.start, problem.all_examples)
+    after = problem.conditions(values, problem.all_examples)
     changes = {}
     for condition in fields(Conditions):
         new = getattr(after, condition.name)

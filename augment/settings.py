@@ -13,7 +13,7 @@ from typing import Any
 
 from augment.attack_settings import AttackSettings
 from augment.parameter_settings import StepSettings
-from renderer.errors import FACTOR, InputError, describe, is_number, require_choice
+from renderer.errors import MAX_SCALE, InputError, describe, is_number, require_choice
 from renderer.settings import (
     MAX_DEGREE,
     MAX_SAMPLES,
@@ -30,7 +30,7 @@ from renderer.settings import (
     settings_from,
 )
 
-ARMS = {
+MODES = {
     "none": "no renders",
     "random": "randomized renders",
     "adversarial": "attacked renders",
@@ -52,7 +52,9 @@ NONE = (0.0, 0.0)  # limits of a strength that is off
 class MeshSettings(Settings):
     """A mesh and its material."""
 
-    mesh: str = setting(REQUIRED, "A mesh file, or a procedural solid as solid:NAME or solid:NAME:SEED.")
+    mesh: str = setting(
+        REQUIRED, "A mesh file, or a procedural solid as solid:NAME or solid:NAME:SEED."
+    )
     _: KW_ONLY
     up: str = setting("auto", "Axis that points up in the file.", choices=UP_AXES)
     color: list[float] | None = setting(
@@ -60,7 +62,7 @@ class MeshSettings(Settings):
     )
     gloss: Any = setting(
         None,
-        "Specular material: [roughness, metallic, strength] or the first of them, from 0 to 1, "
+        "Specular material: [roughness, metallic, specular factor] or the first of them, from 0 to 1, "
         "or file for the material of a glTF file. null: none.",
     )
 
@@ -68,7 +70,7 @@ class MeshSettings(Settings):
         if isinstance(self.mesh, Path):
             self.mesh = str(self.mesh)
         super().__post_init__()
-        expected = "give [roughness, metallic, strength] in [0, 1]"
+        expected = "give [roughness, metallic, specular factor] in [0, 1]"
         if self.gloss == "file" and self.mesh.startswith("solid:"):
             raise InputError(f"gloss=file: {self.mesh} has none of its own, {expected}", "gloss")
         if self.gloss not in (None, "file") and not _is_gloss(self.gloss):
@@ -111,7 +113,9 @@ class PropSettings(MeshSettings):
         minimum=1 / MAX_PROP_DISTANCE,
         maximum=MAX_PROP_DISTANCE,
     )
-    azimuth: float = setting(0.0, "Rotation about the vertical.", "degrees", minimum=-360, maximum=360)
+    azimuth: float = setting(
+        0.0, "Rotation about the vertical.", "degrees", minimum=-360, maximum=360
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -131,7 +135,9 @@ class ObjectSettings(MeshSettings):
     """
 
     label: str = setting(REQUIRED, "Name of its class. It may be empty.", may_be_empty=True)
-    albedo_scale: float = setting(1.0, "Factor of its albedo.", minimum=1 / FACTOR, maximum=FACTOR)
+    albedo_scale: float = setting(
+        1.0, "Factor of its albedo.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
+    )
     props: list[Any] = setting([], "Meshes beside the object, as mappings or PropSettings.")
 
     def __post_init__(self) -> None:
@@ -148,13 +154,27 @@ class ObjectSettings(MeshSettings):
 class ProjectorSettings(Settings):
     """A projector and the pattern with which attacks start."""
 
-    pixels: int = setting(16, "Pixels per side of its pattern.", minimum=1, maximum=MAX_PROJECTOR_PIXELS)
-    polar: float = setting(45.0, "Polar angle of the projector from +z.", "degrees", minimum=0, maximum=180)
-    azimuth: float = setting(45.0, "Azimuth of the projector.", "degrees", minimum=-360, maximum=360)
-    distance: float = setting(4.0, "Distance from the origin in world units.", minimum=2, maximum=FACTOR)
-    fov: float = setting(30.0, "Angle between the sides of its image.", "degrees", minimum=0.1, maximum=170)
-    power: float = setting(1.0, "Largest value of a pixel.", minimum=1 / FACTOR, maximum=FACTOR)
-    pattern: Any = setting(0.0, "Pattern with which attacks start: a gray value in [0, 1] or an image file.")
+    pixels: int = setting(
+        16, "Pixels per side of its pattern.", minimum=1, maximum=MAX_PROJECTOR_PIXELS
+    )
+    polar: float = setting(
+        45.0, "Polar angle of the projector from +z.", "degrees", minimum=0, maximum=180
+    )
+    azimuth: float = setting(
+        45.0, "Azimuth of the projector.", "degrees", minimum=-360, maximum=360
+    )
+    distance: float = setting(
+        4.0, "Distance from the origin in world units.", minimum=2, maximum=MAX_SCALE
+    )
+    fov: float = setting(
+        30.0, "Angle between the sides of its image.", "degrees", minimum=0.1, maximum=170
+    )
+    power: float = setting(
+        1.0, "Largest value of a pixel.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
+    )
+    pattern: Any = setting(
+        0.0, "Pattern with which attacks start: a gray value in [0, 1] or an image file."
+    )
 
 
 @dataclass
@@ -165,8 +185,12 @@ class LampsSettings(Settings):
         [[2.0, 2.0, 2.0], [2.0, -2.0, 2.0], [-2.0, 2.0, 2.0], [-2.0, -2.0, 2.0]],
         "Positions [x, y, z] of the lamps in world units.",
     )
-    power: float = setting(10.0, "Largest power of a lamp.", minimum=1 / FACTOR, maximum=FACTOR)
-    radius: float = setting(0.0, "Radius of the discs in world units.", minimum=0, maximum=FACTOR)
+    power: float = setting(
+        10.0, "Largest power of a lamp.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
+    )
+    radius: float = setting(
+        0.0, "Radius of the discs in world units.", minimum=0, maximum=MAX_SCALE
+    )
     start: Any = setting(
         0.0,
         "Powers with which attacks start: a number, [r, g, b] of each lamp, or the lamps.json of "
@@ -188,12 +212,16 @@ class SceneSettings(Settings):
     meshes: list[Any] = setting(
         ["solid:orange:0"],
         "Objects: mesh files, solid:NAME:SEED, or mappings {mesh, label, up: auto|y|z, "
-        "albedo_scale, color, gloss: [roughness, metallic, strength] or file, "
+        "albedo_scale, color, gloss: [roughness, metallic, specular factor] or file, "
         "props: [{mesh, at: [x, y], scale, azimuth, up, color, gloss}, ...]}.",
     )
     backgrounds: list[Any] = setting([0.5], "Gray values in [0, 1] or image files.")
-    views: int | None = setting(1, "Number of cameras per mesh, at equal azimuths.", minimum=1, maximum=MAX_VIEWS)
-    polar: float = setting(60.0, "Polar angle of the cameras from +z.", "degrees", minimum=0, maximum=180)
+    views: int | None = setting(
+        1, "Number of cameras per mesh, at equal azimuths.", minimum=1, maximum=MAX_VIEWS
+    )
+    polar: float = setting(
+        60.0, "Polar angle of the cameras from +z.", "degrees", minimum=0, maximum=180
+    )
     azimuth: float = setting(
         0.0,
         "Azimuth of the first camera from +x toward +y.",
@@ -201,7 +229,9 @@ class SceneSettings(Settings):
         minimum=-360,
         maximum=360,
     )
-    width: float = setting(2.0, "Width of the image in world units, at the mesh. The mesh spans [-1, 1].")
+    width: float = setting(
+        2.0, "Width of the image in world units, at the mesh. The mesh spans [-1, 1]."
+    )
     fov: float | None = setting(
         None,
         "Angle between the sides of the image. null: orthographic.",
@@ -229,7 +259,9 @@ class SceneSettings(Settings):
         minimum=0,
         maximum=MAX_DEGREE,
     )
-    exposure: float = setting(1.0, "Factor of the lighting.", minimum=1 / FACTOR, maximum=FACTOR)
+    exposure: float = setting(
+        1.0, "Factor of the lighting.", minimum=1 / MAX_SCALE, maximum=MAX_SCALE
+    )
     # OmegaConf cannot set a part of an optional dataclass, so these two are converted below.
     projector: Any = setting(
         None,
@@ -241,7 +273,9 @@ class SceneSettings(Settings):
         "Lamps: {positions: [[2, 2, 2], ...], power: 10, radius: 0.0, start: 0.0 or FILE.json}, "
         "or some of these keys. null: none.",
     )
-    ground: list[float] | None = setting(None, "Color of a table under each mesh: [r, g, b] in sRGB. null: no table.")
+    ground: list[float] | None = setting(
+        None, "Color of a table under each mesh: [r, g, b] in sRGB. null: no table."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -298,7 +332,7 @@ class RendererSettings(Settings):
 
 
 @dataclass
-class VarnishSettings(Settings):
+class SpecularLayerSettings(Settings):
     """A dielectric specular layer on each object, drawn anew for each render."""
 
     roughness: list[float] = setting(
@@ -308,7 +342,7 @@ class VarnishSettings(Settings):
         maximum=1,
         is_pair=True,
     )
-    strength: list[float] = setting(
+    specular_factor: list[float] = setting(
         list(NONE),
         "Smallest and largest strength. [0, 0]: no layer.",
         minimum=0,
@@ -321,7 +355,9 @@ class VarnishSettings(Settings):
 class CameraEffectSettings(Settings):
     """Effects of a camera on each render. Each is uniform from 0 to its value."""
 
-    pattern_fraction: float = setting(0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1)
+    pattern_fraction: float = setting(
+        0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1
+    )
     pattern_fill: list[float] = setting(
         list(NONE),
         "Smallest and largest factor of the lighting of the scene beneath the pattern.",
@@ -329,9 +365,15 @@ class CameraEffectSettings(Settings):
         maximum=1,
         is_pair=True,
     )
-    white_balance: float = setting(0.0, "Largest change of each channel.", "stops", minimum=0, maximum=5)
-    blur: float = setting(0.0, "Largest standard deviation of the blur.", "pixels", minimum=0, maximum=MAX_BLUR)
-    noise: float = setting(0.0, "Largest standard deviation of the pixel noise.", minimum=0, maximum=1)
+    white_balance: float = setting(
+        0.0, "Largest change of each channel.", "stops", minimum=0, maximum=5
+    )
+    blur: float = setting(
+        0.0, "Largest standard deviation of the blur.", "pixels", minimum=0, maximum=MAX_BLUR
+    )
+    noise: float = setting(
+        0.0, "Largest standard deviation of the pixel noise.", minimum=0, maximum=1
+    )
 
 
 @dataclass
@@ -354,19 +396,23 @@ class VariationSettings(Settings):
     scale: list[float] = setting(
         list(UNCHANGED),
         "Smallest and largest factor of the size in the image.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
         is_pair=True,
     )
     exposure: list[float] = setting(
         list(UNCHANGED),
         "Smallest and largest factor of the lighting.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
         is_pair=True,
     )
-    backgrounds: str | None = setting(None, "Folder of images that replace scene.backgrounds. null: none.")
-    instances: bool = setting(False, "Draw another instance of each solid that is named without a seed.")
+    backgrounds: str | None = setting(
+        None, "Folder of images that replace scene.backgrounds. null: none."
+    )
+    instances: bool = setting(
+        False, "Draw another instance of each solid that is named without a seed."
+    )
     azimuth: float = setting(
         0.0,
         "Largest motion of the camera around the mesh, to either side and up and down.",
@@ -418,10 +464,12 @@ class VariationSettings(Settings):
         minimum=0,
         maximum=1,
     )
-    gloss: VarnishSettings = setting(
-        VarnishSettings, "A specular layer on each object, which replaces its own material."
+    gloss: SpecularLayerSettings = setting(
+        SpecularLayerSettings, "A specular layer on each object, which replaces its own material."
     )
-    camera: CameraEffectSettings = setting(CameraEffectSettings, "Effects of a camera on each render.")
+    camera: CameraEffectSettings = setting(
+        CameraEffectSettings, "Effects of a camera on each render."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -432,7 +480,7 @@ class VariationSettings(Settings):
     @property
     def moves(self) -> bool:
         """Whether views change. They are then rasterized in every regeneration."""
-        new_objects = self.instances or self.rotation > 0 or any(self.gloss.strength)
+        new_objects = self.instances or self.rotation > 0 or any(self.gloss.specular_factor)
         is_scaled = tuple(self.scale) != UNCHANGED
         moved = self.shift > 0 or is_scaled or any((self.azimuth, *self.fov))
         return moved or new_objects or self.tables > 0
@@ -445,14 +493,14 @@ class RandomLightSettings(Settings):
     amplitude: float = setting(
         0.5,
         "Each coefficient changes by a uniform draw between minus and plus this value.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
     )
     radius: float | None = setting(
         None,
         "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: the amplitude applies.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
     )
 
 
@@ -469,7 +517,7 @@ class TrainingAttackSettings(AttackSettings):
     step_size: float = setting_like(StepSettings, "step_size", 0.05)
     allow_negative: bool = True
     margin: float = 0.0
-    rounded: bool = False
+    quantized: bool = False
     sensor_noise: float = 0.0
     batch_size: int = 128
 
@@ -484,14 +532,14 @@ class TrainingAttackSettings(AttackSettings):
 class AugmentationSettings(Settings):
     """What an augmentation service renders, and when.
 
-    >>> AugmentationSettings(arm="random", random_light=RandomLightSettings(radius=1.5)).renders
+    >>> AugmentationSettings(mode="random", random_light=RandomLightSettings(radius=1.5)).renders
     True
     """
 
-    arm: str = setting("adversarial", "Kind of renders.", choices=ARMS)
+    mode: str = setting("adversarial", "Kind of renders.", choices=MODES)
     folder: str | None = setting(
         None,
-        "Folder of images for arm=folder: a folder per class, or other_NAME. They replace the renders.",
+        "Folder of images for mode=folder: a folder per class, or other_NAME. They replace the renders.",
     )
     examples: int | None = setting(
         100,
@@ -505,16 +553,20 @@ class AugmentationSettings(Settings):
         "Start of an attack: the lighting of the scene (scene) or a random perturbation (random).",
         choices=INITS,
     )
-    warm_start: bool = setting(False, "Start each attack where the attack of the previous regeneration ended.")
-    every: int | None = setting(
+    warm_start: bool = setting(
+        False, "Start each attack where the attack of the previous regeneration ended."
+    )
+    regenerate_every: int | None = setting(
         None,
         "Training images between two regenerations. null: regenerate once per epoch.",
         minimum=1,
         maximum=MAX_INTERVAL,
     )
-    vary: VariationSettings = setting(VariationSettings, "What is drawn anew for each render in each regeneration.")
+    vary: VariationSettings = setting(
+        VariationSettings, "What is drawn anew for each render in each regeneration."
+    )
     random_light: RandomLightSettings = setting(
-        RandomLightSettings, "Perturbation of the lighting for arm=random and for init=random."
+        RandomLightSettings, "Perturbation of the lighting for mode=random and for init=random."
     )
     attack: TrainingAttackSettings = setting(
         TrainingAttackSettings,
@@ -525,14 +577,16 @@ class AugmentationSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.attack, AttackSettings):
-            raise InputError(f"attack is {describe(self.attack)}: give the settings of an attack", "attack")
+            raise InputError(
+                f"attack is {describe(self.attack)}: give the settings of an attack", "attack"
+            )
         if not self.attack.parameters:
             remedy = "give TrainingAttackSettings(), or name a parameter"
             raise InputError(f"attack changes nothing: {remedy}", "attack")
-        if self.arm == "folder" and not self.folder:
-            given = f"folder is {self.folder}, and arm=folder shows its images"
+        if self.mode == "folder" and not self.folder:
+            given = f"folder is {self.folder}, and mode=folder shows its images"
             raise InputError(f"{given}: name a folder", "folder")
-        uses_random_draws = "random" in (self.arm, self.init)
+        uses_random_draws = "random" in (self.mode, self.init)
         for name, steps in self.attack.parameters.items():
             if uses_random_draws and name != "lighting" and steps.radius is None:
                 missing = f"attack.{name}.radius"
@@ -545,7 +599,7 @@ class AugmentationSettings(Settings):
     @property
     def renders(self) -> bool:
         """Whether there are any examples at all."""
-        return self.arm != "none" and self.examples != 0
+        return self.mode != "none" and self.examples != 0
 
 
 def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
@@ -573,6 +627,8 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
     derived, rest = divmod(examples or 0, objects * backgrounds)
     if rest or derived < 1 or views not in (None, derived):
         product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        remedy = "change one of them, or derive one from the other, with None for views or for examples"
+        remedy = (
+            "change one of them, or derive one from the other, with None for views or for examples"
+        )
         raise InputError(f"examples={examples} is not {product}: {remedy}", "examples")
     return derived

@@ -192,7 +192,10 @@ def rasterizers(device: str) -> Iterator[Row]:
     [camera] = renderer.orbit_cameras(1, 2.2)
     points = camera.project(mesh.vertices)[None]
     for side in SAMPLES_PER_SIDE:
-        calls = {name: partial(choose(name).rasterize, points, mesh.faces, side, True) for name in ("numba", "opengl")}
+        calls = {
+            name: partial(choose(name).rasterize, points, mesh.faces, side, True)
+            for name in ("numba", "opengl")
+        }
         yield from compare_calls(f"rasterize {side}² samples", calls, device)
 
 
@@ -394,7 +397,9 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     parser.add_argument("--out", type=Path, help="a .jsonl or .csv file")
     options = parser.parse_args(arguments)
     if options.device != "cpu" and not torch.cuda.is_available():
-        parser.error("torch finds no GPU here, which this benchmark needs: --device cpu rehearses what needs none")
+        parser.error(
+            "torch finds no GPU here, which this benchmark needs: --device cpu rehearses what needs none"
+        )
     return record(answers(options.questions, options.device), options.out, options.device)
 
 

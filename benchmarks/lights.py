@@ -276,7 +276,9 @@ def measure_errors(operator: TransferOperator, exact: TransferOperator, light: T
         Row with the relative errors of the image and of the gradient.
     """
     image_error = relative_error(radiance_image(operator, light), radiance_image(exact, light))
-    gradient_error = relative_error(gradient_by_light(operator, light), gradient_by_light(exact, light))
+    gradient_error = relative_error(
+        gradient_by_light(operator, light), gradient_by_light(exact, light)
+    )
     return {"image_error": image_error, "gradient_error": gradient_error}
 
 

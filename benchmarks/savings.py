@@ -179,8 +179,10 @@ class RenderGradient:
 
     @classmethod
     def by_gloss(cls, view: View) -> "RenderGradient":
-        """Differentiate the image by the roughness, the metallic and the strength."""
-        material = [torch.tensor(value, device=view.device, requires_grad=True) for value in (0.4, 0.0, 1.0)]
+        """Differentiate the image by the roughness, the metallic and the specular factor."""
+        material = [
+            torch.tensor(value, device=view.device, requires_grad=True) for value in (0.4, 0.0, 1.0)
+        ]
         return cls(view, view.mesh, material, gloss=Gloss(*material))
 
     def __call__(self) -> tuple[Tensor, ...]:

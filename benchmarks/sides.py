@@ -10,7 +10,7 @@ python -m benchmarks.sides make --data DATA --sides SIDES --packages packages
 python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides SIDES
 python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
 
-DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is an arm:
+DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is a method:
 the table has the mean, the lowest and the highest score of its seeds. A network
 may also be efficientnet_lite0 or another classifier, for images of --size
 pixels.
@@ -147,7 +147,9 @@ def solids(seed: int) -> list[str]:
         Names such as "solid:orange:2001".
     """
     oranges = [f"solid:{LABEL}:{seed + number}" for number in range(ORANGES)]
-    others = [f"solid:{name}:{seed + number // OTHER_KINDS}" for number, name in enumerate(OTHER_SOLIDS)]
+    others = [
+        f"solid:{name}:{seed + number // OTHER_KINDS}" for number, name in enumerate(OTHER_SOLIDS)
+    ]
     return oranges + others
 
 
@@ -209,7 +211,10 @@ def reporting_parts(
         slides: Pictures that the projector shows.
     """
     new_meshes = [{"mesh": files[name], "label": label} for name, label in OUTSIDE.items()]
-    trained_meshes = [{"mesh": files[name], "label": LABEL, "albedo_scale": scale} for name, scale in TRAINED.items()]
+    trained_meshes = [
+        {"mesh": files[name], "label": LABEL, "albedo_scale": scale}
+        for name, scale in TRAINED.items()
+    ]
     seen_meshes = [*trained_meshes, *solids(0)]
     laboratory = {
         **UNSEEN,
@@ -350,7 +355,7 @@ def load(name: str, size: int) -> Classifier:
 
 
 @dataclass(frozen=True)
-class Arm:
+class Method:
     """Networks of one training configuration, which differ in their seeds.
 
     Attributes:
@@ -362,7 +367,7 @@ class Arm:
     networks: Mapping[str, Classifier]
 
     @classmethod
-    def load(cls, name: str, size: int) -> "Arm":
+    def load(cls, name: str, size: int) -> "Method":
         """Load the networks of a folder of runs, of one run, or of a classifier."""
         folders = sorted(path.parent for path in Path(name).glob("*/best.pt"))
         runs = [str(folder) for folder in folders] or [name]
@@ -376,7 +381,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Scores:
-    """What the networks of an arm predict for the images of a folder.
+    """What the networks of a method predict for the images of a folder.
 
     Attributes:
         evaluations: Evaluation of each seed.
@@ -388,10 +393,10 @@ class Scores:
 
 
 def score(options: argparse.Namespace) -> None:
-    """Print a table of the scores of arms on one side.
+    """Print a table of the scores of methods on one side.
 
     The rows are the parts of the side with their sources and objects, the
-    accuracy on CIFAR-100, and the differences from the first arm.
+    accuracy on CIFAR-100, and the differences from the first method.
 
     Args:
         options: Parsed command line.
@@ -401,24 +406,24 @@ def score(options: argparse.Namespace) -> None:
     """
     side = SIDE_OF_COMMAND[options.command]
     folders = find_folders(options.sides / side, options.part)
-    arms = [Arm.load(name, options.size) for name in dict.fromkeys(options.networks)]
+    methods = [Method.load(name, options.size) for name in dict.fromkeys(options.networks)]
     if side == REPORTING:
-        log_looks(arms, folders, options.sides, options.table)
+        log_looks(methods, folders, options.sides, options.table)
     rows: list[list[str]] = []
     scores: dict[tuple[str, str], Scores] = {}
-    for arm in arms:
+    for method in methods:
         for folder in folders:
-            scores[arm.name, folder.name] = evaluate_arm(arm, folder, side)
-            rows += score_rows(arm, folder.name, scores[arm.name, folder.name])
+            scores[method.name, folder.name] = evaluate_method(method, folder, side)
+            rows += score_rows(method, folder.name, scores[method.name, folder.name])
         if options.data:
-            rows.append(accuracy_row(arm, options.data / "cifar100.npz", side))
-    first, *others = arms
+            rows.append(accuracy_row(method, options.data / "cifar100.npz", side))
+    first, *others = methods
     for folder in folders:
-        for arm in others:
+        for method in others:
             rows += difference_rows(
-                f"{arm.name} - {first.name}",
+                f"{method.name} - {first.name}",
                 folder.name,
-                scores[arm.name, folder.name],
+                scores[method.name, folder.name],
                 scores[first.name, folder.name],
             )
     header = ["network", "images", "group", *map(metric_title, METRICS)]
@@ -443,13 +448,13 @@ def find_folders(side: Path, chosen: Sequence[str] | None) -> list[Path]:
     return folders
 
 
-def log_looks(arms: Sequence[Arm], folders: Sequence[Path], sides: Path, table: str) -> None:
+def log_looks(methods: Sequence[Method], folders: Sequence[Path], sides: Path, table: str) -> None:
     """Append a row per network to LOG before anything is scored.
 
     A network that the table has scored before is reported.
 
     Args:
-        arms: Arms that will be scored.
+        methods: Arms that will be scored.
         folders: Folders of images that will be shown.
         sides: Folder of both sides.
         table: Name of the table that the scores are for.
@@ -457,11 +462,13 @@ def log_looks(arms: Sequence[Arm], folders: Sequence[Path], sides: Path, table: 
     looks = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines()))
     images = hash_files(folders, sides)
     commit = current_commit()
-    # A run that is in several arms is logged once.
-    networks = {run: network for arm in arms for run, network in arm.networks.items()}
+    # A run that is in several methods is logged once.
+    networks = {run: network for method in methods for run, network in method.networks.items()}
     for run, network in networks.items():
         weights = content_hash(network.state_dict())[:12]
-        days = [look["date"] for look in looks if look["table"] == table and look["weights"] == weights]
+        days = [
+            look["date"] for look in looks if look["table"] == table and look["weights"] == weights
+        ]
         if days:
             print(f"{run} was looked at for {table!r} before, on {', '.join(days)}")
         shown = " ".join(folder.name for folder in folders)
@@ -494,11 +501,11 @@ def current_commit() -> str:
     return done.stdout.strip()
 
 
-def evaluate_arm(arm: Arm, folder: Path, side: str) -> Scores:
-    """Predict the images of a folder with each network of an arm.
+def evaluate_method(method: Method, folder: Path, side: str) -> Scores:
+    """Predict the images of a folder with each network of a method.
 
     Args:
-        arm: Arm to evaluate.
+        method: Method to evaluate.
         folder: Folder of images.
         side: Name of the side, below which the predictions are written.
 
@@ -507,7 +514,7 @@ def evaluate_arm(arm: Arm, folder: Path, side: str) -> Scores:
     """
     evaluations = []
     predictions = []
-    for run, model in zip(arm.networks, arm.models(), strict=True):
+    for run, model in zip(method.networks, method.models(), strict=True):
         run_predictions = predict(model, folder)
         out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
         out.mkdir(parents=True, exist_ok=True)
@@ -549,19 +556,19 @@ def summarize_network(run: str) -> RunSummary:
     return summarize(Path(run))
 
 
-def score_rows(arm: Arm, images: str, scores: Scores) -> Iterator[list[str]]:
+def score_rows(method: Method, images: str, scores: Scores) -> Iterator[list[str]]:
     """Yield a row of metrics for all images of a folder, and for each source and object."""
     for part in scores.evaluations[0].pools:
         estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
         cells = [format_interval(estimate) for estimate in estimates]
-        yield [arm.name, images, Path(part.title()).stem, *cells]
+        yield [method.name, images, Path(part.title()).stem, *cells]
 
 
-def accuracy_row(arm: Arm, path: Path, side: str) -> list[str]:
-    """Return the row of an arm's accuracy on the images of CIFAR-100 that belong to a side."""
+def accuracy_row(method: Method, path: Path, side: str) -> list[str]:
+    """Return the row of a method's accuracy on the images of CIFAR-100 that belong to a side."""
     images = load_cifar(path, side)
-    accuracies = [evaluate(model, images)["accuracy"] for model in arm.models()]
-    return one_number_row(arm.name, "CIFAR-100", "accuracy", accuracies)
+    accuracies = [evaluate(model, images)["accuracy"] for model in method.models()]
+    return one_number_row(method.name, "CIFAR-100", "accuracy", accuracies)
 
 
 def load_cifar(path: Path, side: str) -> Split:
@@ -578,20 +585,22 @@ def difference_rows(
     scores: Scores,
     reference: Scores,
 ) -> Iterator[list[str]]:
-    """Yield the differences of an arm from a reference on a folder.
+    """Yield the differences of a method from a reference on a folder.
 
     Args:
         title: Name of the comparison.
         images: Name of the folder.
-        scores: Scores of the arm.
-        reference: Scores of the arm that it is compared with.
+        scores: Scores of the method.
+        reference: Scores of the method that it is compared with.
 
     Yields:
         A row of the differences of metrics, and two rows of the fraction of
         images with the same predicted class as by the first network of the
         reference: of all images, and of the negatives.
     """
-    differences = [difference(scores.evaluations, reference.evaluations, ALL, metric) for metric in METRICS]
+    differences = [
+        difference(scores.evaluations, reference.evaluations, ALL, metric) for metric in METRICS
+    ]
     yield [title, images, "all", *(format_interval(value, "+") for value in differences)]
     first_predictions = reference.predictions[0]
     same_class = []

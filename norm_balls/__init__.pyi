@@ -22,10 +22,10 @@ from augment import Scene as Scene
 from augment import SceneObject as SceneObject
 from augment import SceneSettings as SceneSettings
 from augment import SkylightSettings as SkylightSettings
+from augment import SpecularLayerSettings as SpecularLayerSettings
 from augment import StepSettings as StepSettings
 from augment import TrainingAttackSettings as TrainingAttackSettings
 from augment import VariationSettings as VariationSettings
-from augment import VarnishSettings as VarnishSettings
 from augment import attack as attack
 from augment import build_scene as build_scene
 from augment import check as check

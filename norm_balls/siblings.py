@@ -41,7 +41,9 @@ def _require_own(name: str) -> None:
 def _import_from_home(name: str) -> None:
     """Import a package from the folder of this library, wherever `sys.path` leads."""
     folder = HOME / name
-    spec = spec_from_file_location(name, folder / "__init__.py", submodule_search_locations=[str(folder)])
+    spec = spec_from_file_location(
+        name, folder / "__init__.py", submodule_search_locations=[str(folder)]
+    )
     if spec is None or spec.loader is None:
         raise ImportError(f"{folder} is missing: install norm_balls again")
     package = module_from_spec(spec)

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import LARGEST, InputError, describe, is_number, require_range
+from renderer.errors import MAX_MAGNITUDE, InputError, describe, is_number, require_range
 from renderer.settings import MAX_VIEWS
 from renderer.validation import require_whole
 
 # Default of `Camera.reach`. A normalized mesh has a radius of at most √3.
 REACH = 2.0
 # Largest polar angle and largest first azimuth of an orbit in degrees: two turns.
-MOST_TURN = 720.0
+MAX_TURN = 720.0
 # Limits of the field of view in degrees.
 MIN_FOV = 0.05
 MAX_FOV = 172.0
@@ -70,11 +70,11 @@ class Camera(ABC):
         for name, value in vars(self).items():
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
-        require_range("width", self.width, 1 / LARGEST, LARGEST)
-        require_range("reach", self.reach, 1 / LARGEST, LARGEST)
-        require_range("polar", self.polar, -MOST_TURN, MOST_TURN)
+        require_range("width", self.width, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+        require_range("reach", self.reach, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+        require_range("polar", self.polar, -MAX_TURN, MAX_TURN)
         for name in ("azimuth", "right", "up"):
-            require_range(name, getattr(self, name), -LARGEST, LARGEST)
+            require_range(name, getattr(self, name), -MAX_MAGNITUDE, MAX_MAGNITUDE)
 
     @property
     def near(self) -> float:
@@ -308,7 +308,7 @@ class PerspectiveCamera(Camera):
     def __post_init__(self) -> None:
         """Convert and check the fields."""
         super().__post_init__()
-        require_range("distance", self.distance, 1 / LARGEST, LARGEST)
+        require_range("distance", self.distance, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
 
     def eye(self) -> np.ndarray:
         """Return the position of the camera and 1, float64, shape (4,)."""
@@ -403,7 +403,7 @@ def orbit_cameras(
     width = _as_scalar("width", width)
     polar = _as_scalar("polar", polar)
     azimuth = _as_scalar("azimuth", azimuth)
-    require_range("azimuth", azimuth, -MOST_TURN, MOST_TURN)
+    require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
     azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 # Largest magnitude in tensors that `require_bounded` accepts. The product of
 # three such float32 values does not overflow. An overflow would lead to infinity
 # minus infinity, which is NaN.
-LARGEST = 1e12
+MAX_MAGNITUDE = 1e12
 # Largest factor for a light or an albedo in settings. Products then stay below
-# LARGEST.
-FACTOR = 1e5
+# MAX_MAGNITUDE.
+MAX_SCALE = 1e5
 # Parts of error messages of torch, CUDA, cuDNN and cuBLAS if memory runs out.
 OUT_OF_MEMORY = (
     "out of memory",
@@ -85,7 +85,7 @@ class InputError(ValueError):
         return InputError(f"{key}: {self}", key)
 
 
-def in_one_line(error: Exception) -> str:
+def single_line(error: Exception) -> str:
     """Return the message of an error in one line.
 
     Args:
@@ -210,7 +210,7 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """Check that tensors hold floating-point numbers of at most the magnitude LARGEST.
+    """Check that tensors hold floating-point numbers of at most the magnitude MAX_MAGNITUDE.
 
     Args:
         **tensors: Tensors by the names of the arguments.
@@ -226,9 +226,9 @@ def require_bounded(**tensors: Tensor) -> None:
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers", name)
         # The comparison is False for NaN.
-        if not _largest_magnitude(tensor) <= LARGEST:
+        if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
             raise InputError(
-                f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values",
+                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}: give finite values",
                 name,
             )
 

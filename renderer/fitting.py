@@ -82,7 +82,7 @@ CLIPPING_ROUNDS = 3
 LEAST_RADIANCE = 0.01
 # Largest number of iterations of non-negative least squares per direction. Three
 # are usual.
-MOST_EXCHANGES = 100
+MAX_EXCHANGES = 100
 # One of as many directions of a grid constrains the first solution.
 FIRST_DIRECTIONS = 16
 # Subdivisions of the grid of directions while a camera is sought, and for the
@@ -105,7 +105,7 @@ USUAL_POLAR = 60.0
 # If the axes of a window change by more, the window is cut anew.
 TILTED = 1e-3
 # Number of pixels that the object must cover.
-LEAST = 16
+MIN_COVERED_PIXELS = 16
 COLORS = 3
 
 
@@ -179,7 +179,9 @@ def fit_photograph(
     rows = np.flatnonzero(is_object.any(axis=1))
     columns = np.flatnonzero(is_object.any(axis=0))
     if not len(rows):
-        raise InputError("no object is found: give a mask that is white where it is, or a box around it")
+        raise InputError(
+            "no object is found: give a mask that is white where it is, or a box around it"
+        )
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
@@ -319,10 +321,14 @@ def fit_scene(
     size = photograph.shape[-1]
     if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
-        raise InputError(f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)")
+        raise InputError(
+            f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)"
+        )
     covered = float(mask.sum())
-    if covered < LEAST:
-        raise InputError(f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object")
+    if covered < MIN_COVERED_PIXELS:
+        raise InputError(
+            f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object"
+        )
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
     mask = mask.double()
@@ -404,7 +410,9 @@ class _Target(NamedTuple):
     options: _RenderOptions
 
     @staticmethod
-    def of(photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions) -> _Target:
+    def of(
+        photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
+    ) -> _Target:
         """Resample a photograph (3, H, H) and a mask (H, H), and remove the background.
 
         Pixels on the border of the object show a mixture of object and background.
@@ -466,7 +474,9 @@ class _Target(NamedTuple):
 
     def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Return the squared error of each camera with its best light, smallest first."""
-        errors = [(float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras]
+        errors = [
+            (float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras
+        ]
         return sorted(errors, key=lambda pair: pair[0])
 
     def penalty(self, squares: Tensor) -> Tensor:
@@ -566,7 +576,9 @@ class _Descent:
         return np.stack(columns, axis=1)
 
 
-def _light_of_channels(squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int) -> tuple[Tensor, Tensor]:
+def _light_of_channels(
+    squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int
+) -> tuple[Tensor, Tensor]:
     """Fit the light of the channel that the object shows best, and then of the other channels.
 
     The other channels are expected to resemble the first one, because the object
@@ -626,7 +638,7 @@ def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
         is_constrained = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
         is_negative = unconstrained @ sides < 0
         while is_negative.any():
-            iterations = MOST_EXCHANGES * len(is_constrained)
+            iterations = MAX_EXCHANGES * len(is_constrained)
             multipliers, _ = nnls(sides[:, is_constrained], -unconstrained, maxiter=iterations)
             nearest = unconstrained + sides[:, is_constrained] @ multipliers
             is_negative = (nearest @ sides < 0) & ~is_constrained

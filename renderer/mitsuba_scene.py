@@ -37,7 +37,7 @@ from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import corner_normals
 from renderer.image import decode, encode, to_bytes
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.io.mitsuba_entries import Scene, environment, integrator, sensor_of
 from renderer.light.basis import LocalBasis
@@ -83,7 +83,7 @@ PLUGIN_TAGS = {
     "box": "rfilter",
     "multijitter": "sampler",
 }
-# Smallest albedo scale by which the strength of a coat is divided.
+# Smallest albedo scale by which the specular_factor of a coat is divided.
 SMALLEST_SCALE = 1e-6
 
 
@@ -110,7 +110,9 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     try:
         module.set_variant(variant)
     except ImportError as error:
-        raise InputError(f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})") from error
+        raise InputError(
+            f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})"
+        ) from error
     # Mitsuba waits forever for an .exr file if it has a single thread.
     drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
@@ -196,7 +198,7 @@ class Part:
         uvs: Texture coordinates of the corners as in `Mesh`, shape (F, 3, 2).
         colors: Linear colors of the corners, shape (F, 3, 3).
         texture: Texture, uint8, shape (H, W, 3). None if there is none.
-        gloss: Roughness, metallic and strength, shape (3,). None if the mesh
+        gloss: Roughness, metallic and specular factor, shape (3,). None if the mesh
             has none.
         factors: Gloss texture with roughness and metallic, uint8,
             shape (H, W, 2). None if there is none.
@@ -245,7 +247,9 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
             colors=colors[is_in_part],
             texture=mesh.textures[texture_id] if has_texture else None,
             gloss=None if mesh.gloss is None else key[1:],
-            factors=mesh.gloss_textures[texture_id] if has_texture and mesh.gloss_textures else None,
+            factors=mesh.gloss_textures[texture_id]
+            if has_texture and mesh.gloss_textures
+            else None,
         )
         parts.append(part)
     return parts
@@ -344,7 +348,7 @@ def write_mitsuba_scene(
     for entry in objects:
         _append(scene, "", entry)
     xml.indent(scene, "    ")
-    write_whole(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
+    atomic_write(folder / SCENE, xml.tostring(scene, "unicode") + "\n")
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
@@ -402,7 +406,9 @@ def _local_emitters(
 class _PartWriter:
     """Writer of the files of one part: part_0.ply, texture_0.png, and so on."""
 
-    def __init__(self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float) -> None:
+    def __init__(
+        self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
+    ) -> None:
         """Prepare to write a part.
 
         Args:
@@ -418,7 +424,7 @@ class _PartWriter:
         self._encoding = encoding
         self._albedo_scale = albedo_scale
         is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
-        # A part without metallic and strength is matte.
+        # A part without metallic and specular factor is matte.
         self._gloss = part.gloss if is_glossy else None
         # Fraction of the albedo that the surface keeps below its coat.
         self._kept = 1.0 if self._gloss is None else _kept_fraction(self._gloss)
@@ -453,7 +459,7 @@ class _PartWriter:
             process=False,
         )
         name = f"part_{self._number}.ply"
-        write_whole(self._folder / name, surface.export(file_type="ply", vertex_normal=True))
+        atomic_write(self._folder / name, surface.export(file_type="ply", vertex_normal=True))
         return name
 
     def _albedo(self) -> Scene:
@@ -470,10 +476,10 @@ class _PartWriter:
     def _glossy_material(self, gloss: np.ndarray, albedo: Scene) -> Scene:
         """Write the gloss texture, if there is one, and return the dictionary of the material."""
         # The metallic part of the color is scaled like the diffuse part.
-        roughness, metallic, strength = (gloss / [1, self._kept, 1]).tolist()
+        roughness, metallic, specular_factor = (gloss / [1, self._kept, 1]).tolist()
         # F0 is 0.08 · specular, and 0.04 for a refractive index of 1.5. The
         # lights contain the albedo scale, which the coat must not have.
-        specular = min(strength / 2 / max(self._albedo_scale, SMALLEST_SCALE), 1.0)
+        specular = min(specular_factor / 2 / max(self._albedo_scale, SMALLEST_SCALE), 1.0)
         return {
             "type": "principled",
             "base_color": albedo,
@@ -509,11 +515,11 @@ def _kept_fraction(gloss: np.ndarray) -> float:
     A metal reflects all of it, and a dielectric reflects what passes its coat.
 
     Args:
-        gloss: Roughness, metallic and strength, shape (3,).
+        gloss: Roughness, metallic and specular factor, shape (3,).
 
     Returns:
         Fraction in [0, 1].
     """
-    roughness, metallic, strength = torch.from_numpy(gloss).double()[:, None]
-    below_coat = 1 - strength * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))
+    roughness, metallic, specular_factor = torch.from_numpy(gloss).double()[:, None]
+    below_coat = 1 - specular_factor * coat_mean(roughness.clamp(min=MIN_ROUGHNESS))
     return float(metallic + (1 - metallic) * below_coat)

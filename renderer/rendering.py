@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera
-from renderer.errors import FACTOR, InputError, describe, require_bounded, require_choice, require_range
+from renderer.errors import (
+    MAX_SCALE,
+    InputError,
+    describe,
+    require_bounded,
+    require_choice,
+    require_range,
+)
 from renderer.geometry.mesh import Mesh, require_mesh
 from renderer.geometry.shapes import sphere
 from renderer.image import as_background, composite
@@ -33,7 +40,9 @@ from renderer.visibility.rasterizers import choose
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
+LocalLight = (
+    LocalBasis | tuple[LocalBasis, Tensor]
+)  # lamps or a projector, and coefficients (size, 3)
 WHITE = 1 + 1e-4  # the largest albedo, and what rounding adds to it
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
 _OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)  # the first of `orbit_cameras`
@@ -127,7 +136,9 @@ def render(
     vertices = None if vertices is None else as_tensor("vertices", vertices)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         shape = tuple(vertices.shape)
-        raise InputError(f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}")
+        raise InputError(
+            f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}"
+        )
     given = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
     local = [_with_coefficients(member) for member in given]
     # The images have the dtype and the device of the first light.
@@ -214,11 +225,15 @@ def precompute_transfer(
     _require_scale(albedo_scale)
     _require_gloss(gloss)
     require_choice("rasterizer", rasterizer, RASTERIZERS)
-    operators = build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss)
+    operators = build_operators(
+        mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss
+    )
     return TransferOperators(operators)
 
 
-def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
+def light_sphere(
+    light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS
+) -> Tensor:
     """Render a white diffuse ball in a light, to show the light as an image.
 
     The ball has radius 1 and lies at the origin, so that the image also shows
@@ -247,14 +262,18 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     sky, local = split_light(basis, light.detach().cpu().float())
     sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
-    images = render(_white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")
+    images = render(
+        _white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy"
+    )
     return images[0]
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
     """Return one camera or several as a list."""
     advice = "a camera or a list of cameras, such as renderer.orbit_cameras(10, width=2.0)"
-    listed = as_list("cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice)
+    listed = as_list(
+        "cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice
+    )
     if not listed:
         raise InputError("cameras is empty: give one camera or several")
     return listed
@@ -263,18 +282,22 @@ def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
 def _require_scale(albedo_scale: float) -> None:
     """Check the factor of the albedo."""
     require_number("albedo_scale", albedo_scale)
-    require_range("albedo_scale", albedo_scale, 0, FACTOR)
+    require_range("albedo_scale", albedo_scale, 0, MAX_SCALE)
 
 
 def _require_gloss(gloss: Gloss | None) -> None:
     """Check that gloss is a record of its three values, not one of these."""
-    require_kind("gloss", gloss, Gloss | None, "renderer.Gloss(roughness, metallic, strength) or None")
+    require_kind(
+        "gloss", gloss, Gloss | None, "renderer.Gloss(roughness, metallic, specular_factor) or None"
+    )
 
 
 def _as_light(light: object) -> Tensor:
     """Convert the coefficients of environment light."""
     if isinstance(light, str):
-        raise InputError(f"light is {light!r}: give coefficients, such as renderer.load_light({light!r})")
+        raise InputError(
+            f"light is {light!r}: give coefficients, such as renderer.load_light({light!r})"
+        )
     coefficients = as_tensor("light", light)
     degree_of(coefficients)
     return coefficients
@@ -286,7 +309,9 @@ def _as_albedo(albedo: object) -> Tensor:
     require_bounded(albedo=values)
     if values.numel() and not (values.min() >= 0 and values.max() <= WHITE):
         extremes = f"{values.min().item():g} to {values.max().item():g}"
-        raise InputError(f"albedo holds values from {extremes}: give 0 to 1, and albedo_scale for brighter surfaces")
+        raise InputError(
+            f"albedo holds values from {extremes}: give 0 to 1, and albedo_scale for brighter surfaces"
+        )
     return values
 
 

@@ -131,7 +131,9 @@ class ShadedView:
     def _shade_lamps(self, fragments: Fragments) -> Iterator[Tensor]:
         """Yield the radiance (3, P) in each local light of the samples in the pixels of fragments."""
         for basis, coefficients in self.light.local_lights:
-            yield self._view_of_lamps.radiance(basis, self.albedo, coefficients, self.lamp_positions, fragments)
+            yield self._view_of_lamps.radiance(
+                basis, self.albedo, coefficients, self.lamp_positions, fragments
+            )
 
     def _sum(self, parts: list[Tensor], fragments: Fragments) -> Tensor:
         """Add radiances (3, P), in darkness none."""
@@ -160,7 +162,9 @@ class ShadedView:
             scaled = added.detach() * fragments.samples**2
             per_albedo = scaled / total.masked_fill(total == 0, 1)
             values = values + per_albedo[:, pixel] * self.albedo.detach().T
-        beside, zeros = moving_outlines(fragments, camera, self.vertices, self._faces, values, background)
+        beside, zeros = moving_outlines(
+            fragments, camera, self.vertices, self._faces, values, background
+        )
         coverage = F.pad(fragments.coverage.to(summed), (0, len(beside)))
         shade = F.pad(summed, (0, len(beside))) + zeros
         return PixelRadiance(torch.cat([fragments.pixels, beside]), coverage, shade)
@@ -191,4 +195,6 @@ class ShadedView:
             return self.lamp_view
         assert self.rays is not None
         vertices = self.vertices if self.is_moved else None
-        return LocalLightView(self.rays, self.mesh, self.fragments, self.settings, vertices, self.gloss)
+        return LocalLightView(
+            self.rays, self.mesh, self.fragments, self.settings, vertices, self.gloss
+        )

@@ -65,7 +65,9 @@ def as_tensor(name: str, value: object) -> Tensor:
             keeps_precision = isinstance(value, np.ndarray) and array.dtype.kind == "f"
             dtype = None if keeps_precision else torch.get_default_dtype()
             return torch.as_tensor(array, dtype=dtype)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of numbers", name
+    )
 
 
 def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
@@ -98,7 +100,9 @@ def as_integers(name: str, value: object) -> Tensor:
         array = _as_numbers(value)
         if array is not None and (array.dtype.kind in "iu" or not array.size):
             return torch.as_tensor(array, dtype=torch.int64)
-    raise InputError(f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name)
+    raise InputError(
+        f"{name} is {describe(value)}: give a tensor, an array or a list of whole numbers", name
+    )
 
 
 def _as_numbers(value: object) -> np.ndarray | None:
@@ -179,7 +183,9 @@ def as_folder(name: str, value: object) -> Path:
             continue
         # A broken link exists for lexists alone.
         if existing.exists() and not existing.is_dir():
-            raise InputError(f"{name}={path}: {existing} is a file, give the path of a folder", name)
+            raise InputError(
+                f"{name}={path}: {existing} is a file, give the path of a folder", name
+            )
         break
     return path
 

@@ -10,8 +10,8 @@ usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.s
 Run it in the root of the clone.
   gpu     training speed, and the experiments paper and fast, with five seeds
   cpu     training speed, and the experiment cpu, with five seeds
-  harden  the experiment harden from a network: four arms with three seeds
-  best    the experiment best, alone and with TrivialAugment, and six arms
+  harden  the experiment harden from a network: four methods with three seeds
+  best    the experiment best, alone and with TrivialAugment, and six methods
           without renders, with three seeds
 
 Every training run gets the further settings key=value of pnb-train.
@@ -23,7 +23,7 @@ These are read from the environment:
   EXCLUDE   sources of photographs that averages leave out; default []
   LAB       harden, best: a folder that pnb-lab wrote
   BASE      harden, best: the network to start from; default pretrained/none
-  DISTANCE  harden: L2 norm of the random perturbations of the fourth arm. It is
+  DISTANCE  harden: L2 norm of the random perturbations of the fourth method. It is
             the norm of the adversarial perturbations; default 0.6
   RUNS      folder of the runs; default runs/reproduce
   PYTHON    the interpreter; default python
@@ -86,10 +86,10 @@ best)
     sweep best "${from_network[@]}" "$@"
     sweep best train.augmentation=trivial_augment "${from_network[@]}" "$@"
     # The baselines have no renders, but the same network, images, model soup and
-    # seeds. To train for about as many minutes as best, the arm without
+    # seeds. To train for about as many minutes as best, the method without
     # augmentation gets twice the images. PGD takes three additional passes for
     # each image, and gets half of the images.
-    without_renders=(augment=none train.ranking=0)
+    without_renders=(augment=none train.ranking_weight=0)
     sweep best "${without_renders[@]}" \
         train.augmentation=none,color_jitter,trivial_augment,augmix "${from_network[@]}" "$@"
     sweep best "${without_renders[@]}" train.augmentation=none train.images_per_epoch=48000 \

@@ -70,7 +70,7 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "albedo": (torch.rand(4, 3), lambda x: render(albedo=x)),
     "lights": (torch.rand(1, 3), lambda x: render(lights=[(LAMP, x)], light=None)),
     "roughness": (0.25 + 0.5 * torch.rand(4), lambda x: render(gloss=renderer.Gloss(x, 0.0, 0.5))),
-    "strength": (torch.tensor(0.5), lambda x: render(gloss=renderer.Gloss(0.3, 0.0, x))),
+    "specular_factor": (torch.tensor(0.5), lambda x: render(gloss=renderer.Gloss(0.3, 0.0, x))),
     "camera": (torch.tensor([57.0, 28.5, 4.0, 0.25, 8.0]), lambda x: perspective(*x)),
     "orbit": (torch.tensor([2.0, 57.0, 28.5]), lambda x: render(cameras=orbit_of(x))),
     "operator's lights": (torch.stack([LIGHT, 2 * LIGHT]), OPERATOR.image),
@@ -103,7 +103,11 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
     "images": (IMAGES, CLASSIFIER),
     "labels": (
         torch.tensor([3, 1]),
-        lambda x: augment.AugmentationService(augment.AugmentationSettings(), SCENE, x, 0, Phases()).labels,
+        lambda x: (
+            augment.AugmentationService(
+                augment.AugmentationSettings(), SCENE, x, 0, Phases()
+            ).labels
+        ),
     ),
 }
 
@@ -113,7 +117,9 @@ def orbit_of(values: Any) -> list[Camera]:
     return renderer.orbit_cameras(2, width, polar, azimuth)
 
 
-@pytest.mark.parametrize("convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"])
+@pytest.mark.parametrize(
+    "convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"]
+)
 @pytest.mark.parametrize("name", CALLS)
 def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):
     tensor, call = CALLS[name]

@@ -16,7 +16,12 @@ ROOT = Path(__file__).parents[1]
 def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-m", "train"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-m", "train"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     *_, sheet = re.findall(r"^image: (.*)$", done.stdout, re.M)
     folder = Path(sheet).parents[1]

@@ -12,9 +12,14 @@ import augment
 import renderer
 
 PUBLIC = {
-    f"{package.__name__}.{name}": getattr(package, name) for package in (renderer, augment) for name in package.__all__
+    f"{package.__name__}.{name}": getattr(package, name)
+    for package in (renderer, augment)
+    for name in package.__all__
 }
-MODULES = {value.__name__ if isinstance(value, ModuleType) else value.__module__ for value in PUBLIC.values()}
+MODULES = {
+    value.__name__ if isinstance(value, ModuleType) else value.__module__
+    for value in PUBLIC.values()
+}
 FUNCTIONS = [name for name, value in PUBLIC.items() if isinstance(value, FunctionType)]
 
 
@@ -37,8 +42,16 @@ def result() -> augment.AttackResult:
 def test_examples_run(module, result, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
-    names = {"augment": augment, "renderer": renderer, "torch": torch, "nn": torch.nn, "result": result}
-    failures, _ = doctest.testmod(importlib.import_module(module), extraglobs=names, optionflags=flags)
+    names = {
+        "augment": augment,
+        "renderer": renderer,
+        "torch": torch,
+        "nn": torch.nn,
+        "result": result,
+    }
+    failures, _ = doctest.testmod(
+        importlib.import_module(module), extraglobs=names, optionflags=flags
+    )
     assert not failures
 
 

@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ALLOWED = {"renderer": {"renderer"}, "augment": {"augment", "renderer"}, "train": {"train", "augment", "renderer"}}
+ALLOWED = {
+    "renderer": {"renderer"},
+    "augment": {"augment", "renderer"},
+    "train": {"train", "augment", "renderer"},
+}
 
 
 def imported_packages(module: Path) -> set[str]:
@@ -51,7 +55,11 @@ def imported_modules() -> dict[str, set[str]]:
     known = modules()
     imported = {}
     for name, path in known.items():
-        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        nodes = [
+            node
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.ImportFrom)
+        ]
         members = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
         parents = {f"{node.module}" for node in nodes} - {name}
         imported[name] = (members | parents) & known.keys() - {name}
@@ -59,8 +67,15 @@ def imported_modules() -> dict[str, set[str]]:
 
 
 def test_no_import_leads_back_to_its_module():
-    order = list(TopologicalSorter(imported_modules()).static_order())  # CycleError names the circle
-    path = ["renderer.geometry.mesh", "renderer.io.meshes", "augment.scene.scene", "train.training.run"]
+    order = list(
+        TopologicalSorter(imported_modules()).static_order()
+    )  # CycleError names the circle
+    path = [
+        "renderer.geometry.mesh",
+        "renderer.io.meshes",
+        "augment.scene.scene",
+        "train.training.run",
+    ]
     assert sorted(path, key=order.index) == path
 
 
@@ -84,11 +99,19 @@ def folder_of(module: str) -> str:
 def test_only_commands_and_what_gets_all_their_settings_name_keys():
     """Other modules name their Python arguments, and `keyed` says which setting gave the value."""
     main = importlib.import_module("train.__main__").main
-    parts = {key.rpartition(".")[0] for key in main.keys}  # such as augment.attack, which is a function, too
+    parts = {
+        key.rpartition(".")[0] for key in main.keys
+    }  # such as augment.attack, which is a function, too
     keys = {key for key in main.keys if "." in key} - parts
     assert "train.precision" in keys
     told = re.compile("ExperimentSettings|DictConfig")
-    command_layer = ("train.command", "train.help", "train.__main__", "train.report", "train.system.user_errors")
+    command_layer = (
+        "train.command",
+        "train.help",
+        "train.__main__",
+        "train.report",
+        "train.system.user_errors",
+    )
     checked = 0
     for name, path in modules().items():
         has_help = name.endswith("settings")
@@ -104,14 +127,20 @@ def texts(path: Path) -> list[str]:
     """The strings of a module but for its docstrings."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-    constants = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings]
+    constants = [
+        node for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings
+    ]
     return [node.value for node in constants if isinstance(node.value, str)]
 
 
 def test_settings_need_neither_torch_nor_numpy():
     """Commands check their settings and print --help before anything that takes seconds to import."""
-    modules = [path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/*settings.py")]
+    modules = [
+        path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/*settings.py")
+    ]
     names = [name.replace("/", ".") for name in modules if name.partition("/")[0] in ALLOWED]
-    code = f"import sys; sys.modules['torch'] = sys.modules['numpy'] = None; import {', '.join(names)}"
+    code = (
+        f"import sys; sys.modules['torch'] = sys.modules['numpy'] = None; import {', '.join(names)}"
+    )
     assert len(names) > 2
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -18,7 +18,9 @@ PAGES = ("README.md", "docs/guide.md", "pretrained/README.md")
 BLOCKS = {
     heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     for page in PAGES
-    for heading, text in re.findall(r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL)
+    for heading, text in re.findall(
+        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL
+    )
     if "```python" in text
 }
 
@@ -38,7 +40,13 @@ def run(heading: str, **names) -> dict[str, object]:
 
 
 def test_every_block_of_python_is_run_here():
-    assert BLOCKS.keys() == {"Attack a classifier", "Render", "Your own training loop", "Many lights and views", "Load"}
+    assert BLOCKS.keys() == {
+        "Attack a classifier",
+        "Render",
+        "Your own training loop",
+        "Many lights and views",
+        "Load",
+    }
 
 
 def test_render_block_has_a_gradient_by_light():
@@ -49,13 +57,21 @@ def test_render_block_has_a_gradient_by_light():
 
 def test_many_views_block_renders_each_view_and_light():
     names = run("Many lights and views")
-    assert names["images"].shape == (100, 2, 3, 32, 32) and names["own_images"].shape == (100, 3, 32, 32)
+    assert names["images"].shape == (100, 2, 3, 32, 32) and names["own_images"].shape == (
+        100,
+        3,
+        32,
+        32,
+    )
     assert names["lights"].grad.any() and names["gradient"].any()
 
 
 def test_load_block_recognizes_an_orange(folder):
     image = renderer.render(
-        renderer.solid("orange", 0), renderer.orbit_cameras(1, width=2.4), renderer.load_light("grace"), 96
+        renderer.solid("orange", 0),
+        renderer.orbit_cameras(1, width=2.4),
+        renderer.load_light("grace"),
+        96,
     )
     Image.fromarray(to_bytes(image[0]).permute(1, 2, 0).numpy()).save(folder / "orange.jpg")
     assert run("Load")["predicted"] == "orange"
@@ -85,7 +101,13 @@ def test_training_loop_block_trains_on_data_and_renders():
     network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
     before = network[1].weight.detach().clone()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
-    names = run("Your own training loop", torch=torch, network=network, data=Photographs(), optimizer=optimizer)
+    names = run(
+        "Your own training loop",
+        torch=torch,
+        network=network,
+        data=Photographs(),
+        optimizer=optimizer,
+    )
     assert len(names["renders"]) == 10 and names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32)
     assert not torch.equal(network[1].weight, before)

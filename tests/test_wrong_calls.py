@@ -123,7 +123,9 @@ def mesh_of(**changed: Any) -> renderer.Mesh:
     return replace(MESH, **changed)
 
 
-def calls_of(name: str, call: Callable[[Any], object], *values: Any) -> list[tuple[str, str, Callable[[], object]]]:
+def calls_of(
+    name: str, call: Callable[[Any], object], *values: Any
+) -> list[tuple[str, str, Callable[[], object]]]:
     """(the argument's name, a title, the call) for each wrong value of an argument."""
     return [(name, f"{name}={_title(value)}", lambda value=value: call(value)) for value in values]
 
@@ -267,8 +269,12 @@ RENDERING = [
         MESH,
         [None],
     ),
-    *calls_of("albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH),
-    *calls_of("gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}),
+    *calls_of(
+        "albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH
+    ),
+    *calls_of(
+        "gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}
+    ),
     *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, 65),
     *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3, ["linear"]),
     *calls_of("normals", lambda x: render(normals=x), "Smooth", None, True, np.ones((4, 3))),
@@ -325,7 +331,9 @@ RENDERING = [
 ]
 
 CAMERAS = [
-    *calls_of("views", lambda x: renderer.orbit_cameras(x, 2.0), 0, -1, 2.5, "3", True, None, NAN, [3]),
+    *calls_of(
+        "views", lambda x: renderer.orbit_cameras(x, 2.0), 0, -1, 2.5, "3", True, None, NAN, [3]
+    ),
     *calls_of(
         "width",
         lambda x: renderer.orbit_cameras(1, x),
@@ -356,7 +364,9 @@ CAMERAS = [
         [0.0, 1.0],
         -721.0,
     ),
-    *calls_of("fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, -1.0, NAN, 1j),
+    *calls_of(
+        "fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, -1.0, NAN, 1j
+    ),
     *calls_of(
         "polar",
         lambda x: renderer.OrthographicCamera(x, 0.0, 2.0),
@@ -367,7 +377,9 @@ CAMERAS = [
         torch.ones(3),
         1j,
     ),
-    *calls_of("azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]),
+    *calls_of(
+        "azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]
+    ),
     *calls_of(
         "width",
         lambda x: renderer.OrthographicCamera(57.3, 0.0, x),
@@ -386,7 +398,9 @@ CAMERAS = [
         NAN,
         (0.0, 0.1),
     ),
-    *calls_of("reach", lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x), 0.0, "far", None),
+    *calls_of(
+        "reach", lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x), 0.0, "far", None
+    ),
     *calls_of(
         "distance",
         lambda x: renderer.PerspectiveCamera(57.3, 0.0, 2.0, distance=x),
@@ -402,7 +416,9 @@ CAMERAS = [
 ]
 
 LIGHTS = [
-    *calls_of("light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"),
+    *calls_of(
+        "light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"
+    ),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
     *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41, "6", True, LIGHT),
     *calls_of(
@@ -414,7 +430,9 @@ LIGHTS = [
         LIGHT * NAN,
         COMPLEX,
     ),
-    *calls_of("basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", None, 6),
+    *calls_of(
+        "basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", None, 6
+    ),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT),
     *calls_of(
         "directions",
@@ -426,7 +444,9 @@ LIGHTS = [
         torch.ones(2, 3) * NAN,
         1j,
     ),
-    *calls_of("degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2", None, True),
+    *calls_of(
+        "degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2", None, True
+    ),
     *calls_of("light", harmonics.degree_of, "grace", None, torch.ones(49), torch.ones(3, 49), 6),
     *calls_of(
         "radiance",
@@ -467,8 +487,12 @@ LIGHTS = [
         [None],
         LAMP,
     ),
-    *calls_of("azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", None, NAN, [[1], [1, 2]]),
-    *calls_of("turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", None, 1.0, 11.0, NAN),
+    *calls_of(
+        "azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", None, NAN, [[1], [1, 2]]
+    ),
+    *calls_of(
+        "turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", None, 1.0, 11.0, NAN
+    ),
     *calls_of(
         "positions",
         Lamps,
@@ -494,7 +518,9 @@ MESHES = [
     *calls_of("gloss", lambda x: renderer.load_mesh("a.glb", gloss=x), "yes", 0.3, None),
     *calls_of("mesh", renderer.normalize, "a.glb", None, TRIMESH, MESH.vertices, [MESH]),
     *calls_of("mesh", lambda x: renderer.subdivide(x, 10), "a.glb", None, TRIMESH),
-    *calls_of("vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", None, True, 10**8, NAN),
+    *calls_of(
+        "vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", None, True, 10**8, NAN
+    ),
     *calls_of("mesh", lambda x: renderer.export_mesh(x, "a.glb"), "b.glb", None, TRIMESH),
     *calls_of("path", lambda x: renderer.export_mesh(MESH, x), None, 3, MESH),
     *calls_of("a.obj", lambda x: renderer.export_mesh(MESH, x), "a.obj"),
@@ -571,7 +597,9 @@ MESHES = [
         -MESH.corner_colors,
     ),
     *calls_of("corner_uvs", lambda x: mesh_of(corner_uvs=x), None, np.ones((4, 3)), "x"),
-    *calls_of("texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), np.zeros(4), [0, 0]),
+    *calls_of(
+        "texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), np.zeros(4), [0, 0]
+    ),
     *calls_of(
         "textures",
         lambda x: mesh_of(textures=x),
@@ -601,8 +629,10 @@ MESHES = [
         1j,
         MESH,
     ),
-    *calls_of("metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", None, 1.5, np.ones((4, 3))),
-    *calls_of("strength", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", None, 1.5),
+    *calls_of(
+        "metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", None, 1.5, np.ones((4, 3))
+    ),
+    *calls_of("specular_factor", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", None, 1.5),
     *calls_of("mesh", renderer.Gloss(0.3).on, "a.glb", None, TRIMESH),
 ]
 
@@ -673,7 +703,9 @@ SCENES = [
     *calls_of("lamps", lambda x: scene(lamps=x), LAMP, [[2, 2, 2]], True),
     *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
     *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", None, 3),
-    *calls_of("pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"),
+    *calls_of(
+        "pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"
+    ),
     *calls_of(
         "pattern",
         lambda x: scene(projector=augment.ProjectorSettings(pattern=x)),
@@ -702,7 +734,9 @@ SCENES = [
     ),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, "", MESH),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
-    *calls_of("albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", None, 0, NAN),
+    *calls_of(
+        "albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", None, 0, NAN
+    ),
     *calls_of(
         "color",
         lambda x: augment.ObjectSettings("solid:cup", "cup", color=x),
@@ -762,7 +796,9 @@ SCENES = [
     ),
     *calls_of("instances", lambda x: augment.VariationSettings(instances=x), "yes", None),
     *calls_of("fov", lambda x: augment.VariationSettings(fov=x), 30.0, None, [50, 60], "wide"),
-    *calls_of("gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None, renderer.Gloss(0.3)),
+    *calls_of(
+        "gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None, renderer.Gloss(0.3)
+    ),
     *calls_of("camera", lambda x: augment.VariationSettings(camera=x), 0.3, None, CAMERA),
     *calls_of("noise", lambda x: augment.CameraEffectSettings(noise=x), 2.0, "much", None, NAN),
     *calls_of(
@@ -812,7 +848,9 @@ ATTACKS = [
     *calls_of("norm", augment.StepSettings, "l3", 0.1, None, 2),
     *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN, [0.1], True),
     *calls_of("step", lambda x: augment.StepSettings(step=x), "adam", None, 0.1),
-    *calls_of("step_size", lambda x: augment.StepSettings(step_size=x), 0, -0.1, "small", None, NAN),
+    *calls_of(
+        "step_size", lambda x: augment.StepSettings(step_size=x), 0, -0.1, "small", None, NAN
+    ),
     *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", None, NAN),
     *calls_of("joints", lambda x: augment.PoseSettings(joints=x), "elbow", None, 200.0, [30.0]),
     *calls_of("roughness", lambda x: augment.MaterialSettings(roughness=x), 2, "rough", None),
@@ -827,8 +865,12 @@ ATTACKS = [
         MESH,
     ),
     *calls_of("pose", lambda x: augment.AttackSettings(pose=x), augment.StepSettings(), 10.0, True),
-    *calls_of("material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3),
-    *calls_of("skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings(), True),
+    *calls_of(
+        "material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3
+    ),
+    *calls_of(
+        "skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings(), True
+    ),
     *calls_of(
         "max_steps",
         lambda x: augment.AttackSettings(lighting=STEPS, max_steps=x),
@@ -838,16 +880,24 @@ ATTACKS = [
         -1,
         None,
     ),
-    *calls_of("restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1, None),
-    *calls_of("margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN, None),
-    *calls_of("rounded", lambda x: augment.AttackSettings(lighting=STEPS, rounded=x), "yes", None, 8),
+    *calls_of(
+        "restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1, None
+    ),
+    *calls_of(
+        "margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN, None
+    ),
+    *calls_of(
+        "quantized", lambda x: augment.AttackSettings(lighting=STEPS, quantized=x), "yes", None, 8
+    ),
     *calls_of(
         "allow_negative",
         lambda x: augment.AttackSettings(lighting=STEPS, allow_negative=x),
         "no",
         None,
     ),
-    *calls_of("shorten", lambda x: augment.AttackSettings(lighting=STEPS, shorten=x), "no", None),
+    *calls_of(
+        "backtracking", lambda x: augment.AttackSettings(lighting=STEPS, backtracking=x), "no", None
+    ),
     *calls_of("eot", lambda x: augment.AttackSettings(lighting=STEPS, eot=x), 3, None, True),
     *calls_of(
         "batch_size",
@@ -857,8 +907,12 @@ ATTACKS = [
         "32",
         None,
     ),
-    *calls_of("classifier", attack, None, LINEAR, bright_or_dark, "efficientnet_lite0", small_scene),
-    *calls_of("scene", lambda x: attack(scene=x), None, "solid:orange", [MESH], MESH, CLASSIFIER, IMAGES),
+    *calls_of(
+        "classifier", attack, None, LINEAR, bright_or_dark, "efficientnet_lite0", small_scene
+    ),
+    *calls_of(
+        "scene", lambda x: attack(scene=x), None, "solid:orange", [MESH], MESH, CLASSIFIER, IMAGES
+    ),
     *calls_of(
         "target",
         lambda x: attack(target=x, force=True),
@@ -872,7 +926,9 @@ ATTACKS = [
         LIGHT,
         {},
     ),
-    *calls_of("settings", lambda x: attack(settings=x), {"lighting": STEPS}, STEPS, "lighting", True),
+    *calls_of(
+        "settings", lambda x: attack(settings=x), {"lighting": STEPS}, STEPS, "lighting", True
+    ),
     *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
     *calls_of("seed", lambda x: attack(seed=x, force=True), "x", 1.5, None, -1, True),
     *calls_of("force", lambda x: attack(force=x), "yes", None),
@@ -968,7 +1024,9 @@ DIRECT = [
     *calls_of("camera_effects", lambda x: small_scene().changed(camera_effects=x), 3, "blur"),
     *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes", None),
-    *calls_of("classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}),
+    *calls_of(
+        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
+    ),
     *calls_of("degree", harmonics.quadrature, "x", 2.5, -1, None),
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, None, 4.5),
     *calls_of("examples", lambda x: small_scene().conditions(x), "all", None, [9], 0, [0.5]),
@@ -989,7 +1047,7 @@ DIRECT = [
         [0, 1, 1],
         [True, False],
     ),
-    *calls_of("studied", lambda x: service_of(studied=x), "orange", [0.5], None),
+    *calls_of("positive_classes", lambda x: service_of(positive_classes=x), "orange", [0.5], None),
     *calls_of("phases", lambda x: service_of(phases=x), None, "attack"),
     *calls_of("seed", lambda x: service_of(seed=x), None, "x", 0.5),
     *calls_of("images", lambda x: service_of(images=x), BYTES, IMAGES, [1], "folder"),
@@ -997,7 +1055,9 @@ DIRECT = [
 
 
 CLASSIFIERS = [
-    *calls_of("function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES),
+    *calls_of(
+        "function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES
+    ),
     *calls_of(
         "size",
         lambda x: augment.Classifier(bright_or_dark, x, CLASSES),
@@ -1047,7 +1107,9 @@ CLASSIFIERS = [
     *calls_of("logits", returning((torch.ones(3, 2), None)), IMAGES),
     *calls_of("float16", half_network(), IMAGES),
     *calls_of("float64", augment.Classifier(LINEAR, SIZE, CLASSES), IMAGES.double()),
-    *calls_of("logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities),
+    *calls_of(
+        "logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities
+    ),
     *calls_of("float16", lambda x: attack(x, force=True), half_network()),
     *calls_of("label", CLASSIFIER.label, 3, None, ["orange"], 0.5),
     *calls_of("pear", CLASSIFIER.label, "pear"),
@@ -1055,7 +1117,9 @@ CLASSIFIERS = [
     *calls_of("label", lambda x: CLASSIFIER.detect(IMAGES, x), 3, ["orange"]),
     *calls_of("name", augment.load_classifier, None, 3, LINEAR, ["timm:resnet18"], Path("a.pth")),
     *calls_of("resnet50", augment.load_classifier, "resnet50"),
-    *calls_of("weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR, {}),
+    *calls_of(
+        "weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR, {}
+    ),
     *calls_of("run", load_run, None, 3, LINEAR),
     *calls_of("missing", load_run, "missing"),
     *calls_of("file.txt", load_run, "file.txt"),
@@ -1064,12 +1128,14 @@ CLASSIFIERS = [
 ]
 
 SERVICES = [
-    *calls_of("arm", augment.AugmentationSettings, "all", None, True, 3),
+    *calls_of("mode", augment.AugmentationSettings, "all", None, True, 3),
     *calls_of("folder", lambda x: augment.AugmentationSettings("folder", x), None, 3),
     *calls_of("examples", lambda x: augment.AugmentationSettings(examples=x), 2.5, "x", -1, True),
     *calls_of("init", lambda x: augment.AugmentationSettings(init=x), "zero", None),
     *calls_of("warm_start", lambda x: augment.AugmentationSettings(warm_start=x), "yes", None),
-    *calls_of("every", lambda x: augment.AugmentationSettings(every=x), 0, 2.5, "x"),
+    *calls_of(
+        "regenerate_every", lambda x: augment.AugmentationSettings(regenerate_every=x), 0, 2.5, "x"
+    ),
     *calls_of("vary", lambda x: augment.AugmentationSettings(vary=x), {"shift": 0.1}, None, True),
     *calls_of("random_light", lambda x: augment.AugmentationSettings(random_light=x), 0.5, None),
     *calls_of("attack", lambda x: augment.AugmentationSettings(attack=x), STEPS, None, "lighting"),
@@ -1084,13 +1150,19 @@ SERVICES = [
         3,
     ),
     *calls_of("label", small_service, "orange", 1.5, None, True, [0], NAN),
-    *calls_of("size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0),
-    *calls_of("settings", lambda x: small_service(settings=x), {"arm": "random"}, STEPS, "random"),
+    *calls_of(
+        "size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0
+    ),
+    *calls_of("settings", lambda x: small_service(settings=x), {"mode": "random"}, STEPS, "random"),
     *calls_of("seed", lambda x: small_service(seed=x), "x", 1.5, None, -1),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2, 53),
     *calls_of("model", lambda x: small_service().regenerate(x, 0), None, "resnet", 3, IMAGES),
-    *calls_of("model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2), HALF),
-    *calls_of("logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))),
+    *calls_of(
+        "model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2), HALF
+    ),
+    *calls_of(
+        "logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))
+    ),
     *calls_of("number", lambda x: small_service().regenerate(LINEAR, x), "x", 1.5, None, -1, True),
     *calls_of(
         "state",
@@ -1108,8 +1180,12 @@ SERVICES = [
         lambda x: x.load_state_dict(small_service(light="uniform").state_dict()),
         small_service(),
     ),
-    *calls_of("state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()),
-    *calls_of("state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()),
+    *calls_of(
+        "state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()
+    ),
+    *calls_of(
+        "state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()
+    ),
 ]
 
 SCORES = [
@@ -1124,7 +1200,12 @@ SCORES = [
         lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), x, "orange", Path("out")),
         "file.txt",
     ),
-    *calls_of("out", lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", "orange", x), None, 3),
+    *calls_of(
+        "out",
+        lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", "orange", x),
+        None,
+        3,
+    ),
     *calls_of(
         "file.txt",
         lambda x: evaluate_photographs(Predictor(LINEAR, CLASSES, SIZE), "photos", "orange", x),
@@ -1198,13 +1279,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "folder.glb").mkdir()
     for name in ("orange", "other"):
         (here / "photos" / name).mkdir(parents=True)
-        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(here / "photos" / name / "0.png")
+        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
+            here / "photos" / name / "0.png"
+        )
     return here
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS])
-def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(folder, monkeypatch, name, call):
+@pytest.mark.parametrize(
+    ("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS]
+)
+def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
+    folder, monkeypatch, name, call
+):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError) as refused:
         call()

@@ -44,8 +44,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from renderer.errors import InputError
 from renderer.settings import Settings
+from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
-from train.system.user_errors import one_sentence
+from train.system.user_errors import user_message
 
 USER_ERROR = 2  # exit status
 INTERRUPTED = "ended by SIGINT"
@@ -123,7 +124,8 @@ class Command:
         # Hydra's parser of options wants --multirun before the settings.
         words = sorted(arguments, key=lambda word: word not in SWEEP_FLAGS)
         keys = self.keys
-        return [as_override(word, keys) for word in self.rewrite(words)]
+        present = [replace_former_key(word) for word in self.rewrite(words)]
+        return [as_override(word, keys) for word in present]
 
     def run(self, config: DictConfig) -> None:
         """Run the command for a composed configuration. Hydra calls this method."""
@@ -181,7 +183,7 @@ class Command:
             if any(isinstance(cause, KeyboardInterrupt) for cause in causes(error)):
                 print(INTERRUPTED, file=sys.stderr)
                 sys.exit(128 + signal.SIGINT)
-            sentence = explain(error, self.keys, sys.argv[1:]) or one_sentence(error)
+            sentence = explain(error, self.keys, sys.argv[1:]) or user_message(error)
             if sentence is None:
                 raise
             print(f"error: {sentence}", file=sys.stderr)

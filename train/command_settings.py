@@ -11,7 +11,7 @@ from typing import Any
 
 from augment.attack_settings import AttackSettings
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
-from renderer.errors import FACTOR, InputError, require_choice
+from renderer.errors import MAX_SCALE, InputError, require_choice
 from renderer.settings import (
     ENCODINGS,
     MAX_BOUNCES,
@@ -64,8 +64,8 @@ class AttackCommandSettings(AttackSettings):
         [],
         "Measure success against radius at these factors of each radius, such as "
         "[0.25, 0.5, 1, 2]. A radius of null counts as 1.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
     )
     verify: str | None = setting(
         "reload",
@@ -210,8 +210,8 @@ class LabSettings(Settings):
     brightness: list[float] = setting(
         [0.2, 2.5],
         "Smallest and largest radiance of white surfaces that face the light.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
         is_pair=True,
     )
     azimuth: list[float] = setting(
@@ -260,8 +260,8 @@ class LabSettings(Settings):
     exposure: float = setting(
         1.0,
         "Factor of the radiance. With 1, a radiance of 1 is white.",
-        minimum=1 / FACTOR,
-        maximum=FACTOR,
+        minimum=1 / MAX_SCALE,
+        maximum=MAX_SCALE,
     )
     size: int = setting(64, "Pixels per side.", minimum=1, maximum=MAX_SIZE)
     spp: int = setting(32, "Paths per pixel and light.", minimum=1, maximum=10**5)

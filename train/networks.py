@@ -17,7 +17,7 @@ from augment.classifiers import build_classifier
 from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.sources import require_architecture
 from augment.model_passes import eval_mode
-from renderer.errors import InputError, in_one_line
+from renderer.errors import InputError, single_line
 from train.settings import WIDERESNET
 
 # Start of the name of an architecture of torchvision.
@@ -269,7 +269,7 @@ def build_network(
         _require_logits(network, len(classes), size)
     except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         task = f"{len(classes)} logits for images of {size} pixels per side"
-        fault = f"name={name} does not give {task} ({in_one_line(error)})"
+        fault = f"name={name} does not give {task} ({single_line(error)})"
         raise InputError(f"{fault}: choose another", "name") from error
     return network
 

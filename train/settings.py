@@ -16,7 +16,7 @@ from augment.settings import (
     SceneSettings,
     count_views,
 )
-from renderer.errors import FACTOR, InputError, describe, is_whole, require_range
+from renderer.errors import MAX_SCALE, InputError, describe, is_whole, require_range
 from renderer.settings import (
     MAX_SIZE,
     MAX_VIEWS,
@@ -183,7 +183,7 @@ class TrainSettings(Settings):
         maximum=10**9,
     )
     batch_size: int = setting(128, "Images per training step.", minimum=1, maximum=10**6)
-    accumulate: int = setting(
+    accumulation_steps: int = setting(
         1,
         "Number of parts into which each batch is divided to save memory.",
         minimum=1,
@@ -194,11 +194,11 @@ class TrainSettings(Settings):
         "Optimizer. adamw decays no biases and norms.",
         choices=OPTIMIZERS,
     )
-    learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=FACTOR)
+    learning_rate: float = setting(0.125, "Highest learning rate.", above=0, maximum=MAX_SCALE)
     momentum: float = setting(0.9, "Nesterov momentum.", minimum=0, below=1)
-    weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=FACTOR)
+    weight_decay: float = setting(5e-4, "Weight decay.", minimum=0, maximum=MAX_SCALE)
     clip_gradient: float | None = setting(
-        None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=FACTOR
+        None, "Largest norm of the gradient of a batch. null: any.", above=0, maximum=MAX_SCALE
     )
     freeze: str | None = setting(
         None,
@@ -221,18 +221,18 @@ class TrainSettings(Settings):
         choices=AUGMENTATIONS,
     )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
-    ranking: float = setting(
+    ranking_weight: float = setting(
         0.0,
         "Weight of the loss that ranks the images of `label` in a batch above the others.",
         minimum=0,
-        maximum=FACTOR,
+        maximum=MAX_SCALE,
     )
-    distillation: float = setting(
+    distillation_weight: float = setting(
         0.0,
         "Weight of the divergence from the predictions of the network train.init_from. "
         "On renders, this counts classes other than `label`.",
         minimum=0,
-        maximum=FACTOR,
+        maximum=MAX_SCALE,
     )
     ema_decay: float = setting(
         0.0,
@@ -288,7 +288,7 @@ class TrainSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.distillation or self.soup or self.eval_mode) and not self.init_from:
+        if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
             needed = "distillation, soup and eval_mode need a network to begin with"
             raise InputError(f"{needed}: set init_from")
 
@@ -375,7 +375,7 @@ class ExperimentSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         label_names(self.label)
-        if self.augment.renders and self.augment.arm != "folder":
+        if self.augment.renders and self.augment.mode != "folder":
             if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
                 remedy = "an attack on the pose needs renderer.silhouettes=true"
                 raise InputError(f"renderer.silhouettes=false: {remedy}", "renderer.silhouettes")

@@ -18,16 +18,16 @@ from augment.scene.scene import Scene
 from renderer.angles import ANGLE_UNIT, DEGREES, angles_in_degrees
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import (
-    FACTOR,
+    MAX_SCALE,
     InputError,
-    in_one_line,
     require_bounded,
     require_file,
     require_range,
+    single_line,
 )
 from renderer.image import to_bytes
 from renderer.io.export import export_mesh
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import gray_or_image, read_numbers, write_image, write_numbers
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
@@ -52,7 +52,7 @@ MITSUBA = "mitsuba"
 MAP_HEIGHT = 256
 
 # Fraction of the brightest radiance that an .hdr file rounds off.
-NOWHERE = 2.0**-8
+RGBE_TOLERANCE = 2.0**-8
 
 
 @dataclass(frozen=True)
@@ -209,10 +209,10 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         write_numbers(folder / PIXELS, adversary.pixels.numpy())
     _write_views(adversary.images_before, folder, BEFORE)
     _write_views(adversary.images, folder, AFTER)
-    write_whole(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+    atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     radiance = to_map(light, MAP_HEIGHT)
-    if radiance.min() >= -NOWHERE * radiance.max():
+    if radiance.min() >= -RGBE_TOLERANCE * radiance.max():
         for suffix in (".hdr", ".exr"):
             write_map(folder / f"light{suffix}", radiance)
     write_mitsuba_scene(
@@ -301,7 +301,7 @@ def reload(folder: str | Path) -> Adversary:
     # JSON, and the types that it may hold instead of a description, raise many
     # types of errors.
     except Exception as error:
-        message = f"{path} does not describe an adversary ({in_one_line(error)}): write it again"
+        message = f"{path} does not describe an adversary ({single_line(error)}): write it again"
         raise InputError(message) from error
 
 
@@ -351,7 +351,7 @@ def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:
     own_faces = description["own_faces"]
     own_faces = None if own_faces is None else int(own_faces)
     albedo_scale = float(description["albedo_scale"])
-    require_range("albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
+    require_range("albedo_scale", albedo_scale, 1 / MAX_SCALE, MAX_SCALE)
     require_range("own_faces", own_faces, 1, len(mesh.faces))
     return SceneObject(
         str(description["label"]),
@@ -372,6 +372,6 @@ def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
             raise InputError(f"it has shape {tuple(images.shape)}, not {shape}")
     # Python's parser raises many types of errors for a damaged header.
     except Exception as error:
-        message = f"{path} cannot be read ({in_one_line(error)}): write the adversary again"
+        message = f"{path} cannot be read ({single_line(error)}): write the adversary again"
         raise InputError(message) from error
     return images

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary
-from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.descent import Criterion, DescentResult, descend
 from augment.attacks.eot import preprocessed_model, stored
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
@@ -64,7 +64,7 @@ class AttackResult:
     Attributes:
         problem: The attacked scene, and the parameters that were changed.
         classifier: The attacked classifier, without rounding.
-        goal: Source and target class of each view.
+        criterion: Source and target class of each view.
         settings: Settings of the attack.
         seed: Seed of the attack.
         images_before: Images before the attack, in [0, 1] and not rounded,
@@ -84,7 +84,7 @@ class AttackResult:
 
     problem: AttackProblem
     classifier: Classifier
-    goal: Goal
+    criterion: Criterion
     settings: AttackSettings
     seed: int
     images_before: Tensor
@@ -102,24 +102,24 @@ class AttackResult:
 
     @property
     def success(self) -> Tensor:
-        """Whether every view reaches its goal, also with the noise of a sensor, (E,) bool."""
+        """Whether every view reaches its criterion, also with the noise of a sensor, (E,) bool."""
         return self.success_in_views.all(1)
 
     @property
     def success_without_noise(self) -> Tensor:
-        """Whether every view reaches its goal as the classifier gets it, (E,) bool."""
-        return self.goal.reached(self.logits.argmax(2))
+        """Whether every view reaches its criterion as the classifier gets it, (E,) bool."""
+        return self.criterion.reached(self.logits.argmax(2))
 
     @property
     def success_with_margin(self) -> Tensor:
         """Whether a success also leads by `settings.margin` in every view, (E,) bool."""
-        gaps = logit_gap(self.logits, self.goal.source, self.goal.target)
+        gaps = logit_gap(self.logits, self.criterion.source, self.criterion.target)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
-        """Whether every view reached its goal before the attack, (E,) bool."""
-        return self.goal.reached(self.logits_before.argmax(2))
+        """Whether every view reached its criterion before the attack, (E,) bool."""
+        return self.criterion.reached(self.logits_before.argmax(2))
 
     @property
     def clean_correct(self) -> Tensor:
@@ -127,7 +127,7 @@ class AttackResult:
 
         Only then is a success the merit of the attack.
         """
-        return (self.logits_before.argmax(2) == self.goal.source).all(1)
+        return (self.logits_before.argmax(2) == self.criterion.source).all(1)
 
     @property
     def steps(self) -> Tensor:
@@ -137,7 +137,7 @@ class AttackResult:
     @property
     def conditions(self) -> Conditions:
         """Light, shape, colors and other conditions of the E examples after the attack."""
-        return self.problem.conditions(self.descent.values, self.problem.everything)
+        return self.problem.conditions(self.descent.values, self.problem.all_examples)
 
     def plot(self, example: int = 0, view: int = 0) -> Figure:
         """Draw one view: before, the light after the attack, after, and the probabilities.
@@ -266,7 +266,9 @@ def attack(
     size = scene.settings.size
     device = scene.lights.device
     with gradient_flags_kept(classifier):
-        adapted = as_classifier(classifier, size, classes, normalization, value_range, device, "classifier")
+        adapted = as_classifier(
+            classifier, size, classes, normalization, value_range, device, "classifier"
+        )
         return _attack(adapted, scene, target, settings, seed, force)
 
 
@@ -292,28 +294,28 @@ def _attack(
     source = source_labels(scene, logits_before, classifier)
     if not force:
         require_clean_correct(scene, logits_before, source, classifier)
-    goal = Goal(source, target_labels(target, source, logits_before, classifier))
+    criterion = Criterion(source, target_labels(target, source, logits_before, classifier))
 
     phases = Phases(problem.start.device)
     with phases("attack"):
         restarts = random_starts(problem, settings.restarts, seed)
-        descent = descend(model, problem, goal, settings, phases, restarts=restarts, seed=seed)
-        images = final_images(problem, descent.values, problem.everything, descent.images)
+        descent = descend(model, problem, criterion, settings, phases, restarts=restarts, seed=seed)
+        images = final_images(problem, descent.values, problem.all_examples, descent.images)
 
     logits = logits_of(model, images, settings.batch_size)
     success_in_views = fooled_in_views(
         model,
         images,
         logits.argmax(2),
-        problem.everything,
-        goal,
+        problem.all_examples,
+        criterion,
         settings,
         seed,
     )
     return AttackResult(
         problem=problem,
         classifier=classifier,
-        goal=goal,
+        criterion=criterion,
         settings=settings,
         seed=seed,
         images_before=images_before,
@@ -523,14 +525,14 @@ def fooled_in_views(
     images: Tensor,
     predicted: Tensor,
     examples: Tensor,
-    goal: Goal,
+    criterion: Criterion,
     settings: AttackSettings,
     seed: int,
 ) -> Tensor:
     """Decide which views count as a success.
 
     Attacks, their checks, sweeps, transfers and files all decide by this
-    function. A view counts if it reaches the goal as it is and in each of the
+    function. A view counts if it reaches the criterion as it is and in each of the
     images that a camera stores of it (`augment.attacks.eot.stored`). An example
     has the same noise wherever it is counted under a seed, so that a search
     with many tries does not draw the noise again.
@@ -542,7 +544,7 @@ def fooled_in_views(
         predicted: Classes of these images, shape (A, V), int64.
         examples: Indices of the A examples, on which their noise depends,
             shape (A,), int64.
-        goal: Source and target classes of the A examples.
+        criterion: Source and target classes of the A examples.
         settings: Settings of the attack. With `sensor_noise=0`, the images as
             they are decide.
         seed: Seed of the noise.
@@ -551,13 +553,13 @@ def fooled_in_views(
         Whether each view counts, shape (A, V), bool, on the device of
         `predicted`.
     """
-    fooled = goal.reached_in_views(predicted)
+    fooled = criterion.reached_in_views(predicted)
     rows = torch.nonzero(fooled.any(1)).squeeze(1)
     if not settings.sensor_noise or not len(rows):
         return fooled
     images_of_rows = images[rows.to(images.device)]
     examples_of_rows = examples.to(rows.device)[rows]
-    goal_of_rows = goal.of(rows)
+    goal_of_rows = criterion.select(rows)
     noisy_versions = stored(
         images_of_rows,
         settings.sensor_noise,

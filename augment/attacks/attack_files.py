@@ -22,7 +22,7 @@ from augment.attacks.eot import as_jpeg
 from augment.progress import progress
 from renderer.errors import InputError, require_choice
 from renderer.image import background_term, clamp, encode, to_bytes, to_unit
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.io.tiles import Tile, draw_grid, tiles_of
 from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
@@ -98,7 +98,7 @@ def save(
     all_lines = list(lines)
     if checks is not None:
         all_lines.append({"checks": checks, "warnings": warnings(checks)})
-    write_whole(folder / LINES, "".join(json.dumps(line) + "\n" for line in all_lines))
+    atomic_write(folder / LINES, "".join(json.dumps(line) + "\n" for line in all_lines))
     return lines
 
 
@@ -122,7 +122,7 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
     """Write the figure and the folder of each example, and return its numbers."""
     problem = result.problem
     scene = problem.scene
-    conditions_before = problem.conditions(problem.start, problem.everything)
+    conditions_before = problem.conditions(problem.start, problem.all_examples)
     conditions_after = result.conditions
     lines = []
     for example, path in enumerate(progress(paths, "saving")):
@@ -143,7 +143,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     classes = result.classifier.classes
     before = predictions(result.logits_before[example], classes)
     change = descent.values[[example]] - result.problem.start[[example]]
-    changes = result.problem.by_parameter(change)
+    changes = result.problem.split_by_parameter(change)
     largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
     return {
         "clean_correct": bool(result.clean_correct[example]),
@@ -155,7 +155,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "steps": int(result.steps[example]),
         "cost_before": float(descent.cost_before[example]),
         "cost": float(descent.cost[example]),
-        "label": [classes[index] for index in result.goal.source[example].tolist()],
+        "label": [classes[index] for index in result.criterion.source[example].tolist()],
         "predicted_before": before["predicted"],
         "confidence_before": before["confidence"],
         **predictions(result.logits[example], classes),
@@ -200,13 +200,13 @@ def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, 
         result.preprocessed_model,
         images,
         predicted,
-        result.problem.everything,
-        result.goal,
+        result.problem.all_examples,
+        result.criterion,
         result.settings,
         result.seed,
     )
     success = success_in_views.all(1)
-    without_noise = result.goal.reached(predicted)
+    without_noise = result.criterion.reached(predicted)
     differences = (images - result.images).abs().flatten(1)
     numbers = []
     for example, difference in enumerate(differences):
@@ -286,7 +286,7 @@ def _columns_of_light(result: AttackResult, example: int) -> dict[str, list[Tile
     """Return tiles of the light before and after an attack; none if it did not change."""
     problem = result.problem
     scene = problem.scene
-    row = problem.everything[[example]]
+    row = problem.all_examples[[example]]
     conditions_before = problem.conditions(problem.start[row], row)
     conditions_after = problem.conditions(result.descent.values[row], row)
     basis_before = scene.basis_under(conditions_before, 0)
@@ -313,7 +313,7 @@ def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[
     If the class is wrong, the right class and its confidence follow.
     """
     classes = result.classifier.classes
-    labels = result.goal.source[example].tolist()
+    labels = result.criterion.source[example].tolist()
     captions = []
     for probabilities, label in zip(logits[example].softmax(1), labels, strict=True):
         shown = dict.fromkeys([int(probabilities.argmax()), label])

@@ -21,7 +21,7 @@ from augment.attacks.attack import (
     predictions,
     require_result,
 )
-from augment.attacks.descent import Goal, descend
+from augment.attacks.descent import Criterion, descend
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
@@ -30,7 +30,7 @@ from augment.parameter_settings import StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
-from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
 from renderer.validation import as_list, require_number
 
 # `check` also takes so many times as many steps as the attack.
@@ -201,7 +201,7 @@ def transfer(
         A dict for each, for JSON. "network", "azimuth" or "mesh" tells which.
         "clean_correct" and "success", A values each, tell whether every view is
         classified correctly before the attack, and whether every view reaches
-        the goal after it, which counts as in the result, with the noise of a
+        the criterion after it, which counts as in the result, with the noise of a
         sensor. "success_without_noise" is by the images as they are.
         "predicted_before", "confidence_before", "predicted" and "confidence"
         have A × V values.
@@ -228,7 +228,7 @@ def transfer(
     azimuths = as_list("azimuths", azimuths, object, "a list of degrees")
     for azimuth in azimuths:
         require_number("azimuths", azimuth)
-        require_range("azimuths", azimuth, -LARGEST, LARGEST)
+        require_range("azimuths", azimuth, -MAX_MAGNITUDE, MAX_MAGNITUDE)
     names = [parameter.name for parameter in result.problem.parameters]
     require_transferable(names, azimuths, objects)
 
@@ -317,19 +317,19 @@ class Successes:
         (see `final_images`).
 
         Args:
-            result: The attack, with its goal and classifier.
+            result: The attack, with its criterion and classifier.
             problem: What the values are of.
             values: Values of the A examples, shape (A, D).
             examples: Indices of the examples, shape (A,).
             images: Images that the problem rendered of them,
                 shape (A, V, 3, H, W).
         """
-        is_reached = result.goal.of(examples).reached(_predicted(result, images))
+        is_reached = result.criterion.select(examples).reached(_predicted(result, images))
         rows = torch.nonzero(is_reached).squeeze(1)
         if not len(rows):
             return
         chosen = examples[rows]
-        goal = result.goal.of(chosen)
+        criterion = result.criterion.select(chosen)
         final = final_images(problem, values[rows], chosen, images[rows])
         predicted = _predicted(result, final)
         fooled = fooled_in_views(
@@ -337,11 +337,11 @@ class Successes:
             final,
             predicted,
             chosen,
-            goal,
+            criterion,
             result.settings,
             result.seed,
         )
-        self.without_noise[chosen] |= goal.reached(predicted)
+        self.without_noise[chosen] |= criterion.reached(predicted)
         self.counted[chosen] |= fooled.all(1)
 
 
@@ -385,7 +385,7 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
             end = descend(
                 result.preprocessed_model,
                 result.problem,
-                result.goal.of(left),
+                result.criterion.select(left),
                 longer,
                 examples=left,
                 seed=result.seed,
@@ -407,7 +407,7 @@ def _as_scales(scales: Sequence[float]) -> list[float]:
         raise InputError("scales is empty: give factors of the radii")
     for scale in listed:
         require_number("scales", scale)
-        require_range("scales", scale, 1 / FACTOR, FACTOR)
+        require_range("scales", scale, 1 / MAX_SCALE, MAX_SCALE)
     return listed
 
 
@@ -431,7 +431,7 @@ def _descend_further(
     end = descend(
         result.preprocessed_model,
         problem,
-        result.goal.of(left),
+        result.criterion.select(left),
         result.settings,
         examples=left,
         start=values[left],
@@ -471,7 +471,7 @@ class _Adversaries:
         """Return the clean-correct examples with success."""
         problem = result.problem
         chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
-        conditions_before = problem.conditions(problem.start, problem.everything)
+        conditions_before = problem.conditions(problem.start, problem.all_examples)
         conditions_after = result.conditions
         before = []
         after = []
@@ -490,7 +490,7 @@ class _Adversaries:
     def shown_to(self, classifier: Classifier) -> dict[str, Any]:
         """Return what a classifier predicts for the adversaries; see `transfer`."""
         settings = self.result.settings
-        goal = self._goal(classifier)
+        criterion = self._goal(classifier)
         logits_before = self._logits(self._rendered(self.before, classifier), classifier)
         images = self._rendered(self.after, classifier)
         logits = self._logits(images, classifier)
@@ -500,32 +500,32 @@ class _Adversaries:
             images,
             logits.argmax(2),
             torch.tensor(self.examples, dtype=torch.long),
-            goal,
+            criterion,
             settings,
             self.result.seed,
         )
         return {
-            "clean_correct": (logits_before.argmax(2) == goal.source).all(1).tolist(),
+            "clean_correct": (logits_before.argmax(2) == criterion.source).all(1).tolist(),
             "success": success_in_views.all(1).tolist(),
-            "success_without_noise": goal.reached(logits.argmax(2)).tolist(),
+            "success_without_noise": criterion.reached(logits.argmax(2)).tolist(),
             "predicted_before": predicted_before["predicted"],
             "confidence_before": predicted_before["confidence"],
             **predictions(logits, classifier.classes),
         }
 
-    def _goal(self, classifier: Classifier) -> Goal:
-        """Return the goal of the adversaries in the classes of a classifier."""
+    def _goal(self, classifier: Classifier) -> Criterion:
+        """Return the criterion of the adversaries in the classes of a classifier."""
         view_count = self.result.problem.scene.views
         sources = [[adversary.shown.label] * view_count for adversary in self.after]
         source = self._labels(sources, classifier)
-        if self.result.goal.target is None:
-            return Goal(source)
+        if self.result.criterion.target is None:
+            return Criterion(source)
         attacked_classes = self.result.classifier.classes
         targets = [
-            [attacked_classes[index] for index in self.result.goal.target[example].tolist()]
+            [attacked_classes[index] for index in self.result.criterion.target[example].tolist()]
             for example in self.examples
         ]
-        return Goal(source, self._labels(targets, classifier))
+        return Criterion(source, self._labels(targets, classifier))
 
     def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
         """Return the classes (A, V) of names of classes, A lists of V."""

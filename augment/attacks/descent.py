@@ -15,11 +15,11 @@ by repeating the step
 
 `norm_ball.take_step` takes this step: it scales the gradient, and returns the
 nearest values that are feasible and lie in the norm-ball. The length is 1. With
-backtracking (`AttackSettings.shorten`), a step that does not lower the cost is
+backtracking (`AttackSettings.backtracking`), a step that does not lower the cost is
 undone and tried again at half its length.
 
 One forward and backward pass of the classifier gives the cost, its gradient and
-the predictions. An example succeeds when the predictions reach its goal in
+the predictions. An example succeeds when the predictions reach its criterion in
 every view. It is finished when the logits also lead by `AttackSettings.margin`
 in every view and, if the settings ask for it, by more than the noise of a
 sensor changes them. Until then it stays active: it takes further steps, and its
@@ -39,7 +39,7 @@ from torch import Tensor, nn
 
 from augment.attacks.eot import ExpectationOverTransformations, stored
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
-from augment.model_passes import BatchSize, as_found
+from augment.model_passes import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 
@@ -51,13 +51,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Goal:
+class Criterion:
     """Source and target class of each view of an attack.
 
     An attack lowers the confidence in the source class of each view and raises
-    the confidence in its target class. A view reaches the goal when it is
+    the confidence in its target class. A view reaches the criterion when it is
     classified as its target or, without a target, as any class except its
-    source. An example reaches the goal when all its views do.
+    source. An example reaches the criterion when all its views do.
 
     Attributes:
         source: Source class of each view. NO_CLASS removes the source from the
@@ -66,36 +66,36 @@ class Goal:
             untargeted. None makes the attack on all views untargeted.
 
     Example:
-        >>> goal = Goal(source=torch.tensor([[0, 0]]))
-        >>> goal.reached(torch.tensor([[2, 1]])), goal.reached(torch.tensor([[2, 0]]))
+        >>> criterion = Criterion(source=torch.tensor([[0, 0]]))
+        >>> criterion.reached(torch.tensor([[2, 1]])), criterion.reached(torch.tensor([[2, 0]]))
         (tensor([True]), tensor([False]))
     """
 
     source: Int[Tensor, "E V"]
     target: Int[Tensor, "E V"] | None = None
 
-    def of(self, examples: Tensor | slice) -> Goal:
-        """Return the goal of some of the examples.
+    def select(self, examples: Tensor | slice) -> Criterion:
+        """Return the criterion of some of the examples.
 
         Args:
             examples: Indices of the examples, shape (A,), or a slice.
         """
         if self.target is None:
-            return Goal(self.source[examples])
-        return Goal(self.source[examples], self.target[examples])
+            return Criterion(self.source[examples])
+        return Criterion(self.source[examples], self.target[examples])
 
-    def flatten(self) -> Goal:
-        """Return a goal with an entry for each view of each example, in shape (E · V,)."""
+    def flatten(self) -> Criterion:
+        """Return a criterion with an entry for each view of each example, in shape (E · V,)."""
         if self.target is None:
-            return Goal(self.source.flatten())
-        return Goal(self.source.flatten(), self.target.flatten())
+            return Criterion(self.source.flatten())
+        return Criterion(self.source.flatten(), self.target.flatten())
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
-        """Return whether all views of each example are predicted as its goal demands."""
+        """Return whether all views of each example are predicted as its criterion demands."""
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
-        """Return whether each view is predicted as its goal demands."""
+        """Return whether each view is predicted as its criterion demands."""
         is_misclassified = predicted != self.source
         if self.target is None:
             return is_misclassified
@@ -116,8 +116,8 @@ class DescentResult:
         values: Values of the returned candidate.
         images: Images of the returned candidate, in [0, 1].
         steps: Number of steps taken, including those of restarts.
-        success_before: Whether the initial values reach the goal.
-        success: Whether the returned candidate reaches the goal, without noise.
+        success_before: Whether the initial values reach the criterion.
+        success: Whether the returned candidate reaches the criterion, without noise.
         cost_before: Cost of the initial values (equation 1).
         cost: Cost of the returned candidate (equation 1).
         predicted: Class predicted for each view of the returned candidate.
@@ -181,7 +181,7 @@ class DescentResult:
 def descend(
     model: nn.Module,
     problem: AttackProblem,
-    goal: Goal,
+    criterion: Criterion,
     settings: AttackSettings,
     phases: Phases | None = None,
     *,
@@ -192,7 +192,7 @@ def descend(
 ) -> DescentResult:
     """Attack examples by projected gradient descent, with restarts.
 
-    Examples are attacked in groups of at most `problem.at_once`, which limits
+    Examples are attacked in groups of at most `problem.group_size`, which limits
     the memory that the gradients take. The model runs in evaluation mode, and
     its state is restored afterwards.
 
@@ -200,7 +200,7 @@ def descend(
         model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
             [0, 1] to logits (N, C).
         problem: Attacked parameters and the scene that renders them.
-        goal: Source and target classes of the A examples.
+        criterion: Source and target classes of the A examples.
         settings: Number of steps, margin, backtracking, batch size, and the
             random transformations of EOT (expectation over transformations).
         phases: Timer to which the seconds of the classifier passes are added.
@@ -229,16 +229,16 @@ def descend(
         phases=phases or Phases(),
         seed=seed,
     )
-    rows_by_group = torch.arange(len(start), device=start.device).split(problem.at_once)
+    rows_by_group = torch.arange(len(start), device=start.device).split(problem.group_size)
     if len(rows_by_group) == 1:
-        return descent.run_with_restarts(goal, examples, start, restarts)
+        return descent.run_with_restarts(criterion, examples, start, restarts)
 
     # Every group needs all restarts, but an iterator yields them only once.
     restarts = list(restarts)
     result = None
     for rows in progress(rows_by_group, "groups of examples"):
         group_result = descent.run_with_restarts(
-            goal.of(rows),
+            criterion.select(rows),
             examples[rows],
             start[rows],
             (restart[rows] for restart in restarts),
@@ -272,12 +272,12 @@ class Descent:
     seed: int
 
     def run_with_restarts(
-        self, goal: Goal, examples: Tensor, start: Tensor, restarts: Iterable[Tensor]
+        self, criterion: Criterion, examples: Tensor, start: Tensor, restarts: Iterable[Tensor]
     ) -> DescentResult:
         """Attack examples from their start, and from each restart until they succeed.
 
         Args:
-            goal: Source and target classes of the A examples.
+            criterion: Source and target classes of the A examples.
             examples: Indices of the attacked examples in the problem,
                 shape (A,).
             start: Initial values, shape (A, D).
@@ -286,24 +286,24 @@ class Descent:
         Returns:
             Result of the A examples.
         """
-        result = self.run(goal, examples, start)
+        result = self.run(criterion, examples, start)
         for restart in restarts:
             failed_rows = torch.nonzero(~result.success).squeeze(1)
             if not len(failed_rows):
                 break
-            failed_goal = goal.of(failed_rows)
+            failed_goal = criterion.select(failed_rows)
             restarted = self.run(failed_goal, examples[failed_rows], restart[failed_rows])
             result.add_restart(failed_rows, restarted)
         return result
 
     @torch.enable_grad()
-    def run(self, goal: Goal, examples: Tensor, start: Tensor) -> DescentResult:
+    def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
         """Take gradient steps until all examples are finished, or `max_steps` of them.
 
         Only examples that are not finished are rendered and classified.
 
         Args:
-            goal: Source and target classes of the A examples.
+            criterion: Source and target classes of the A examples.
             examples: Indices of the attacked examples in the problem,
                 shape (A,).
             start: Initial values, shape (A, D).
@@ -311,8 +311,8 @@ class Descent:
         Returns:
             Result of the A examples.
         """
-        state = _State.at_start(goal, examples, start, self.settings.batch_size)
-        with as_found(self.model):
+        state = _State.at_start(criterion, examples, start, self.settings.batch_size)
+        with frozen_eval_mode(self.model):
             # The initial values are evaluated before the first step, so there
             # is one more evaluation than steps.
             for step in progress(range(self.settings.max_steps + 1), "attack, until all succeed"):
@@ -329,27 +329,29 @@ class Descent:
     def _evaluate(self, state: _State) -> _Evaluation:
         """Render and classify the candidates of the N active examples."""
         candidate = state.candidate[state.active_rows].requires_grad_(True)
-        goal = state.goal.of(state.active_rows)
+        criterion = state.criterion.select(state.active_rows)
         rendered = self.problem.render(candidate, state.examples[state.active_rows])
         images = rendered.detach()
         with self.phases("attack_classifier"):
-            score, image_gradient = self._score(images, goal, state.batch_size)
+            score, image_gradient = self._score(images, criterion, state.batch_size)
         # The chain rule continues the gradient from the images to the values.
         (gradient,) = torch.autograd.grad(rendered, candidate, image_gradient)
         return _Evaluation(
             values=candidate.detach(),
             images=images,
             score=score,
-            is_goal_reached=goal.reached(score.predicted),
+            is_criterion_met=criterion.reached(score.predicted),
             gradient=gradient,
         )
 
-    def _score(self, images: Tensor, goal: Goal, batch_size: BatchSize) -> tuple[_Score, Tensor]:
+    def _score(
+        self, images: Tensor, criterion: Criterion, batch_size: BatchSize
+    ) -> tuple[_Score, Tensor]:
         """Compute the costs, logit gaps and predictions of N examples, batch by batch.
 
         Args:
             images: Rendered images, shape (N, V, 3, H, W).
-            goal: Source and target classes of the N examples.
+            criterion: Source and target classes of the N examples.
             batch_size: Images per classifier pass.
 
         Returns:
@@ -359,7 +361,7 @@ class Descent:
         view_count = images.shape[1]
         all_images = images.flatten(0, 1)
         all_gradients = torch.empty_like(all_images)
-        score_batch = partial(self._score_batch, all_images, goal.flatten(), all_gradients)
+        score_batch = partial(self._score_batch, all_images, criterion.flatten(), all_gradients)
         scores = list(batch_size.map(score_batch, len(all_images)))
         # Each of these has shape (N, V).
         cost = torch.cat([score.cost for score in scores]).unflatten(0, (-1, view_count))
@@ -371,7 +373,7 @@ class Descent:
     def _score_batch(
         self,
         all_images: Tensor,
-        goal: Goal,
+        criterion: Criterion,
         all_gradients: Tensor,
         batch_rows: slice,
     ) -> _Score:
@@ -383,7 +385,7 @@ class Descent:
         Args:
             all_images: The images of all examples and views, shape
                 (N · V, 3, H, W).
-            goal: Source and target class of each image, shape (N · V,).
+            criterion: Source and target class of each image, shape (N · V,).
             all_gradients: Gradients of the costs with respect to all images,
                 shape (N · V, 3, H, W).
             batch_rows: Rows of the batch among the N · V images.
@@ -392,7 +394,7 @@ class Descent:
             Score of each image of the batch.
         """
         batch = all_images[batch_rows].detach().requires_grad_(True)
-        classes = goal.of(batch_rows)
+        classes = criterion.select(batch_rows)
         logits = self.model(batch)
         expected_logits = self.expectation(self.model, batch, logits)
         cost = adversarial_cost(expected_logits, classes.source, classes.target)
@@ -409,13 +411,13 @@ class Descent:
     def _decide(self, state: _State, evaluation: _Evaluation) -> _Decision:
         """Decide which candidates are finished, accepted and kept (see `_Decision`)."""
         active_rows = state.active_rows
-        is_success = evaluation.is_goal_reached
+        is_success = evaluation.is_criterion_met
         cost = evaluation.score.cost
         is_finished = is_success & (evaluation.score.gap >= self.settings.margin)
         if self.settings.lead_over_noise:
             is_finished = self._with_lead_over_noise(is_finished, state, evaluation)
         is_accepted = torch.ones_like(is_finished)
-        if self.settings.shorten:
+        if self.settings.backtracking:
             is_accepted = is_finished | (cost < state.cost[active_rows])
         # An example without success keeps its last accepted candidate, or its
         # first success. Then only a success of lower cost replaces a success.
@@ -448,12 +450,12 @@ class Descent:
             is_leading = self._leads_over_noise(
                 evaluation.images[chosen],
                 state.examples[rows],
-                state.goal.of(rows),
+                state.criterion.select(rows),
             )
         return is_finished.index_copy(0, chosen, is_leading)
 
     @torch.no_grad()
-    def _leads_over_noise(self, images: Tensor, examples: Tensor, goal: Goal) -> Tensor:
+    def _leads_over_noise(self, images: Tensor, examples: Tensor, criterion: Criterion) -> Tensor:
         """Return whether the views of examples lead by more than noise changes, shape (A,).
 
         The lead of a view is its logit gap. The smallest lead, with noise and
@@ -463,7 +465,7 @@ class Descent:
         Args:
             images: Images of the A examples, shape (A, V, 3, H, W).
             examples: Indices of the examples in the problem, shape (A,).
-            goal: Source and target classes of the A examples.
+            criterion: Source and target classes of the A examples.
         """
         if not len(images):
             return examples.new_zeros(0, dtype=torch.bool)
@@ -479,7 +481,7 @@ class Descent:
             batches = version.flatten(0, 1).split(self.settings.batch_size)
             logits = torch.cat([self.model(batch) for batch in batches])
             logits_of_views = logits.unflatten(0, version.shape[:2])
-            leads.append(logit_gap(logits_of_views, goal.source, goal.target))
+            leads.append(logit_gap(logits_of_views, criterion.source, criterion.target))
         smallest, largest = torch.stack(leads).aminmax(dim=0)
         needed = self.settings.lead_over_noise * (largest - smallest)
         return (smallest >= needed).all(1)
@@ -504,7 +506,7 @@ class _Score:
         cost: Cost (equation 1), summed over the views of an example,
             shape (N,).
         gap: Lead of the wanted class in the logits, shape (N,). For an example,
-            it is the smallest lead among the views. It is negative if the goal
+            it is the smallest lead among the views. It is negative if the criterion
             is not reached.
         predicted: Predicted classes of the images without EOT transformations.
             Shape (N, V) for examples, (N,) for single images.
@@ -523,7 +525,7 @@ class _Evaluation:
         values: The candidates, shape (N, D).
         images: Rendered images, shape (N, V, 3, H, W).
         score: Cost, logit gap and predictions of the N examples.
-        is_goal_reached: Mask of the examples whose predictions reach the goal
+        is_criterion_met: Mask of the examples whose predictions reach the criterion
             in every view, shape (N,).
         gradient: Gradient of the cost with respect to the candidates,
             shape (N, D).
@@ -532,7 +534,7 @@ class _Evaluation:
     values: Tensor
     images: Tensor
     score: _Score
-    is_goal_reached: Tensor
+    is_criterion_met: Tensor
     gradient: Tensor
 
 
@@ -541,7 +543,7 @@ class _Decision:
     """Decisions about the candidates of the N active examples, as masks of shape (N,).
 
     Attributes:
-        is_finished: The candidate reaches the goal with the required margin,
+        is_finished: The candidate reaches the criterion with the required margin,
             also over noise.
         is_accepted: The next step starts from the candidate.
         is_kept: The candidate is the result of its example unless a later
@@ -562,7 +564,7 @@ class _State:
     state and the result.
 
     Attributes:
-        goal: Source and target classes of the A examples.
+        criterion: Source and target classes of the A examples.
         examples: Indices of the examples in the problem, shape (A,).
         batch_size: Images per classifier pass. It is halved when memory runs
             out.
@@ -576,7 +578,7 @@ class _State:
             evaluation.
     """
 
-    goal: Goal
+    criterion: Criterion
     examples: Tensor
     batch_size: BatchSize
     active_rows: Tensor
@@ -588,11 +590,13 @@ class _State:
     result: DescentResult = field(init=False)
 
     @classmethod
-    def at_start(cls, goal: Goal, examples: Tensor, start: Tensor, batch_size: int) -> _State:
+    def at_start(
+        cls, criterion: Criterion, examples: Tensor, start: Tensor, batch_size: int
+    ) -> _State:
         """Create the state before the first evaluation. The initial values are its candidates.
 
         Args:
-            goal: Source and target classes of the A examples.
+            criterion: Source and target classes of the A examples.
             examples: Indices of the attacked examples in the problem,
                 shape (A,).
             start: Initial values, shape (A, D).
@@ -600,7 +604,7 @@ class _State:
         """
         values = start.detach().clone()
         return cls(
-            goal=goal,
+            criterion=criterion,
             examples=examples,
             batch_size=BatchSize(batch_size),
             active_rows=torch.arange(len(values), device=values.device),
@@ -622,11 +626,11 @@ class _State:
             values=self.values.clone(),
             images=evaluation.images.clone(),
             steps=zeros,
-            success_before=evaluation.is_goal_reached,
+            success_before=evaluation.is_criterion_met,
             success=zeros.bool(),
             cost_before=evaluation.score.cost,
             cost=self.cost.clone(),
-            predicted=torch.zeros_like(self.goal.source),
+            predicted=torch.zeros_like(self.criterion.source),
             zero_gradient=evaluation.gradient.abs().amax(1) == 0,
         )
 
@@ -673,7 +677,7 @@ class _State:
         rows = self.active_rows[chosen]
         self.result.values[rows] = evaluation.values[chosen]
         self.result.images[rows] = evaluation.images[chosen]
-        self.result.success[rows] = evaluation.is_goal_reached[chosen]
+        self.result.success[rows] = evaluation.is_criterion_met[chosen]
         self.result.cost[rows] = evaluation.score.cost[chosen]
         self.result.predicted[rows] = evaluation.score.predicted[chosen]
 

@@ -17,7 +17,7 @@ from renderer.image import clamp, to_bytes, to_unit
 NOISE_DRAWS = 3
 
 
-class Rounded(nn.Module):
+class Quantized(nn.Module):
     """Model whose images are rounded to 8 bits per channel. The derivative passes straight through.
 
     Args:
@@ -45,7 +45,7 @@ def preprocessed_model(settings: AttackSettings, classifier: nn.Module) -> nn.Mo
         settings: Settings of the attack.
         classifier: A model from images in [0, 1] to logits.
     """
-    return Rounded(classifier) if settings.rounded else classifier
+    return Quantized(classifier) if settings.quantized else classifier
 
 
 def stored(images: Tensor, deviation: float, examples: Tensor, *key: int | str) -> Iterator[Tensor]:

@@ -17,7 +17,7 @@ from renderer.light.ball import Ball, nearest_in_box
 Domain = Callable[..., Tensor]
 
 
-def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
+def unconstrained(values: Tensor, within: Ball | None = None) -> Tensor:
     """Find the nearest points in the domain of all values.
 
     Args:
@@ -35,7 +35,7 @@ def take_step(
     values: Tensor,
     gradient: Tensor,
     center: Tensor,
-    domain: Domain = anywhere,
+    domain: Domain = unconstrained,
     length: float | Tensor = 1.0,
 ) -> Tensor:
     """Take a step of projected gradient descent.
@@ -88,7 +88,9 @@ def scale_gradient(settings: StepSettings, gradient: Tensor) -> Tensor:
     return settings.step_size * F.normalize(scaled, eps=tiny)
 
 
-def project(settings: StepSettings, values: Tensor, center: Tensor, domain: Domain = anywhere) -> Tensor:
+def project(
+    settings: StepSettings, values: Tensor, center: Tensor, domain: Domain = unconstrained
+) -> Tensor:
     """Find the nearest points that are feasible and lie in the ball.
 
     Args:

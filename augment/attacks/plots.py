@@ -39,7 +39,9 @@ def draw_attack(
         The figure. It belongs to no window: `figure.savefig(path)` writes it.
     """
     figure = Figure(figsize=(10, 2.6), layout="constrained")
-    axes_before, axes_light, axes_after, axes_bars = figure.subplots(1, 4, width_ratios=[1, 1, 1, 1.2])
+    axes_before, axes_light, axes_after, axes_bars = figure.subplots(
+        1, 4, width_ratios=[1, 1, 1, 1.2]
+    )
     _show(axes_before, before, f"before: {_most_probable(probabilities_before, classes)}")
     _show(axes_light, ball, "light after the attack")
     _show(axes_after, after, f"after: {_most_probable(probabilities_after, classes)}")

@@ -28,18 +28,18 @@ class AttackProblem:
         scene: Scene to attack.
         parameters: Parameters to change, made for this scene.
         start: Values at which attacks start, shape (E, D).
-        everything: Indices of all examples, shape (E,).
-        at_once: Largest number of examples that are rendered at the same time,
+        all_examples: Indices of all examples, shape (E,).
+        group_size: Largest number of examples that are rendered at the same time,
             which limits the memory.
     """
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
         self.scene = scene
         self.parameters = parameters
-        self.at_once = scene.at_once
+        self.group_size = scene.group_size
         starts = [parameter.start.to(scene.lights) for parameter in parameters]
         self.start = torch.cat(starts, dim=1)
-        self.everything = torch.arange(len(scene), device=self.start.device)
+        self.all_examples = torch.arange(len(scene), device=self.start.device)
         self._value_counts = [parameter.start.shape[1] for parameter in parameters]
 
     def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
@@ -54,7 +54,7 @@ class AttackProblem:
             differentiable with respect to the values.
         """
         conditions = self.scene.conditions(examples)
-        for parameter, parameter_values in self.by_parameter(values):
+        for parameter, parameter_values in self.split_by_parameter(values):
             conditions = parameter.apply(parameter_values, conditions, examples)
         return conditions
 
@@ -73,7 +73,7 @@ class AttackProblem:
 
     @torch.no_grad()
     def images(self, values: Tensor, examples: Tensor | None = None) -> Tensor:
-        """Render examples without gradients, at most `at_once` of them at a time.
+        """Render examples without gradients, at most `group_size` of them at a time.
 
         Args:
             values: Values of all E examples, shape (E, D).
@@ -84,11 +84,11 @@ class AttackProblem:
             Images in [0, 1], shape (A, V, 3, size, size).
         """
         if examples is None:
-            examples = self.everything
+            examples = self.all_examples
         size = self.scene.settings.size
         images = values.new_empty(len(examples), self.scene.views, 3, size, size)
-        image_parts = images.split(self.at_once)
-        example_parts = examples.split(self.at_once)
+        image_parts = images.split(self.group_size)
+        example_parts = examples.split(self.group_size)
         parts = list(zip(image_parts, example_parts, strict=True))
         for image_part, example_part in progress(parts, "images") if len(parts) > 1 else parts:
             image_part.copy_(self.render(values[example_part], example_part))
@@ -114,7 +114,7 @@ class AttackProblem:
             Values after the step, which are feasible and lie in the
             norm-balls, shape (A, D).
         """
-        parts = zip(self.by_parameter(values), self.by_parameter(gradient), strict=True)
+        parts = zip(self.split_by_parameter(values), self.split_by_parameter(gradient), strict=True)
         moved = [
             parameter.take_step(part, gradient_part, examples, length)
             for (parameter, part), (_, gradient_part) in parts
@@ -132,7 +132,7 @@ class AttackProblem:
         Returns:
             Projected values, shape (A, D).
         """
-        parts = self.by_parameter(values)
+        parts = self.split_by_parameter(values)
         projected = [parameter.project(part, examples) for parameter, part in parts]
         return torch.cat(projected, dim=1)
 
@@ -154,11 +154,11 @@ class AttackProblem:
         if reached is None:
             samples = [parameter.sample(generator) for parameter in self.parameters]
         else:
-            parts = self.by_parameter(reached)
+            parts = self.split_by_parameter(reached)
             samples = [parameter.sample(generator, part) for parameter, part in parts]
         return torch.cat([sample.to(self.start) for sample in samples], dim=1)
 
-    def by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
+    def split_by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
         """Split values of shape (A, D) into pairs of a parameter and its values."""
         parts = values.split(self._value_counts, dim=1)
         return list(zip(self.parameters, parts, strict=True))

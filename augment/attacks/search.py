@@ -38,7 +38,7 @@ LIGHT_GRAY = 0.9
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
 
 # Confidence in every image at which the search ends.
-SURE = 0.5
+CONFIDENCE_TO_STOP = 0.5
 
 Settings = TypeVar("Settings", bound=SceneSettings)
 
@@ -78,7 +78,7 @@ def find_scene(
         if confidence > highest:
             highest = confidence
             chosen = lit
-        if highest >= SURE:
+        if highest >= CONFIDENCE_TO_STOP:
             break
     return chosen
 
@@ -167,5 +167,5 @@ def _confidences(
     probabilities = logits.softmax(2)
     labels = source_labels(scene, logits, classifier)
     confidence = probabilities.gather(2, labels[..., None])[..., 0]
-    is_right = probabilities.argmax(2) == labels
-    return (confidence * is_right).view(groups, -1).amin(1)
+    is_correct = probabilities.argmax(2) == labels
+    return (confidence * is_correct).view(groups, -1).amin(1)

@@ -21,7 +21,7 @@ from augment.classifiers.sources import (
     load_timm,
     load_torchvision,
 )
-from augment.progress import announced
+from augment.progress import progress_message
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
 
@@ -103,7 +103,7 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
         message = f"name={name} is not known: choose one of {', '.join(choices)}"
         raise InputError(message, "name")
     load = SOURCES[source + colon].load
-    with announced(f"loading {name}"):
+    with progress_message(f"loading {name}"):
         return load(model, path) if colon else load(path)
 
 

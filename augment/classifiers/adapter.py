@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.losses import log_odds
-from renderer.errors import InputError, describe, in_one_line, is_out_of_memory, require_range
+from renderer.errors import InputError, describe, is_out_of_memory, require_range, single_line
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole
 
@@ -61,7 +61,9 @@ class NetworkCall:
         self.name = name
         self.probability_rows: int | None = 0
 
-    def __call__(self, network: Callable[[Tensor], Tensor], images: Tensor, classes: int | None = None) -> Tensor:
+    def __call__(
+        self, network: Callable[[Tensor], Tensor], images: Tensor, classes: int | None = None
+    ) -> Tensor:
         """Compute the logits of images.
 
         Args:
@@ -86,16 +88,20 @@ class NetworkCall:
         fits = isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
         if not fits or classes not in (None, logits.shape[1]):
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            raise InputError(f"{self.name} returned {returned}: make it return logits {expected} of images {shape}")
+            raise InputError(
+                f"{self.name} returned {returned}: make it return logits {expected} of images {shape}"
+            )
         self._require_no_probabilities(logits)
         return logits
 
-    def _failure(self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception) -> str:
+    def _failure(
+        self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception
+    ) -> str:
         """Say why a network fails on images, and what to do about it."""
         weights = network.parameters() if isinstance(network, nn.Module) else iter(())
         dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
-        reason = f"{self.name} fails on {given} ({type(error).__name__}: {in_one_line(error)})"
+        reason = f"{self.name} fails on {given} ({type(error).__name__}: {single_line(error)})"
         if dtypes and images.dtype not in dtypes:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
             remedy = f"convert it with network.to({images.dtype}), or the light of the scene to {of_weights}"
@@ -112,7 +118,9 @@ class NetworkCall:
         self.probability_rows += len(logits)
         if self.probability_rows >= SEVERAL:
             fault = "returned probabilities, which are in [0, 1] and sum to 1, in place of logits"
-            raise InputError(f"{self.name} {fault}: leave out its softmax, or return the logarithm of its result")
+            raise InputError(
+                f"{self.name} {fault}: leave out its softmax, or return the logarithm of its result"
+            )
 
 
 def are_probabilities(outputs: Tensor) -> bool:
@@ -135,12 +143,20 @@ class Classifier(nn.Module):
 
     operating_points: Sequence[OperatingPoint] = ()
 
-    def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
+    def __init__(
+        self,
+        function: Callable[[Tensor], Tensor],
+        size: int,
+        classes: Sequence[str],
+        name: str = "callable",
+    ):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
         mode. InputError for a class name that occurs twice, since labels are found by name, and a size beyond 4,096."""
         super().__init__()
         require_kind("name", name, str, "a string for messages")
-        require_kind("function", function, Callable, "a torch.nn.Module, or a function from images to logits")
+        require_kind(
+            "function", function, Callable, "a torch.nn.Module, or a function from images to logits"
+        )
         require_whole(f"classifier {name}: size", size)
         require_range(f"classifier {name}: size", size, 1, MAX_SIZE)
         self.function = function
@@ -161,7 +177,9 @@ class Classifier(nn.Module):
         images = as_images("images", images)
         if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
-            raise InputError(f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}")
+            raise InputError(
+                f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}"
+            )
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
         require_unit_range("images", *extremes)  # only now, since the host waits here for a GPU
@@ -171,7 +189,9 @@ class Classifier(nn.Module):
             raise InputError(f"{name} returned logits without a gradient: compute them in torch")
         return logits
 
-    def detect(self, images: Float[Tensor, "N 3 size size"], label: str | None = None) -> Bool[Tensor, " N"]:
+    def detect(
+        self, images: Float[Tensor, "N 3 size size"], label: str | None = None
+    ) -> Bool[Tensor, " N"]:
         """Whether images, RGB in [0, 1], show a class, by the threshold of its operating point instead of argmax.
 
         label: the class, where there are operating points of several. InputError without one, and as of `forward`.
@@ -210,7 +230,9 @@ class Classifier(nn.Module):
 def as_images(name: str, images: object) -> Tensor:
     """Convert images to a tensor of floating-point numbers; InputError for bytes and for what is no number."""
     if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
-        raise InputError(f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255")
+        raise InputError(
+            f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255"
+        )
     return as_tensor(name, images)
 
 
@@ -238,7 +260,11 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     Raises:
         InputError: If it is no list of strings, but for example one string.
     """
-    return tuple(as_list(name, classes, str, "a list of the names of the classes, in the order of the logits"))
+    return tuple(
+        as_list(
+            name, classes, str, "a list of the names of the classes, in the order of the logits"
+        )
+    )
 
 
 class Normalized(nn.Module):
@@ -251,7 +277,9 @@ class Normalized(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float], bgr: bool = False):
+    def __init__(
+        self, network: nn.Module, mean: Sequence[float], std: Sequence[float], bgr: bool = False
+    ):
         super().__init__()
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
@@ -260,7 +288,9 @@ class Normalized(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         ordered = images.flip(1) if self.bgr else images
-        return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
+        return self.network(
+            ((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
+        )
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
@@ -288,7 +318,9 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
             return int(text)
         indices = f"indices go from 0 to {len(classes) - 1}"
         raise InputError(f"{subject}: the label {text} is not a class: {indices}")
-    raise InputError(f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}")
+    raise InputError(
+        f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
+    )
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:
@@ -333,11 +365,18 @@ def call_python(name: str) -> tuple[nn.Module, int, Sequence[str]]:
         raise
     except (Exception, SystemExit) as error:  # of the user's code, or where there is none
         at = traceback.extract_tb(error.__traceback__)[-1]
-        reason = f"{type(error).__name__}: {in_one_line(error)}, in line {at.lineno} of {at.filename}"  # type: ignore[arg-type]
+        reason = (
+            f"{type(error).__name__}: {single_line(error)}, in line {at.lineno} of {at.filename}"  # type: ignore[arg-type]
+        )
         expected = "python:package.module:function, which returns (module, size, classes)"
         raise InputError(f"name=python:{name} fails ({reason}): give {expected}", "name") from error
     ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
-    if not (isinstance(network, nn.Module) and type(size) is int and ordered and all(type(c) is str for c in classes)):
+    if not (
+        isinstance(network, nn.Module)
+        and type(size) is int
+        and ordered
+        and all(type(c) is str for c in classes)
+    ):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
         expected = "return (torch.nn.Module, pixels per side, class names)"
         raise InputError(f"name=python:{name} returns ({kinds}): {expected}", "name")

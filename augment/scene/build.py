@@ -13,7 +13,7 @@ from torch import Tensor
 
 from augment.progress import progress
 from augment.scene.degree import degree_of_scene, reached_gloss, warn_of_cut_light
-from augment.scene.objects import SceneObject, load_object, on_ground
+from augment.scene.objects import SceneObject, add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer.camera import Camera, orbit_cameras
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 # What a label must be, for errors.
 LABEL = "the name of a class, or its index"
 # What a mesh is given as: a file, solid:NAME or a mesh.
-Shown = str | Path | Mesh
+MeshSource = str | Path | Mesh
 # The settings of a scene that are options of `build_scene`.
 SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
 RENDERER_OPTIONS = {item.name for item in fields(RendererSettings)}
 
 
 def build_scene(
-    meshes: Sequence[ObjectSettings | tuple[Shown, str | int]],
+    meshes: Sequence[ObjectSettings | tuple[MeshSource, str | int]],
     size: int,
     views: int = 1,
     *,
@@ -102,7 +102,7 @@ def build_scene(
     objects = []
     for member in progress(members, "reading meshes"):
         item = _load_member(member, scene_settings.vertices)
-        objects.append(on_ground(item, scene_settings.ground))
+        objects.append(add_table(item, scene_settings.ground))
     environment: Any = scene_settings.light
     is_named = isinstance(environment, str | Path)
     degree = None
@@ -165,7 +165,9 @@ def _as_meshes(meshes: object) -> list[Any]:
     return members
 
 
-def _load_member(member: ObjectSettings | tuple[Shown, str | int], vertices: int) -> SceneObject:
+def _load_member(
+    member: ObjectSettings | tuple[MeshSource, str | int], vertices: int
+) -> SceneObject:
     """Load a member of `meshes`, subdivided until it has more than a number of vertices."""
     if isinstance(member, ObjectSettings):
         return load_object(member, vertices)
@@ -219,7 +221,9 @@ def build_local_light(settings: Any) -> tuple[LocalBasis, Tensor]:
         InputError: If a file cannot be read, or if a value does not fit the
             others.
     """
-    [kind] = [kind for name, kind in LOCAL_LIGHTS.items() if type(settings) is LOCAL_LIGHT_SETTINGS[name]]
+    [kind] = [
+        kind for name, kind in LOCAL_LIGHTS.items() if type(settings) is LOCAL_LIGHT_SETTINGS[name]
+    ]
     return kind.from_settings(settings)
 
 

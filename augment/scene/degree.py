@@ -22,13 +22,13 @@ from augment.scene.scene import Scene
 from renderer.geometry.mesh import select_faces
 from renderer.light.basis import DEGREE, harmonics_of
 from renderer.light.harmonics import irradiance_error
-from renderer.light.highlights import degree_for, highlight_error
+from renderer.light.highlights import highlight_error, required_degree
 from renderer.light.presets import load_light
 from renderer.settings import MIN_ROUGHNESS
 from renderer.shading.gloss import Gloss, smoothest
 
 if TYPE_CHECKING:
-    from augment.settings import VarnishSettings
+    from augment.settings import SpecularLayerSettings
 
 # A warning reports errors of the irradiance above this fraction of the rms irradiance.
 NOTICED = 0.05
@@ -62,7 +62,7 @@ class Smoothest(NamedTuple):
     @property
     def degree(self) -> int:
         """The degree of lighting that shows the gloss, or 0 if no surface has gloss."""
-        return degree_for(self.roughness) if self.roughness < MATTE else 0
+        return required_degree(self.roughness) if self.roughness < MATTE else 0
 
     def warn(self, choice: str, degree: int) -> None:
         """Warn of the error of highlights in lighting of a degree that is too low.
@@ -83,7 +83,7 @@ class Smoothest(NamedTuple):
 def reached_gloss(
     objects: Iterable[SceneObject],
     material: MaterialSettings | None = None,
-    varnish: VarnishSettings | None = None,
+    varnish: SpecularLayerSettings | None = None,
 ) -> Smoothest:
     """Find the smoothest surface of all objects, also after an attack and a variation.
 
@@ -107,15 +107,19 @@ def reached_gloss(
     return least
 
 
-def _reached_roughness(item: SceneObject, material: MaterialSettings | None, varnish: VarnishSettings | None) -> float:
+def _reached_roughness(
+    item: SceneObject, material: MaterialSettings | None, varnish: SpecularLayerSettings | None
+) -> float:
     """Return the lowest roughness that a variation and an attack give to an object's own faces."""
-    is_varnished = varnish is not None and any(varnish.strength)
-    is_attacked = material is not None and any((material.roughness, material.metallic, material.strength))
-    if not is_varnished and not is_attacked:
+    has_specular_layer = varnish is not None and any(varnish.specular_factor)
+    is_attacked = material is not None and any(
+        (material.roughness, material.metallic, material.specular_factor)
+    )
+    if not has_specular_layer and not is_attacked:
         return MATTE
     materials = initial_materials(item)
     roughness = materials.face_gloss[materials.object_mask, ROUGHNESS]
-    if varnish is not None and is_varnished:
+    if varnish is not None and has_specular_layer:
         roughness = torch.full_like(roughness, varnish.roughness[0])
     if material is not None and is_attacked and material.roughness:
         mean = float(roughness.mean())
@@ -125,7 +129,7 @@ def _reached_roughness(item: SceneObject, material: MaterialSettings | None, var
         change = max(mean - radius, MIN_ROUGHNESS) - mean
         roughness = (roughness + min(change, 0.0)).clamp(min=0)
     # The strength of this gloss is 1, because attacks and variations can raise it to 1.
-    gloss = Gloss(roughness, textured=not is_varnished)
+    gloss = Gloss(roughness, textured=not has_specular_layer)
     own_mesh = select_faces(item.mesh, slice(item.own))
     return smoothest(gloss.on(own_mesh))
 
@@ -200,7 +204,7 @@ def warn_of_cut_light(name: str, light: Tensor) -> None:
 def with_needed_degree(
     scene: Scene,
     material: MaterialSettings | None = None,
-    varnish: VarnishSettings | None = None,
+    varnish: SpecularLayerSettings | None = None,
 ) -> Scene:
     """Raise the degree of a scene's lighting to what an attack and a variation need.
 

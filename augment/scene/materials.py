@@ -9,15 +9,15 @@ from torch import Tensor
 
 from augment.scene.objects import SceneObject
 
-# Positions among roughness, metallic and strength of a face.
+# Positions among roughness, metallic and specular factor of a face.
 ROUGHNESS = 0
 METALLIC = 1
 
-# Roughness, metallic and strength of an object that neither reflects specularly
+# Roughness, metallic and specular factor of an object that neither reflects specularly
 # nor is metallic. `initial_materials` gives it to meshes without a gloss.
 MATTE = (1.0, 0.0, 0.0)
-# Roughness, metallic and strength with which an attack on a matte object starts.
-VARNISH = (0.5, 0.0, 1.0)
+# Roughness, metallic and specular factor with which an attack on a matte object starts.
+SPECULAR_LAYER = (0.5, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class FaceMaterials:
     """Specular materials of the F faces of a mesh: an object, its props and its table.
 
     Attributes:
-        face_gloss: Roughness, metallic and strength of each face, shape (F, 3).
+        face_gloss: Roughness, metallic and specular factor of each face, shape (F, 3).
         object_mask: Mask of the faces that belong to the object itself,
             shape (F,).
     """
@@ -34,7 +34,7 @@ class FaceMaterials:
     object_mask: Tensor
 
     def average(self) -> Tensor:
-        """Average roughness, metallic and strength over the object's faces, shape (3,)."""
+        """Average roughness, metallic and specular factor over the object's faces, shape (3,)."""
         return self.face_gloss[self.object_mask].mean(0)
 
     def is_uniform(self) -> bool:
@@ -51,7 +51,7 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
     """Return the materials with which an attack on the material of an object starts.
 
     It is the material of the mesh. If the object itself is matte, which means
-    that metallic and strength are zero on all its faces, it gets `VARNISH`.
+    that metallic and specular factor are zero on all its faces, it gets `SPECULAR_LAYER`.
 
     Args:
         item: The object, whose mesh has F faces.
@@ -64,9 +64,9 @@ def initial_materials(item: SceneObject) -> FaceMaterials:
         face_gloss = torch.tensor([MATTE]).expand(len(object_mask), 3)
     else:
         face_gloss = torch.from_numpy(item.mesh.gloss)
-    metallic_and_strength = face_gloss[object_mask, METALLIC:]
-    is_matte = not metallic_and_strength.any()
+    metallic_and_specular = face_gloss[object_mask, METALLIC:]
+    is_matte = not metallic_and_specular.any()
     if is_matte:
-        varnish = face_gloss.new_tensor(VARNISH)
+        varnish = face_gloss.new_tensor(SPECULAR_LAYER)
         face_gloss = torch.where(object_mask[:, None], varnish, face_gloss)
     return FaceMaterials(face_gloss=face_gloss, object_mask=object_mask)

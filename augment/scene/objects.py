@@ -128,7 +128,7 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
     return replace(item.joined(raised), props=props)
 
 
-def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
+def add_table(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """Put a table under an object and its props.
 
     Args:
@@ -159,7 +159,7 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     return replace(item.joined([table]), ground=color)
 
 
-def another_instance(item: SceneObject, seed: int) -> SceneObject:
+def resample_instance(item: SceneObject, seed: int) -> SceneObject:
     """Replace a solid by another instance of its class.
 
     Args:
@@ -198,7 +198,7 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 
 
-def varnished(item: SceneObject, gloss: Gloss) -> SceneObject:
+def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
     """Replace the gloss of an object.
 
     Args:
@@ -215,7 +215,7 @@ def varnished(item: SceneObject, gloss: Gloss) -> SceneObject:
 def _with_mesh(item: SceneObject, mesh: Mesh) -> SceneObject:
     """Replace the object's own mesh, and keep its props and its table."""
     alone = replace(item, mesh=mesh, own=None)
-    return on_ground(with_props(alone, item.props), item.ground)
+    return add_table(with_props(alone, item.props), item.ground)
 
 
 def _load_prop(item: PropSettings) -> Mesh:
@@ -281,6 +281,6 @@ def _has_colors(mesh: Mesh) -> bool:
 
 
 def _as_gloss(values: Sequence[float]) -> Gloss:
-    """Convert [roughness, metallic, strength], or the first of them, to a gloss."""
+    """Convert [roughness, metallic, specular factor], or the first of them, to a gloss."""
     roughness, *others = [float(value) for value in values]
     return Gloss(roughness, *others)

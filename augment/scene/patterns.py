@@ -95,7 +95,7 @@ def solid(points: Tensor, shift: Tensor | float = 0.0) -> Tensor:
 FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (stripes, checkers, spots, half, solid)
 
 
-def pixel_middles(size: int) -> Tensor:
+def pixel_centers(size: int) -> Tensor:
     """Return the centers of the pixels of an image as points, shape (2, 1, size, size)."""
     centers = (torch.arange(size) + 0.5) / size * 2 - 1
     return torch.stack(torch.meshgrid(centers, centers, indexing="xy"))[:, None]
@@ -151,7 +151,9 @@ def random_colors(draws: Tensor) -> Tensor:
     return decode(1 - saturation * (1 - pure), "srgb")[:, :, None, None]
 
 
-def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor | None = None) -> Tensor:
+def draw_patterns(
+    count: int, size: int, draws: torch.Generator, points: Tensor | None = None
+) -> Tensor:
     """Draw patterns of random colors, at random angles, scales and positions.
 
     Args:
@@ -169,7 +171,7 @@ def draw_patterns(count: int, size: int, draws: torch.Generator, points: Tensor 
         torch.Size([2, 3, 8, 8])
     """
     if points is None:
-        points = pixel_middles(size)
+        points = pixel_centers(size)
     position_draws = []
     family_draws = []
     color_draws = []

@@ -135,7 +135,9 @@ class Relighting:
     def _require_memory_for_others(self, first: _BuiltStack) -> None:
         """Check that there is memory for all other stacks, which are as large as the first."""
         operators = first.operators
-        stack_bytes = operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
+        stack_bytes = (
+            operators.transfer.nbytes + operators.albedo.nbytes + first.background_terms.nbytes
+        )
         needed = (self._stack_count - 1) * stack_bytes + self.beside
         view_count = len(self._views_of_operators)
         name = f"{view_count} views of {self.settings.size} pixels per side (views)"

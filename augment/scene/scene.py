@@ -15,16 +15,16 @@ from torch import Tensor
 from augment.memory import attack_bytes, require_memory
 from augment.progress import progress
 from augment.scene.conditions import Conditions, Example
+from augment.scene.direct_rendering import DirectRenderer
 from augment.scene.objects import SceneObject
 from augment.scene.relighting import Layer, Relighting
-from augment.scene.reshading import Reshading
 from renderer.camera import Camera
 from renderer.errors import InputError, describe, require_bounded
 from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, clamp, encode
 from renderer.light.basis import HARMONICS, Basis
 from renderer.settings import ImageSettings
-from renderer.transport.operator_stacks import InPlace, OperatorStack
+from renderer.transport.operator_stacks import OperatorStack, ScatterLayers
 from renderer.transport.operators import build_operators
 from renderer.validation import as_integers, as_list, as_tensor, require_kind
 from renderer.visibility.rasterizers import Rasterizer
@@ -43,7 +43,7 @@ class Scene:
 
     While the light alone changes, nothing is rasterized after the first time: the transfer
     operators of many views are stacked (see `Relighting`). A view whose vertices move is
-    rasterized each time (see `Reshading`).
+    rasterized each time (see `DirectRenderer`).
 
     Args:
         objects: The objects.
@@ -64,7 +64,7 @@ class Scene:
     Attributes:
         views: The number of views of an example.
         object_of: The index of the object of each example, shape (E,).
-        at_once: The number of examples that are rendered at a time.
+        group_size: The number of examples that are rendered at a time.
         attack_bytes: The memory that an attack on the light needs beside the operators.
 
     Raises:
@@ -124,17 +124,19 @@ class Scene:
         self._exposure = exposures.to(lights)[:, None, None]
 
         pixels_per_example = self.views * settings.size**2
-        self.at_once = max(1, AT_ONCE // pixels_per_example)
+        self.group_size = max(1, AT_ONCE // pixels_per_example)
         self.attack_bytes = attack_bytes(
             pixels=len(self) * pixels_per_example,
-            pixels_at_once=min(len(self), self.at_once) * pixels_per_example,
+            pixels_at_once=min(len(self), self.group_size) * pixels_per_example,
             lights=self.lights,
             camera_effects=camera_effects is not None,
         )
         count = f"{len(self) * self.views} renders of {settings.size} pixels per side"
         require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
         self._relighting = self._build_relighting()
-        self._reshading = Reshading(self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light)
+        self._direct_renderer = DirectRenderer(
+            self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
+        )
 
     def _seeing(self, example: Example) -> Example:
         """Return an example whose cameras have a depth range that holds the whole object."""
@@ -191,7 +193,9 @@ class Scene:
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [
             Example(number, view, background)
-            for number, view, background in product(range(len(objects)), views, range(len(backgrounds)))
+            for number, view, background in product(
+                range(len(objects)), views, range(len(backgrounds))
+            )
         ]
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
@@ -223,7 +227,7 @@ class Scene:
     @cached_property
     def vertices(self) -> Tensor:
         """The vertices of each object, shape (M, N, 3). Those of smaller meshes end in zeros."""
-        return torch.nn.utils.rnn.pad_sequence(self._reshading.vertices, batch_first=True)
+        return torch.nn.utils.rnn.pad_sequence(self._direct_renderer.vertices, batch_first=True)
 
     @property
     def stacks(self) -> list[OperatorStack]:
@@ -282,7 +286,9 @@ class Scene:
         """
         return Conditions(self.lights[self._as_examples(examples)])
 
-    def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
+    def render(
+        self, conditions: Conditions, examples: Int[Tensor, " A"]
+    ) -> Float[Tensor, "A V 3 size size"]:
         """Render examples from their views, differentiable in the conditions.
 
         Args:
@@ -308,7 +314,7 @@ class Scene:
         canvas = self.backgrounds.flatten(2).index_select(0, behind)
         covered = [encode(clamp(layer.composite), self.settings.encoding) for layer in layers]
         targets = [(layer.rows, layer.pixels) for layer in layers]
-        images = InPlace.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
+        images = ScatterLayers.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
         size = self.settings.size
         images = images.view(len(examples), self.views, 3, size, size)
         if self.camera_effects:
@@ -353,7 +359,9 @@ class Scene:
             light = light.repeat_interleave(self.views, dim=0)
         return self._relighting.layers(light, images)
 
-    def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
+    def _under_moved_lamps(
+        self, light: Tensor, positions: Tensor, examples: Tensor
+    ) -> Iterator[Layer]:
         """Give the layers of all other light by operators, and add the lamps image by image."""
         movable_light = self.basis.movable_light
         assert movable_light is not None
@@ -367,8 +375,8 @@ class Scene:
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 camera = example.cameras[view]
-                view_in_lamps = self._reshading.local_view(example.object, camera)
-                fragments, albedo = self._reshading.view(example.object, camera)
+                view_in_lamps = self._direct_renderer.local_view(example.object, camera)
+                fragments, albedo = self._direct_renderer.view(example.object, camera)
                 radiance = view_in_lamps.radiance(lamps, albedo, light[row, where], positions[row])
                 covered = torch.searchsorted(pixels, fragments.pixels)
                 canvas = radiance.new_zeros(3, len(pixels))
@@ -384,7 +392,7 @@ class Scene:
             example = self.examples[number]
             camera = self.cameras_under(conditions, row, number)[view]
             background = self.backgrounds[example.background].flatten(1)
-            pixels, coverage, radiance = self._reshading.radiance(
+            pixels, coverage, radiance = self._direct_renderer.radiance(
                 number,
                 example.object,
                 camera,

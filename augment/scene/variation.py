@@ -14,11 +14,11 @@ from torch import Tensor
 from augment.progress import progress
 from augment.scene.camera_effects import draw_camera_effects
 from augment.scene.conditions import Example
-from augment.scene.objects import SceneObject, another_instance, rotated, varnished
-from augment.scene.patterns import pixel_middles, random_colors
-from augment.scene.room import Room, above_table, across_light, irradiance
+from augment.scene.objects import SceneObject, add_specular_layer, resample_instance, rotated
+from augment.scene.patterns import pixel_centers, random_colors
 from augment.scene.scene import Scene
-from augment.settings import CameraEffectSettings, VariationSettings, VarnishSettings
+from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
+from augment.settings import CameraEffectSettings, SpecularLayerSettings, VariationSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
@@ -40,7 +40,9 @@ WALL_DISTANCES = (1.8, 8.0)
 MAX_LIGHT_ANGLE = 70.0
 
 
-def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False) -> Scene:
+def vary(
+    scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False
+) -> Scene:
     """Draw the examples of a scene anew around its own examples.
 
     All views of one example are moved in the same way.
@@ -71,7 +73,9 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, once
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
-            raise InputError("tables are for one view of objects that stand on none: leave ground out, or tables")
+            raise InputError(
+                "tables are for one view of objects that stand on none: leave ground out, or tables"
+            )
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _vary_geometry(scene, settings, draws, once, is_on_table)
@@ -98,13 +102,16 @@ def _vary_geometry(
         size = scene.settings.size
         changed["backgrounds"] = _draw_background_files(folder, len(scene), size, draws)
         examples = _number_backgrounds(examples)
-    if settings.instances or settings.rotation or any(settings.gloss.strength):
+    if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
         # The views that show the same object from the same cameras share a drawn object.
         views = [(example.object, example.cameras) for example in scene.examples]
         index_of_view = {view: index for index, view in enumerate(dict.fromkeys(views))}
         objects = [scene.objects[number] for number, _ in index_of_view]
         changed["objects"] = _draw_objects(objects, settings, draws)
-        examples = [replace(example, object=index_of_view[view]) for example, view in zip(examples, views, strict=True)]
+        examples = [
+            replace(example, object=index_of_view[view])
+            for example, view in zip(examples, views, strict=True)
+        ]
     # For images in one lighting, transfer operators are worth their cost only where the
     # alternative is to trace rays.
     needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
@@ -139,7 +146,9 @@ def _draw_cameras(
     return examples
 
 
-def _move_camera(camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]) -> Camera:
+def _move_camera(
+    camera: Camera, shift: Sequence[float], scale: float, angles: Sequence[float]
+) -> Camera:
     """Zoom by a factor, shift by (right, up) in image widths, and turn by (polar, azimuth)."""
     width = camera.width / scale
     right, up = shift
@@ -174,7 +183,9 @@ def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Gen
     """Read images (count, 3, size, size), drawn with repetition from all files below a folder."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
-        raise InputError(f"backgrounds={folder} holds no image: give a folder of .jpg or .png files")
+        raise InputError(
+            f"backgrounds={folder} holds no image: give a folder of .jpg or .png files"
+        )
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
     images = [read_image(files[index], size) for index in progress(chosen, "reading backgrounds")]
     return torch.stack(images)
@@ -193,13 +204,15 @@ def _draw_objects(
     if settings.instances:
         seeds = torch.randint(2**31, (len(drawn),), generator=draws).tolist()
         pairs = progress(zip(drawn, seeds, strict=True), "new instances", len(drawn))
-        drawn = [another_instance(item, seed) for item, seed in pairs]
+        drawn = [resample_instance(item, seed) for item, seed in pairs]
     if settings.rotation:
         rotations = _draw_rotations(settings.rotation, len(drawn), draws)
         drawn = [rotated(item, rotation) for item, rotation in zip(drawn, rotations, strict=True)]
-    if any(settings.gloss.strength):
+    if any(settings.gloss.specular_factor):
         glosses = _draw_glosses(settings.gloss, len(drawn), draws)
-        drawn = [varnished(item, gloss) for item, gloss in zip(drawn, glosses, strict=True)]
+        drawn = [
+            add_specular_layer(item, gloss) for item, gloss in zip(drawn, glosses, strict=True)
+        ]
     return drawn
 
 
@@ -210,12 +223,17 @@ def _draw_rotations(max_angle: float, count: int, draws: torch.Generator) -> np.
     return rotation_matrices(angles * axes / axes.norm(dim=1, keepdim=True)).numpy()
 
 
-def _draw_glosses(settings: VarnishSettings, count: int, draws: torch.Generator) -> list[Gloss]:
-    """Draw the roughness and the strength of each gloss uniformly from their ranges."""
-    ranges = torch.tensor([settings.roughness, settings.strength], dtype=torch.float64)
+def _draw_glosses(
+    settings: SpecularLayerSettings, count: int, draws: torch.Generator
+) -> list[Gloss]:
+    """Draw the roughness and the specular factor of each gloss uniformly from their ranges."""
+    ranges = torch.tensor([settings.roughness, settings.specular_factor], dtype=torch.float64)
     fractions = torch.rand(count, 2, generator=draws, dtype=torch.float64)
     values = torch.lerp(ranges[:, 0], ranges[:, 1], fractions)
-    return [Gloss(roughness, strength=strength) for roughness, strength in values.tolist()]
+    return [
+        Gloss(roughness, specular_factor=specular_factor)
+        for roughness, specular_factor in values.tolist()
+    ]
 
 
 # Lighting, its effect on backgrounds, and camera effects.
@@ -257,7 +275,9 @@ class _DrawnLights:
         return replace(self, environment=environment)
 
 
-def _vary_lighting(scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor) -> Scene:
+def _vary_lighting(
+    scene: Scene, settings: VariationSettings, draws: torch.Generator, is_on_table: Tensor
+) -> Scene:
     """Draw the lighting of all examples, light their backgrounds, and draw the camera effects."""
     exposures = _draw_log_uniform(settings.exposure, len(scene), draws)
     examples = [
@@ -317,7 +337,10 @@ def _draw_directional(
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     is_chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     angles = _draw_pairs(MAX_LIGHT_ANGLE, len(scene), draws)
-    cameras = [_turn_camera(example.cameras[0], *turn) for example, turn in zip(scene.examples, angles, strict=True)]
+    cameras = [
+        _turn_camera(example.cameras[0], *turn)
+        for example, turn in zip(scene.examples, angles, strict=True)
+    ]
     directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
     # No light comes from below a table. A direction from there is mirrored.
     grounds = [scene.objects[example.object].ground for example in scene.examples]
@@ -332,7 +355,9 @@ def _draw_directional(
     )
 
 
-def _draw_background_albedo(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
+def _draw_background_albedo(
+    scene: Scene, settings: VariationSettings, draws: torch.Generator
+) -> Tensor:
     """Return the linear albedo (E, 1 or 3, size, size) of all backgrounds, in random colors."""
     backgrounds = decode(scene.backgrounds, scene.settings.encoding)
     albedo = backgrounds[[example.background for example in scene.examples]]
@@ -377,7 +402,7 @@ def _light_rooms(
     environments = lights.environment.cpu().double()
     settings = scene.settings
     images = []
-    points = pixel_middles(settings.size).repeat(1, len(scene), 1, 1)
+    points = pixel_centers(settings.size).repeat(1, len(scene), 1, 1)
     # The room of every example of an object has the same rays.
     groups = groupby(progress(rows, "tables"), lambda row: scene.examples[row].object)
     for number, rows_of_object in groups:
@@ -393,7 +418,9 @@ def _light_rooms(
             images.append(example.exposure * arriving)
             if not direction.any():
                 direction = torch.from_numpy(camera.axes()[2])
-            points[:, row] = across_light(room, item.mesh, camera, settings, direction).float()
+            points[:, row] = project_along_light(
+                room, item.mesh, camera, settings, direction
+            ).float()
     if not images:
         return torch.zeros(0, 3, settings.size, settings.size), points
     return torch.stack(images), points

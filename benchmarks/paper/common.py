@@ -256,9 +256,9 @@ def attack_settings(
         "max_steps": max_steps,
         "allow_negative": True,
         "margin": 0.0,
-        "rounded": False,
+        "quantized": False,
         "sensor_noise": 0.0,
-        "shorten": is_backtracking,
+        "backtracking": is_backtracking,
     }
     return AttackSettings(**(settings | overrides))
 

@@ -12,7 +12,7 @@ set -euo pipefail
 as_in_the_paper=(
     attack.allow_negative=true
     attack.margin=0
-    attack.rounded=false
+    attack.quantized=false
     attack.max_steps=100
     attack.checks=false
     attack.verify=null

@@ -37,7 +37,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = parser.parse_args(argv)
     epochs = [line for line in read_metrics(options.run) if "augment/steps" in line]
     if not epochs:
-        parser.error(f"{options.run} has no finished epoch with attacks: give a run with augment=adversarial")
+        parser.error(
+            f"{options.run} has no finished epoch with attacks: give a run with augment=adversarial"
+        )
     write_measures(epochs, options.out.with_suffix(".csv"))
     draw_measures(epochs, options.out)
 

@@ -105,11 +105,11 @@ def is_successful(attacked: AttackResult, values: Tensor) -> Tensor:
         values: Values of the attacked parameter, shape (E, D).
 
     Returns:
-        Whether the attack's goal is reached, bool, shape (E,).
+        Whether the attack's criterion is reached, bool, shape (E,).
     """
     images = attacked.problem.images(values)
     logits = logits_of(attacked.classifier, images, common.BATCH_SIZE)
-    return attacked.goal.reached(logits.argmax(2))
+    return attacked.criterion.reached(logits.argmax(2))
 
 
 def without_negative_radiance(light: Tensor) -> Tensor:
@@ -182,7 +182,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = setup.options
     classifier = setup.classifier
     for subject, views in common.subjects_with_views(setup):
-        scenes = [common.make_scene(subject, classifier.size, part) for part in common.batches(views)]
+        scenes = [
+            common.make_scene(subject, classifier.size, part) for part in common.batches(views)
+        ]
         for space in options.spaces:
             draws = generator(options.seed, subject.name, space)
             for radius in RADII[space]:

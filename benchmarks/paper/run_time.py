@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 
 from augment import AttackSettings, Classifier
-from augment.attacks.descent import Goal, descend
+from augment.attacks.descent import Criterion, descend
 from augment.attacks.problem import build_problem
 from augment.scene.objects import SceneObject
 from benchmarks.common import Row
@@ -35,10 +35,10 @@ def measure_attack(
         Record of the attack.
     """
     scene = common.make_scene(subject, classifier.size, [view])
-    goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
+    criterion = Criterion(torch.tensor([[classifier.label(subject.label)]]))
     start = time.process_time()
     problem = build_problem(settings, scene)
-    result = descend(classifier, problem, goal, settings)
+    result = descend(classifier, problem, criterion, settings)
     seconds = time.process_time() - start
     return {
         "mesh": subject.name,

@@ -90,7 +90,9 @@ def attack_example(
         Record of the attack.
     """
     settings = common.read_mesh(mesh)
-    given_fields = [f"{name}:{json.dumps(value)}" for name, value in asdict(settings).items() if value]
+    given_fields = [
+        f"{name}:{json.dumps(value)}" for name, value in asdict(settings).items() if value
+    ]
     name, _, weights = options.classifier.partition("=")
     overrides = [
         f"attack={attack}",

@@ -147,7 +147,9 @@ def networks(records: Sequence[Row]) -> Cells:
     rows = []
     for (kind,), group in group_by(records, "kind").items():
         for network in group[0]["predictions"]:
-            cells = [format_rate(transfer_outcomes(group, network, state)) for state in NETWORK_STATES]
+            cells = [
+                format_rate(transfer_outcomes(group, network, state)) for state in NETWORK_STATES
+            ]
             rows.append([kind, network, *cells])
     return Cells(["attack", "network", *NETWORK_STATES.values()], rows)
 
@@ -208,7 +210,9 @@ def format_failures(group: Sequence[Row], state: str) -> str:
     """
     failures_of_meshes = []
     for sets in group_by(group, "mesh").values():
-        failures = [np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets]
+        failures = [
+            np.mean([name != row["label"] for name in row["predictions"][state]]) for row in sets
+        ]
         failures_of_meshes.append(failures)
     interval = bootstrap(
         failures_of_meshes,
@@ -280,9 +284,14 @@ def survival(records: Sequence[Row]) -> Cells:
     for (attack,), group in group_by(records, "attack").items():
         attacked = [record for record in group if "versions" in record]
         successes = [record["versions"] for record in attacked if record["success"]]
-        cells = [format_rate(success[version]["success"] for success in successes) for version in versions]
+        cells = [
+            format_rate(success[version]["success"] for success in successes)
+            for version in versions
+        ]
         refused = len(group) - len(attacked)
-        rows.append([attack, refused, format_rate(record["success"] for record in attacked), *cells])
+        rows.append(
+            [attack, refused, format_rate(record["success"] for record in attacked), *cells]
+        )
     return Cells(["attack", "refused", "success", *versions], rows)
 
 

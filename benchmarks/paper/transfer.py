@@ -14,18 +14,18 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.attacks.descent import Goal, descend
+from augment.attacks.descent import Criterion, descend
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.random_streams import generator
 from augment.scene.objects import SceneObject
 from benchmarks.paper import common
-from renderer.errors import FACTOR
+from renderer.errors import MAX_SCALE
 
 # Number of steps after the first success.
-FURTHER_STEPS = 10
+ADDITIONAL_STEPS = 10
 # A descent ends when its margin is reached. No logit reaches this margin, so
 # that a descent takes all its steps.
-ENDLESS_MARGIN = FACTOR
+ENDLESS_MARGIN = MAX_SCALE
 # Numbers of views that share an attacked light or shape.
 ATTACKED_VIEW_COUNTS = (1, 5)
 
@@ -42,13 +42,13 @@ class SharedProblem:
 
     Attributes:
         start: Values at which the attack starts, shape (1, D).
-        at_once: Largest number of examples that are rendered at once.
+        group_size: Largest number of examples that are rendered at once.
     """
 
     def __init__(self, problem: AttackProblem):
         self._problem = problem
         self.start = problem.start[:1]
-        self.at_once = problem.at_once
+        self.group_size = problem.group_size
         # The steps and the norm-ball are those of the first example.
         self.take_step = problem.take_step
         self.project = problem.project
@@ -63,7 +63,7 @@ class SharedProblem:
         Returns:
             Images, shape (1, V, 3, size, size).
         """
-        all_views = self._problem.everything
+        all_views = self._problem.all_examples
         images = self._problem.render(values.expand(len(all_views), -1), all_views)
         return images.transpose(0, 1)
 
@@ -75,7 +75,7 @@ class Adversaries:
     Attributes:
         start: Values at which the descent started.
         first: Values at the first success, or at the end if there was none.
-        further: Best values after FURTHER_STEPS more steps.
+        further: Best values after ADDITIONAL_STEPS more steps.
     """
 
     start: Tensor
@@ -111,10 +111,10 @@ def find_adversaries(
         Values of all examples.
     """
     labels = torch.full((len(problem.start), view_count), classifier.label(label))
-    goal = Goal(labels)
-    first = descend(classifier, problem, goal, settings).values
-    further_settings = replace(settings, max_steps=FURTHER_STEPS, margin=ENDLESS_MARGIN)
-    further = descend(classifier, problem, goal, further_settings, start=first).values
+    criterion = Criterion(labels)
+    first = descend(classifier, problem, criterion, settings).values
+    further_settings = replace(settings, max_steps=ADDITIONAL_STEPS, margin=ENDLESS_MARGIN)
+    further = descend(classifier, problem, criterion, further_settings, start=first).values
     return Adversaries(problem.start, first, further)
 
 
@@ -175,7 +175,8 @@ def measure_networks(
             predictions = {}
             for network, problem in zip(networks, problems, strict=True):
                 predictions[network.name] = {
-                    state: common.predict(network, problem.images(values)) for state, values in states.items()
+                    state: common.predict(network, problem.images(values))
+                    for state, values in states.items()
                 }
             record = {
                 "kind": kind,
@@ -222,7 +223,9 @@ def measure_views(
                 "set": set_index,
                 "kind": kind,
                 "attacked": view_count,
-                "predictions": predict_in_views(subject, classifier, settings, states, unseen_views),
+                "predictions": predict_in_views(
+                    subject, classifier, settings, states, unseen_views
+                ),
             }
             common.append(options.out, record)
 

@@ -68,7 +68,7 @@ class Mesh:
             `NO_TEXTURE`.
         textures: sRGB-encoded textures, shape (H, W, 3) each, uint8. Row 0 is
             the top.
-        gloss: Roughness, metallic and strength of each face in [0, 1]
+        gloss: Roughness, metallic and specular factor of each face in [0, 1]
             (`renderer.Gloss`), shape (F, 3), float32. None for a matte mesh.
         gloss_textures: For each of the textures, factors of roughness and
             metallic, shape (H, W, 2) each, uint8. Empty without such textures.
@@ -112,7 +112,9 @@ class Mesh:
         factors = _as_textures("gloss_textures", self.gloss_textures, 2)
         object.__setattr__(self, "gloss_textures", factors)
         if self.texture_ids.max() >= len(self.textures):
-            raise InputError(f"texture_ids name textures that are not there: give indices below {len(self.textures)}")
+            raise InputError(
+                f"texture_ids name textures that are not there: give indices below {len(self.textures)}"
+            )
 
     def _require_shapes(self) -> None:
         """Raise `InputError` if an array has another shape or type."""
@@ -130,14 +132,18 @@ class Mesh:
         for name, shape in shapes.items():
             values = getattr(self, name)
             if values.shape != shape or values.dtype.kind not in _KINDS[name]:
-                raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
+                raise InputError(
+                    f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}"
+                )
 
     def _require_indices(self) -> None:
         """Raise `InputError` if there are no faces, or they have vertices that are not there."""
         require_range("the number of faces", len(self.faces), 1, np.inf)
         vertex_count = len(self.vertices)
         if not 0 <= self.faces.min() <= self.faces.max() < vertex_count:
-            raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}")
+            raise InputError(
+                f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}"
+            )
 
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
@@ -172,7 +178,9 @@ class Mesh:
             # The constructor refuses indices out of range, which are clipped here.
             corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
-            raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
+            raise InputError(
+                f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)"
+            ) from error
         return Mesh(
             vertices=vertices,
             faces=faces,
@@ -305,7 +313,9 @@ def require_mesh(name: str, value: object) -> None:
             f"such as renderer.load_mesh({path}) or renderer.Mesh.plain(vertices, faces)"
         )
     if not value.displayable:
-        raise InputError(f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255")
+        raise InputError(
+            f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255"
+        )
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:

@@ -61,7 +61,9 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
     return unit(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
 
-def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+def vertex_normals(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "V 3"]:
     """Compute the unit normals of vertices, differentiable in the vertices.
 
     The normal of a vertex is the mean of the normals of its faces, weighted with
@@ -121,7 +123,9 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
-def corner_normals(vertices: np.ndarray, faces: np.ndarray, normals: str, crease: float = -2.0) -> np.ndarray:
+def corner_normals(
+    vertices: np.ndarray, faces: np.ndarray, normals: str, crease: float = -2.0
+) -> np.ndarray:
     """Compute the unit normals that the corners of faces are shaded with.
 
     Args:
@@ -152,7 +156,9 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, normals: str, crease
     return np.where(chosen.any(axis=-1, keepdims=True), chosen, [0.0, 0.0, 1.0])
 
 
-def area_vectors(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float64[Tensor, "3 F"]:
+def area_vectors(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float64[Tensor, "3 F"]:
     """Compute the normals of faces with lengths in proportion to the areas of the faces.
 
     Args:

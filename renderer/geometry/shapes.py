@@ -169,7 +169,9 @@ def bottle(rng: np.random.Generator) -> Mesh:
     shoulder = arc((0.1, shoulder_height - 0.05), (radius - 0.1, 0.35), 0, 85)
     neck = np.concatenate([shoulder, [(0.1, 0.8)]])
     cap = [(0.125, 0.8), (0.125, 1), (0, 1)]
-    glass = choose(rng, (0.10, 0.36, 0.16), (0.36, 0.18, 0.06), (0.20, 0.42, 0.60), (0.62, 0.74, 0.74))
+    glass = choose(
+        rng, (0.10, 0.36, 0.16), (0.36, 0.18, 0.06), (0.20, 0.42, 0.60), (0.62, 0.74, 0.74)
+    )
     paper = choose(rng, (0.93, 0.90, 0.80), (0.85, 0.20, 0.15), (0.92, 0.78, 0.25))
     metal = choose(rng, (0.75, 0.62, 0.25), (0.70, 0.12, 0.12), (0.80, 0.80, 0.82))
     return paint(*revolve(base, label, neck, cap), glass, paper, glass, metal)
@@ -183,7 +185,9 @@ def cup(rng: np.random.Generator) -> Mesh:
     outside = [(0, -0.7), (foot_radius, -0.7), (rim_radius, 0.7)]
     inside = [(rim_radius - 0.07, 0.7), (rim_radius - 0.1, drink_height)]
     surface = [(0, drink_height)]
-    glaze = choose(rng, (0.93, 0.93, 0.90), (0.20, 0.35, 0.62), (0.75, 0.16, 0.14), (0.30, 0.52, 0.42))
+    glaze = choose(
+        rng, (0.93, 0.93, 0.90), (0.20, 0.35, 0.62), (0.75, 0.16, 0.14), (0.30, 0.52, 0.42)
+    )
     white = (0.95, 0.94, 0.90)
     coffee = (0.28, 0.16, 0.08)
     body = paint(*revolve(outside, inside, surface), glaze, white, coffee)
@@ -230,7 +234,9 @@ def plate(rng: np.random.Generator) -> Mesh:
     band = [(0.85, brim_height - 0.03)]
     inside = [(well_radius + 0.08, brim_height - 0.06), (well_radius, 0), (0, 0)]
     china = choose(rng, (0.95, 0.95, 0.93), (0.93, 0.89, 0.80))
-    stripe = choose(rng, (0.15, 0.25, 0.60), (0.70, 0.15, 0.12), (0.20, 0.50, 0.45), (0.80, 0.65, 0.25))
+    stripe = choose(
+        rng, (0.15, 0.25, 0.60), (0.70, 0.15, 0.12), (0.20, 0.50, 0.45), (0.80, 0.65, 0.25)
+    )
     return paint(*revolve(underside, band, inside), china, stripe, china)
 
 
@@ -244,8 +250,12 @@ def lamp(rng: np.random.Generator) -> Mesh:
     rod = [(0.05, -0.15), (0.05, 0.9)]
     lining = [(top_radius - 0.03, 0.9), (shade_radius - 0.03, 0)]
     shade = [(shade_radius, 0), (top_radius, 0.95), (0, 0.95)]
-    stand = choose(rng, (0.62, 0.48, 0.22), (0.25, 0.18, 0.14), (0.30, 0.45, 0.55), (0.85, 0.85, 0.82))
-    cloth = choose(rng, (0.95, 0.88, 0.70), (0.90, 0.80, 0.55), (0.70, 0.22, 0.16), (0.92, 0.92, 0.90))
+    stand = choose(
+        rng, (0.62, 0.48, 0.22), (0.25, 0.18, 0.14), (0.30, 0.45, 0.55), (0.85, 0.85, 0.82)
+    )
+    cloth = choose(
+        rng, (0.95, 0.88, 0.70), (0.90, 0.80, 0.55), (0.70, 0.22, 0.16), (0.92, 0.92, 0.90)
+    )
     brass = (0.70, 0.60, 0.35)
     cream = (0.98, 0.93, 0.75)
     return paint(*revolve(foot, rod, lining, shade), stand, brass, cream, cloth)

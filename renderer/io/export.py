@@ -16,7 +16,7 @@ from renderer.errors import InputError, require_choice, require_range
 from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, require_mesh
 from renderer.geometry.normals import corner_normals
 from renderer.image import decode
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.settings import NORMALS
 from renderer.validation import as_list, as_path, require_whole
 
@@ -74,11 +74,13 @@ def export_mesh(
         require_range("first", first, 0, len(mesh.faces))
     normals_of_corners = corner_normals(mesh.vertices, mesh.faces, normals)
     if path.suffix.lower() != ".glb":
-        raise InputError(f"{path} cannot be written as a mesh: choose a file name that ends in .glb")
+        raise InputError(
+            f"{path} cannot be written as a mesh: choose a file name that ends in .glb"
+        )
     content = _glb(mesh, normals_of_corners, cameras, first)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, content)
+        atomic_write(path, content)
     except OSError as error:
         raise InputError(f"mesh {path} cannot be written: {error}") from error
 
@@ -112,14 +114,16 @@ class _PartSurface:
 
     Attributes:
         texture_id: Index of the texture, or -1.
-        gloss: Roughness, metallic and strength. Empty if the mesh has no gloss.
+        gloss: Roughness, metallic and specular factor. Empty if the mesh has no gloss.
     """
 
     texture_id: int
     gloss: list[float]
 
 
-def _write_part(mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray) -> "trimesh.Trimesh":
+def _write_part(
+    mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
+) -> "trimesh.Trimesh":
     """Convert the faces of a part to a mesh of trimesh, with y up.
 
     Args:
@@ -171,8 +175,8 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
     name = f"texture {surface.texture_id}"
     roughness, metallic = MATTE
     if surface.gloss:
-        roughness, metallic, strength = surface.gloss
-        name = f"{name}, {SPECULAR} {strength}"
+        roughness, metallic, specular_factor = surface.gloss
+        name = f"{name}, {SPECULAR} {specular_factor}"
     return PBRMaterial(
         name=name,
         baseColorTexture=texture,
@@ -197,9 +201,9 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     tree["meshes"] = [{"primitives": primitives}]
     tree["nodes"] = [{"mesh": 0}]
     for material in tree["materials"]:
-        _, found, strength = material["name"].partition(f", {SPECULAR} ")
+        _, found, specular_factor = material["name"].partition(f", {SPECULAR} ")
         if found:
-            material["extensions"] = {"KHR_materials_specular": {SPECULAR: float(strength)}}
+            material["extensions"] = {"KHR_materials_specular": {SPECULAR: float(specular_factor)}}
             tree["extensionsUsed"] = ["KHR_materials_specular"]
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]

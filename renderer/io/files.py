@@ -18,7 +18,9 @@ TEMPORARY = ".pnb-*.tmp"
 
 
 @contextmanager
-def replacing(path: str | Path, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
+def replacing(
+    path: str | Path, durable: bool = False, previous: Path | None = None
+) -> Iterator[Path]:
     """Give a temporary path to write to, and move the file to `path` at the end of the block.
 
     If the block raises an error, the temporary file is removed, and the old
@@ -63,7 +65,7 @@ def replacing(path: str | Path, durable: bool = False, previous: Path | None = N
             temporary.unlink(missing_ok=True)
 
 
-def write_whole(
+def atomic_write(
     path: str | Path,
     content: bytes | memoryview | str,
     durable: bool = False,

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from renderer.errors import InputError, require_file
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 
 # Suffixes of image files that can be read.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
@@ -169,7 +169,7 @@ def write_image(path: Path, image: Image.Image, **options: object) -> None:
     content = io.BytesIO()
     image_format = Image.registered_extensions()[path.suffix.lower()]
     image.save(content, image_format, **options)
-    write_whole(path, content.getbuffer())
+    atomic_write(path, content.getbuffer())
 
 
 def write_numbers(path: Path, numbers: np.ndarray) -> None:
@@ -184,7 +184,7 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
     """
     content = io.BytesIO()
     np.save(content, numbers)
-    write_whole(path, content.getbuffer())
+    atomic_write(path, content.getbuffer())
 
 
 def read_numbers(path: Path) -> np.ndarray:

@@ -25,7 +25,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
-from renderer.errors import LARGEST, InputError, in_one_line, require_choice, require_file
+from renderer.errors import MAX_MAGNITUDE, InputError, require_choice, require_file, single_line
 from renderer.geometry.mesh import Y_UP_TO_Z_UP, Mesh, concatenate, transformed
 from renderer.image import encode
 from renderer.io.images import eight_bits
@@ -101,10 +101,14 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _merge_vertices(concatenate(placed))
     # The nodes of a scene may move vertices out of range. NaN fails the comparison.
-    if not (np.abs(mesh.vertices) <= LARGEST).all():
-        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
+    if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
+        raise InputError(
+            f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: export it again"
+        )
     if not mesh.face_areas().sum() > 0:
-        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
+        raise InputError(
+            f"{path} has a surface of zero area: give a mesh with faces of some extent"
+        )
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
@@ -153,10 +157,12 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
         return _read_parts(path, suffix, linear, gloss)
     except Exception as error:
         # Readers of meshes and images raise almost anything for a damaged file.
-        raise InputError(f"{path} cannot be read as a mesh: {in_one_line(error)}") from error
+        raise InputError(f"{path} cannot be read as a mesh: {single_line(error)}") from error
 
 
-def _read_parts(path: Path, suffix: str, linear: bool, gloss: bool) -> list[tuple[Mesh, np.ndarray]]:
+def _read_parts(
+    path: Path, suffix: str, linear: bool, gloss: bool
+) -> list[tuple[Mesh, np.ndarray]]:
     """Read the parts of a file of a known format, or raise any error."""
     content = path.read_bytes()
     tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
@@ -222,7 +228,9 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
 def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
     """Read a scene, or raise `ValueError` if trimesh leaves out a part of the surface."""
     with _recorded_omissions() as omissions:
-        scene = trimesh.load(io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False)
+        scene = trimesh.load(
+            io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False
+        )
     if suffix == "obj" and b"mtllib" in content:
         unknown = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
         for name in unknown:
@@ -334,7 +342,9 @@ def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> 
     # The positions take the place of missing texture coordinates. They are floats.
     uvs = tree["accessors"][attributes.get("TEXCOORD_0", attributes["POSITION"])]
     if uvs["componentType"] != FLOAT:
-        raise ValueError("texture coordinates that are not floating-point numbers are not supported")
+        raise ValueError(
+            "texture coordinates that are not floating-point numbers are not supported"
+        )
 
 
 def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> bool:
@@ -357,7 +367,9 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
         used_textures.append(metallic_roughness.get("metallicRoughnessTexture") or {})
     for texture in used_textures:
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
-            raise ValueError("a texture has a second set of coordinates or is transformed, which is not supported")
+            raise ValueError(
+                "a texture has a second set of coordinates or is transformed, which is not supported"
+            )
     return bool(color_textures)
 
 
@@ -375,8 +387,8 @@ def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     checked = {"coordinates": vertices, "texture coordinates": uvs, "colors": colors}
     for name, values in checked.items():
         # NaN fails the comparison.
-        if values is not None and not (np.abs(values) <= LARGEST).all():
-            raise ValueError(f"{name} are not finite or beyond {LARGEST:g}")
+        if values is not None and not (np.abs(values) <= MAX_MAGNITUDE).all():
+            raise ValueError(f"{name} are not finite or beyond {MAX_MAGNITUDE:g}")
     if linear:
         colors = encode(torch.from_numpy(colors), "srgb").numpy()
     mesh = replace(mesh, corner_colors=colors.astype(np.float32))

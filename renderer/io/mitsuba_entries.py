@@ -68,7 +68,9 @@ def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Sce
     return {"type": "projector", "irradiance": irradiance, **lens}
 
 
-def sensor(pose: np.ndarray, size: int, fov: float | None = None, pixel_format: str = "rgba") -> Scene:
+def sensor(
+    pose: np.ndarray, size: int, fov: float | None = None, pixel_format: str = "rgba"
+) -> Scene:
     """Describe a camera.
 
     Args:

@@ -169,7 +169,9 @@ class _Skeleton:
         for parent, item in enumerate(nodes):
             for child in item.get("children", []):
                 self._parent_node[child] = parent
-        self.joints = sorted(self._joint_nodes, key=lambda joint: (len(self.joints_from(joint)), joint))
+        self.joints = sorted(
+            self._joint_nodes, key=lambda joint: (len(self.joints_from(joint)), joint)
+        )
         self.column = {joint: index for index, joint in enumerate(self.joints)}
         self.names = tuple(str(nodes[joint].get("name", joint)) for joint in self.joints)
         self.parents = np.array([self._parent_column(joint) for joint in self.joints])
@@ -218,7 +220,9 @@ def _add_weights(weights: np.ndarray, attributes: dict[str, Any], columns: np.nd
         # Entries without weight may have any joint.
         joints = np.where(values == 0, 0, attributes[name])
         if joints.max() >= len(columns):
-            raise ValueError(f"a vertex has the joint {joints.max()}, but its skin has {len(columns)} joints")
+            raise ValueError(
+                f"a vertex has the joint {joints.max()}, but its skin has {len(columns)} joints"
+            )
         np.add.at(weights, (rows, columns[joints]), values)
 
 

@@ -64,7 +64,9 @@ class Tile:
         return captioned
 
 
-def tiles_of(images: Iterable[Tensor], captions: Iterable[tuple[str, ...]] = repeat(()), side: int = 1) -> list[Tile]:
+def tiles_of(
+    images: Iterable[Tensor], captions: Iterable[tuple[str, ...]] = repeat(()), side: int = 1
+) -> list[Tile]:
     """Create tiles of images, enlarged without smoothing.
 
     A tile then shows the pixels that a classifier saw.
@@ -88,7 +90,9 @@ def tiles_of(images: Iterable[Tensor], captions: Iterable[tuple[str, ...]] = rep
     return tiles
 
 
-def draw_grid(rows: Sequence[Sequence[Tile]], titles: Sequence[str] = (), heading: str = "") -> Image.Image:
+def draw_grid(
+    rows: Sequence[Sequence[Tile]], titles: Sequence[str] = (), heading: str = ""
+) -> Image.Image:
     """Draw rows of tiles on a sheet.
 
     Each column and each row is as large as its largest tile.

@@ -16,7 +16,13 @@ from torch import Tensor
 
 from renderer.errors import InputError, require_finite, require_range
 from renderer.light.ball import Ball, nearest_in_box
-from renderer.light.harmonics import basis, degree_of, lambertian_factors, nonzero_coefficients, select_rows
+from renderer.light.harmonics import (
+    basis,
+    degree_of,
+    lambertian_factors,
+    nonzero_coefficients,
+    select_rows,
+)
 from renderer.settings import MAX_DEGREE
 from renderer.validation import require_whole
 from renderer.vectors import unit
@@ -122,7 +128,9 @@ class Harmonics(Basis):
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
         rows = select_rows(unit(normals.double().T), self.nonzero.tolist())
         by_function = torch.stack(rows).to(normals.dtype) * factors[:, None]
-        return by_function.T.contiguous()  # Transposed last, since rows are what a processor fills fastest.
+        return (
+            by_function.T.contiguous()
+        )  # Transposed last, since rows are what a processor fills fastest.
 
     def radiance(self, directions: Tensor) -> Tensor:
         """(N, size) from unit directions (N, 3), per unit of each coefficient."""
@@ -130,7 +138,9 @@ class Harmonics(Basis):
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Coefficients (..., size, 3) of light that can be emitted, of the same mean and the most alike irradiance."""
-        from renderer.light.nonnegative import project_nonnegative  # scipy's optimizers take long to import
+        from renderer.light.nonnegative import (
+            project_nonnegative,  # scipy's optimizers take long to import
+        )
 
         return project_nonnegative(coefficients)
 
@@ -198,7 +208,9 @@ class LocalBasis(Basis):
         raise NotImplementedError
 
     @abstractmethod
-    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+    def connect(
+        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+    ) -> LightPaths:
         """Find the paths from the lights to surface points, without regard to occlusion.
 
         Args:
@@ -275,11 +287,18 @@ class SumBasis(Basis):
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        return [LocalPart(rows, light.basis) for rows, part in self._rows_of_parts() for light in part.local_lights]
+        return [
+            LocalPart(rows, light.basis)
+            for rows, part in self._rows_of_parts()
+            for light in part.local_lights
+        ]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """Project the coefficients of each part."""
-        projected = [part.project_nonnegative(coefficients[..., rows, :]) for rows, part in self._rows_of_parts()]
+        projected = [
+            part.project_nonnegative(coefficients[..., rows, :])
+            for rows, part in self._rows_of_parts()
+        ]
         return torch.cat(projected, dim=-2)
 
     def moved(self, positions: Tensor) -> Self:
@@ -333,7 +352,9 @@ def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
     )
 
 
-def with_local_lights(sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:
+def with_local_lights(
+    sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
+) -> tuple[Basis, Tensor]:
     """Join environment light and local lights.
 
     Args:

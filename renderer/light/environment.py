@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import LARGEST, InputError, require_file
+from renderer.errors import MAX_MAGNITUDE, InputError, require_file
 from renderer.io.files import replacing
 from renderer.io.images import read_numbers, write_numbers
 from renderer.light.harmonics import basis, equirectangular
@@ -128,9 +128,9 @@ def read_map(path: str | Path) -> Tensor:
         message = str(error).partition("\n")[0]
         raise InputError(f"environment map {path} cannot be read: {message}") from error
     # NaN fails the comparison.
-    if not (np.abs(radiance) <= LARGEST).all():
+    if not (np.abs(radiance) <= MAX_MAGNITUDE).all():
         raise InputError(
-            f"environment map {path} holds NaN, infinity or radiance beyond {LARGEST:g}: "
+            f"environment map {path} holds NaN, infinity or radiance beyond {MAX_MAGNITUDE:g}: "
             "replace these values and save it again"
         )
     return torch.from_numpy(radiance)
@@ -212,7 +212,9 @@ def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
-        raise InputError(f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels")
+        raise InputError(
+            f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels"
+        )
     return array, names
 
 

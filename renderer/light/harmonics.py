@@ -85,7 +85,9 @@ def _degree_of_rows(coefficients: Tensor) -> int | None:
     return degree if len(coefficients) == (degree + 1) ** 2 else None
 
 
-def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients"]:
+def basis(
+    directions: Float[Tensor, "*batch 3"], degree: int
+) -> Float[Tensor, "*batch coefficients"]:
     """Evaluate the real spherical harmonics of all bands up to a degree.
 
     The values are computed in float64 and can be differentiated once by the
@@ -280,7 +282,9 @@ def monomial_coefficients(degree: int) -> Tensor:
     # by z where a = b = 0.
     below = monomial_coefficients(degree - 1)
     along_x, along_y, along_z = below @ homogeneous_gradients(degree)[:, : below.shape[1]]
-    powers = torch.tensor([a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)])
+    powers = torch.tensor(
+        [a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)]
+    )
     derivatives = torch.cat([along_x, along_y[-degree:], along_z[-1:]])
     return derivatives / powers[:, None]
 
@@ -347,7 +351,9 @@ def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     return torch.nonzero(lambertian_factors(degree)).squeeze(1)
 
 
-def irradiance_error(lights: Float[Tensor, "*batch K channels"], given: Float[Tensor, "*batch J channels"]) -> Tensor:
+def irradiance_error(
+    lights: Float[Tensor, "*batch K channels"], given: Float[Tensor, "*batch J channels"]
+) -> Tensor:
     """Compute the relative error of the irradiance of approximate lights.
 
     The error is the rms difference of irradiance over all normals and channels,

@@ -18,7 +18,7 @@ from renderer.light.window import best_window
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.surface.microfacets import SCHLICK, reflectance
 
-# Default amplitude in `degree_for`: degrees whose amplitude in a highlight is
+# Default amplitude in `required_degree`: degrees whose amplitude in a highlight is
 # at most this fraction of the amplitude of degree 0 are not needed.
 AMPLITUDE = 0.1
 # Factor for α that gives the narrower lobe in `window_without_ringing`. Lobes
@@ -33,7 +33,7 @@ SMALLEST = 1e-4
 
 
 @cache
-def degree_for(roughness: float, amplitude: float = AMPLITUDE) -> int:
+def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
     """Find the smallest spherical-harmonic degree that shows the highlights of a material.
 
     The highlight is the lobe of a metal for a camera that looks along the

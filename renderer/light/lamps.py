@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.camera import PerspectiveCamera
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import MAX_SCALE, InputError, require_range
 from renderer.io.mitsuba_entries import pose_of
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.light_files import read_light
@@ -60,13 +60,15 @@ class Lamps(LocalBasis):
     def __post_init__(self) -> None:
         positions = as_array("positions", self.positions)
         if positions.shape[1:] != (3,) or not all(map(any, positions)):
-            raise InputError(f"lamps.positions={self.positions}: give [x, y, z] of lamps, none at the origin")
+            raise InputError(
+                f"lamps.positions={self.positions}: give [x, y, z] of lamps, none at the origin"
+            )
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_field_types(self, "positions")
         for value in chain(*self.positions):
-            require_range("a coordinate of lamps.positions", value, -FACTOR, FACTOR)
-        require_range("lamps.power", self.power, 1 / FACTOR, FACTOR)
-        require_range("lamps.radius", self.radius, 0, FACTOR)
+            require_range("a coordinate of lamps.positions", value, -MAX_SCALE, MAX_SCALE)
+        require_range("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
+        require_range("lamps.radius", self.radius, 0, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
@@ -101,7 +103,9 @@ class Lamps(LocalBasis):
     def moved(self, positions: Tensor) -> Self:
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 
-    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+    def connect(
+        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+    ) -> LightPaths:
         positions = points.new_tensor(self.positions) if positions is None else positions
         # Shape (sets, L, rays, 3). A point has one set of one ray.
         sources = self._disc_points(positions) if self.radius else positions[None, :, None]
@@ -152,12 +156,16 @@ class Lamps(LocalBasis):
         cosine = (toward * F.normalize(positions, dim=-1)).sum(-1) / squared.sqrt()
         return received * cosine.clamp(min=0)
 
-    def _mitsuba_point(self, position: tuple[float, float, float], intensity: list[float]) -> dict[str, Any]:
+    def _mitsuba_point(
+        self, position: tuple[float, float, float], intensity: list[float]
+    ) -> dict[str, Any]:
         """Describe a lamp without extent for Mitsuba."""
         color = {"type": "rgb", "value": intensity}
         return {"type": "point", "position": list(position), "intensity": color}
 
-    def _mitsuba_disc(self, position: tuple[float, float, float], intensity: list[float]) -> dict[str, Any]:
+    def _mitsuba_disc(
+        self, position: tuple[float, float, float], intensity: list[float]
+    ) -> dict[str, Any]:
         """Describe a disc for Mitsuba, whose disks have radius 1 and shine along +z.
 
         The radiance is that of a far point's intensity on the disc's area.

@@ -11,9 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from renderer.angles import ANGLE_UNIT, ANGLES, DEGREES, angles_in_degrees
-from renderer.errors import FACTOR, InputError, require_bounded, require_file
+from renderer.errors import MAX_SCALE, InputError, require_bounded, require_file
 from renderer.image import to_bytes
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.validation import as_path, as_tensor, require_kind
@@ -31,7 +31,9 @@ _DAMAGED_FILE_ERRORS = (
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
-def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
+def save_light(
+    path: str | Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS
+) -> None:
     """Write a light to a .json file.
 
     `read_light` reads the same float32 numbers back, to the bit.
@@ -67,7 +69,7 @@ def save_light(path: str | Path, coefficients: Tensor, basis: Harmonics | LocalB
         description[ANGLE_UNIT] = DEGREES
     picture = basis.picture(coefficients)
     try:
-        write_whole(path, json.dumps(description, allow_nan=False) + "\n")
+        atomic_write(path, json.dumps(description, allow_nan=False) + "\n")
         if picture is not None:
             image = Image.fromarray(to_bytes(picture).numpy())
             write_image(path.with_suffix(".png"), image)
@@ -108,9 +110,9 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     except _DAMAGED_FILE_ERRORS as error:
         raise InputError(f"{path} does not describe a light ({error}): write it again") from error
     # NaN fails the comparison.
-    is_bounded = bool((coefficients.abs() <= FACTOR).all())
+    is_bounded = bool((coefficients.abs() <= MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)
-        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {FACTOR:g}"
+        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {MAX_SCALE:g}"
         raise InputError(f"{path} has coefficients {shape}: {advice}")
     return basis, coefficients

@@ -323,7 +323,9 @@ class _Program:
         nearest, active_rows = zip(*solved, strict=True)
         return np.stack(nearest), list(active_rows)
 
-    def _step_to_sphere(self, direction: Array, displacement: Array, missing_squared: float) -> float:
+    def _step_to_sphere(
+        self, direction: Array, displacement: Array, missing_squared: float
+    ) -> float:
         """Return the step on t after which |displacement + step direction| is the radius.
 
         This is the root of a quadratic equation. `missing_squared` is the squared

@@ -75,7 +75,9 @@ _REFERENCE_PROBE = "grace"
 _LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 
 
-def load_light(light: str | Path, degree: int | None = DEGREE, roughness: float | None = None) -> Tensor:
+def load_light(
+    light: str | Path, degree: int | None = DEGREE, roughness: float | None = None
+) -> Tensor:
     """Load environment light by name or from a file.
 
     An environment map is scaled to the mean luminance of the grace probe, since
@@ -124,10 +126,14 @@ def load_light(light: str | Path, degree: int | None = DEGREE, roughness: float 
         coefficients = _read_light_map(Path(light), map_degree, roughness)
     else:
         files = f"the path of an environment map ({', '.join(SUFFIXES)}) or of coefficients (.json)"
-        raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}")
+        raise InputError(
+            f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}"
+        )
     size = len(coefficients) if degree is None else Harmonics(degree).size
     if coefficients[size:].any():
-        raise InputError(f"light {light} has harmonics beyond degree={degree}: give a higher degree")
+        raise InputError(
+            f"light {light} has harmonics beyond degree={degree}: give a higher degree"
+        )
     return F.pad(coefficients, (0, 0, 0, size - len(coefficients)))
 
 
@@ -183,7 +189,9 @@ def directional(direction: Tensor, color: Tensor, degree: int = DEGREE) -> Tenso
     return basis(direction, degree)[..., None] * color
 
 
-def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:
+def perturb(
+    light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator
+) -> Tensor:
     """Draw random lights around a light.
 
     Every coefficient is changed by a uniform random number, as in the paper's

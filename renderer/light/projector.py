@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from renderer.camera import MAX_FOV, MIN_FOV, OrthographicCamera, PerspectiveCamera
-from renderer.errors import FACTOR, require_range
+from renderer.errors import MAX_SCALE, require_range
 from renderer.io.images import gray_or_image
 from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
@@ -57,9 +57,9 @@ class Projector(LocalBasis):
     def __post_init__(self) -> None:
         require_field_types(self)
         require_range("projector.pixels", self.pixels, 1, MAX_PIXELS)
-        require_range("projector.distance", self.distance, 2, FACTOR)
+        require_range("projector.distance", self.distance, 2, MAX_SCALE)
         require_range("projector.fov", self.fov, MIN_FOV, MAX_FOV)
-        require_range("projector.power", self.power, 1 / FACTOR, FACTOR)
+        require_range("projector.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
@@ -88,7 +88,9 @@ class Projector(LocalBasis):
         """Return coefficients (size, 3) as an image (pixels, pixels, 3), in which 1 is the power."""
         return coefficients.view(self.pixels, self.pixels, 3) / self.power
 
-    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+    def connect(
+        self, points: Tensor, normals: Tensor, positions: Tensor | None = None
+    ) -> LightPaths:
         """Find one path for each point within the pattern."""
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]

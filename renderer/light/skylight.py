@@ -94,10 +94,14 @@ class _FittedSky(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor
+    ) -> Tensor:
         # Chebyshev polynomials in variables that range over [-1, 1].
         in_zenith, by_zenith = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
-        in_turbidity, by_turbidity = _chebyshev(5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1])
+        in_turbidity, by_turbidity = _chebyshev(
+            5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1]
+        )
         # Row 0 is the value, row 1 its derivative by zenith, row 2 by turbidity.
         zenith_factors = torch.stack([in_zenith, by_zenith, in_zenith])
         turbidity_factors = torch.stack([in_turbidity, in_turbidity, by_turbidity])
@@ -115,7 +119,9 @@ class _FittedSky(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        by_zenith, by_azimuth, by_turbidity = ((upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors)
+        by_zenith, by_azimuth, by_turbidity = (
+            (upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors
+        )
         return by_zenith, by_azimuth, by_turbidity, None
 
 
@@ -125,7 +131,9 @@ def _library_fit() -> Tensor:
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 
 
-def _as_parameters(zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float) -> list[Tensor]:
+def _as_parameters(
+    zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float
+) -> list[Tensor]:
     """Return the angles in radians and the turbidity as tensors.
 
     They have the dtype and the device of the first floating tensor among
@@ -158,7 +166,9 @@ def _is_floating(value: object) -> TypeGuard[Tensor]:
     return isinstance(value, Tensor) and value.is_floating_point()
 
 
-def _require_in_domain(name: str, value: Tensor, limits: tuple[float, float], description: str) -> None:
+def _require_in_domain(
+    name: str, value: Tensor, limits: tuple[float, float], description: str
+) -> None:
     """Raise `InputError` if an entry of a parameter is outside of its limits or NaN.
 
     An entry may exceed a limit by rounding.
@@ -169,7 +179,9 @@ def _require_in_domain(name: str, value: Tensor, limits: tuple[float, float], de
     is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
     if is_outside.any():
         first = value[is_outside][0].item()
-        raise InputError(f"{name}={first:.9g} is outside the sky model's domain: give {description}")
+        raise InputError(
+            f"{name}={first:.9g} is outside the sky model's domain: give {description}"
+        )
 
 
 def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:

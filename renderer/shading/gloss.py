@@ -1,6 +1,6 @@
 """Gloss (specular reflection) of surfaces in the terms of glTF 2.0.
 
-A surface has roughness, metallic m and strength s (glTF's `specularFactor`), and
+A surface has roughness, metallic m and specular_factor s (glTF's `specularFactor`), and
 an albedo ρ. Its specular reflection has two parts, both of `renderer.shading.lobes`.
 A dielectric one with the factor (1 - m) s is white. A metallic one with the
 factor m has the color of the metal: it is Schlick's approximation with
@@ -40,7 +40,14 @@ from renderer.errors import InputError, require_bounded
 from renderer.geometry.mesh import Mesh, require_mesh
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.settings import MIN_ROUGHNESS
-from renderer.shading.lobes import ViewFrame, along, coat_albedo, coat_bands, coat_mean, lobe_functions
+from renderer.shading.lobes import (
+    ViewFrame,
+    along,
+    coat_albedo,
+    coat_bands,
+    coat_mean,
+    lobe_functions,
+)
 from renderer.surface.albedo import Texture, sample_textures
 from renderer.surface.microfacets import DIELECTRIC, EDGE, SCHLICK, reflectance
 from renderer.validation import as_tensor, require_flag
@@ -50,7 +57,7 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_NAMES = ("roughness", "metallic", "strength")
+_NAMES = ("roughness", "metallic", "specular_factor")
 # Percentile of the roughness of a texture that `smoothest` returns. Fewer texels
 # are smoother.
 _SMOOTHEST_PERCENT = 1
@@ -68,7 +75,7 @@ class Gloss:
     Attributes:
         roughness: Roughness as in glTF. Below 0.2, it is taken for 0.2.
         metallic: Fraction of the surface that is metal.
-        strength: Factor of the dielectric reflection (`specularFactor` of
+        specular_factor: Factor of the dielectric reflection (`specularFactor` of
             KHR_materials_specular).
         textured: Whether the gloss textures of the mesh multiply the values.
             Otherwise the textures are ignored.
@@ -81,7 +88,7 @@ class Gloss:
 
     roughness: float | Float[Tensor, ...] = 0.5
     metallic: float | Float[Tensor, ...] = 0.0
-    strength: float | Float[Tensor, ...] = 1.0
+    specular_factor: float | Float[Tensor, ...] = 1.0
     textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:
@@ -103,7 +110,7 @@ class Gloss:
         return replace(mesh, gloss=by_face, gloss_textures=textures)
 
     def checked(self, faces: int) -> list[Tensor]:
-        """Return roughness, metallic and strength as tensors of shape (1,) or (F,).
+        """Return roughness, metallic and specular factor as tensors of shape (1,) or (F,).
 
         Args:
             faces: Number of faces of the mesh, F.
@@ -122,7 +129,9 @@ class Gloss:
             require_bounded(**{name: values})
             has_shape = values.shape in ((), (1,), (faces,))
             if not has_shape or not (values.min() >= 0 and values.max() <= 1):
-                raise InputError(f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]")
+                raise InputError(
+                    f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]"
+                )
             checked.append(values.reshape(-1))
         return checked
 
@@ -135,12 +144,12 @@ class SampleGloss(NamedTuple):
     Attributes:
         roughness: Roughness in [0.2, 1].
         metallic: Fraction that is metal in [0, 1].
-        strength: Factor of the dielectric reflection in [0, 1].
+        specular_factor: Factor of the dielectric reflection in [0, 1].
     """
 
     roughness: Tensor
     metallic: Tensor
-    strength: Tensor
+    specular_factor: Tensor
 
     @property
     def metal(self) -> bool:
@@ -178,7 +187,7 @@ class SampleGloss(NamedTuple):
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)
         dielectric, *of_metals = lobe_functions(cosine, self.roughness, degree, terms)
-        white = (1 - self.metallic) * self.strength * dielectric
+        white = (1 - self.metallic) * self.specular_factor * dielectric
         if not of_metals:
             return None, white
         schlick, edge = of_metals
@@ -214,7 +223,7 @@ class SampleGloss(NamedTuple):
         Returns:
             Fractions in [0, 1], with the shape of `cosine`.
         """
-        return 1 - self.strength * coat_albedo(cosine.clamp(0, 1), self.roughness)
+        return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
     def entering_bands(self, degree: int) -> Tensor:
         """Compute the factors A_l - s B_l of environment light below the coat.
@@ -231,7 +240,7 @@ class SampleGloss(NamedTuple):
         """
         reflected = coat_bands(degree).to(self.roughness) @ along(self.roughness)
         factors = lambertian_factors(degree).to(self.roughness)
-        return factors[:, None] - self.strength * reflected[bands(degree)]
+        return factors[:, None] - self.specular_factor * reflected[bands(degree)]
 
     def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
         """Compute how much of the diffuse radiance below the coat the camera sees.
@@ -247,9 +256,13 @@ class SampleGloss(NamedTuple):
             Factors, shape (S,).
         """
         leaving = self.entering((normals * toward).sum(1))
-        return (1 - self.metallic) * leaving / (1 - self.strength * coat_mean(self.roughness))
+        return (
+            (1 - self.metallic) * leaving / (1 - self.specular_factor * coat_mean(self.roughness))
+        )
 
-    def transfer(self, normals: Tensor, toward: Tensor, degree: int) -> tuple[Tensor | None, Tensor, ViewFrame]:
+    def transfer(
+        self, normals: Tensor, toward: Tensor, degree: int
+    ) -> tuple[Tensor | None, Tensor, ViewFrame]:
         """Compute the specular radiance per unit of each coefficient of environment light.
 
         The coefficients are those in the axes of the view. The result is
@@ -266,7 +279,7 @@ class SampleGloss(NamedTuple):
             the frame of the view, which turns coefficients to world axes
             (`to_world`).
         """
-        frame = ViewFrame.of(normals, toward)
+        frame = ViewFrame.from_directions(normals, toward)
         colored, white = self.lobes(frame.cosine, degree)
         colored_transfer = None if colored is None else frame.harmonics(colored)
         return colored_transfer, frame.harmonics(white), frame
@@ -286,7 +299,7 @@ class SampleGloss(NamedTuple):
             radiance, shape (...) each.
         """
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
-        white = self.metallic * edge + (1 - self.metallic) * self.strength * dielectric
+        white = self.metallic * edge + (1 - self.metallic) * self.specular_factor * dielectric
         return self.metallic * schlick, white
 
 
@@ -301,7 +314,9 @@ def smoothest(mesh: Mesh) -> float:
     """
     if mesh.gloss is None:
         return 1.0
-    factors = [np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures]
+    factors = [
+        np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures
+    ]
     # The last factor is that of faces without a texture, whose index is -1.
     factors.append(1.0)
     factor_of_face = np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
@@ -324,7 +339,9 @@ def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
     return values if len(values) == 1 else values[samples]
 
 
-def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -> SampleGloss | None:
+def sample_gloss(
+    mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
+) -> SampleGloss | None:
     """Look up the gloss at the samples of a view.
 
     The result is differentiable in a given gloss. A warning is issued if
@@ -347,12 +364,12 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
     if gloss is None:
         return None
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
-    roughness, metallic, strength = (_by_sample(column, fragments) for column in columns)
+    roughness, metallic, specular_factor = (_by_sample(column, fragments) for column in columns)
     if textures:
         sources = []
         for texture in textures:
             factors = torch.from_numpy(texture).to(fragments.coverage) / 255
-            sources.append(Texture.of(factors))
+            sources.append(Texture.from_values(factors))
         roughness_factor, metallic_factor = sample_textures(sources, mesh, fragments)
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
@@ -362,7 +379,7 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None) -
             "the smallest roughness that light of degree 40 shows.",
             stacklevel=2,
         )
-    return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, strength)
+    return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, specular_factor)
 
 
 def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
@@ -371,8 +388,8 @@ def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
         return None
     is_even = (mesh.gloss == mesh.gloss[0]).all()
     rows = mesh.gloss[:1] if is_even else mesh.gloss
-    roughness, metallic, strength = torch.from_numpy(rows).unbind(1)
-    return Gloss(roughness, metallic, strength)
+    roughness, metallic, specular_factor = torch.from_numpy(rows).unbind(1)
+    return Gloss(roughness, metallic, specular_factor)
 
 
 def _by_sample(column: Tensor, fragments: Fragments) -> Tensor:

@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from renderer.light.harmonics import bands, per_degree, rotate, select_rows
-from renderer.light.highlights import degree_for
+from renderer.light.highlights import required_degree
 from renderer.settings import MIN_ROUGHNESS
 from renderer.surface.microfacets import DIELECTRIC, reflectance
 from renderer.vectors import unit
@@ -86,7 +86,7 @@ class ViewFrame(NamedTuple):
     axis: ViewAxis
 
     @staticmethod
-    def of(normals: Tensor, toward: Tensor) -> ViewFrame:
+    def from_directions(normals: Tensor, toward: Tensor) -> ViewFrame:
         """Create the frame of a view.
 
         The result is differentiable with respect to both arguments.
@@ -308,7 +308,9 @@ class Angle(NamedTuple):
 
     def for_columns(self, coefficients: Tensor) -> Angle:
         """Return an angle of shape () in shape (1,), on the device and in the dtype given."""
-        return Angle(sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients))
+        return Angle(
+            sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
+        )
 
 
 def _rotate_about_x(vectors: Components, angle: Angle) -> Components:
@@ -531,7 +533,7 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
 def coat_bands(degree: int) -> Tensor:
     """Compute the factors by which a dielectric coat reflects each degree of the lighting.
 
-    A coat of strength 1 reflects the fraction E(μ) of the light at the cosine μ
+    A coat of specular_factor 1 reflects the fraction E(μ) of the light at the cosine μ
     (see `coat_albedo`). The irradiance that it reflects in total is
     Σ_lm B_l U_lm Y_lm(n) with the coefficients U_lm of the lighting, the
     harmonics Y_lm and the normal n. The factor of degree l is
@@ -704,7 +706,7 @@ def _fit(degree: int, roughness: float) -> Tensor:
         noticeable amplitude at this roughness (see NEGLIGIBLE).
     """
     polynomial_count = 2 * degree + 1 + MARGIN
-    noticeable_degree = max(degree_for(roughness, NEGLIGIBLE), USUAL)
+    noticeable_degree = max(required_degree(roughness, NEGLIGIBLE), USUAL)
     fitted_degree = min(degree, noticeable_degree)
     # The least squares below use 1.5 times as many cosines as polynomials. The
     # number of cosines is N.

@@ -178,12 +178,12 @@ def _coat_irradiance(normals: Tensor, light: Tensor, gloss: SampleGloss) -> Tens
     # the same roughness.
     of_roughness = along(gloss.roughness)
     if len(gloss.roughness) == 1:
-        return gloss.strength * _Series.apply(normals, (reflected @ of_roughness) * light)
+        return gloss.specular_factor * _Series.apply(normals, (reflected @ of_roughness) * light)
     # One light for each node, shape (K, nodes × 3).
     lights = (reflected[..., None] * light[:, None]).flatten(1)
     # The irradiance under each of them, shape (nodes, 3, S).
     by_node = _Series.apply(normals, lights).unflatten(0, (-1, COLORS))
-    return gloss.strength * (by_node * of_roughness[:, None]).sum(0)
+    return gloss.specular_factor * (by_node * of_roughness[:, None]).sum(0)
 
 
 class _Series(torch.autograd.Function):
@@ -329,9 +329,9 @@ class _IrradiancePolynomial:
         Only the tangential part of the slope has a meaning.
         """
         # The monomials have no name, so that their memory is released at once.
-        slope = torch.addmm(self.linear, self.even, harmonics.monomials(directions, self.degree - 1)).unflatten(
-            0, (3, COLORS)
-        )
+        slope = torch.addmm(
+            self.linear, self.even, harmonics.monomials(directions, self.degree - 1)
+        ).unflatten(0, (3, COLORS))
         # The value is constant + n · linear + p(n). The loop below adds
         # n · slope / d = p(n) + n · linear / d, so 1 - 1/d of the linear term is left.
         linear = self.linear.view(3, COLORS).T

@@ -51,7 +51,7 @@ class Texture:
     look_up: Callable[[Tensor], Tensor]
 
     @staticmethod
-    def of(values: Tensor) -> "Texture":
+    def from_values(values: Tensor) -> "Texture":
         """Create a texture from linear values, in which lookups are differentiable.
 
         Args:
@@ -74,7 +74,9 @@ class Texture:
         return Texture(height=height, width=width, look_up=look_up)
 
 
-def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
+def surface_albedo(
+    mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
+) -> Tensor:
     """Compute the albedo of a mesh: the interpolated corner color times the texture.
 
     Colors and texels are decoded before they are interpolated.
@@ -97,7 +99,7 @@ def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Se
     colors = _interpolated_colors(mesh, fragments, encoding)
     used_textures: list[Texture] = []
     if textures is not None:
-        used_textures = [Texture.of(values) for values in textures]
+        used_textures = [Texture.from_values(values) for values in textures]
     elif mesh.packed_textures:
         used_textures = mesh_textures(mesh, encoding, fragments.coverage)
     if not used_textures:
@@ -157,7 +159,9 @@ def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
     blocks = []
     # Blocks of BLOCK points limit the memory.
     for block in uvs.split(BLOCK, dim=1):
-        weighted = [weight * texture.look_up(texel) for weight, texel in _surrounding_texels(texture, block)]
+        weighted = [
+            weight * texture.look_up(texel) for weight, texel in _surrounding_texels(texture, block)
+        ]
         blocks.append(reduce(torch.add, weighted))
     return torch.cat(blocks, dim=1)
 
@@ -273,7 +277,7 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     return _at_samples(albedo.index_select(0, seen_faces), fragments)
 
 
-def painted_albedo(
+def paint_faces(
     mesh: Mesh,
     fragments: Fragments,
     encoding: str,

@@ -25,11 +25,11 @@ from renderer.vectors import unit
 
 # Refractive index that `fresnel` uses for dielectrics. It is typical of
 # varnish.
-INDEX = 1.5
+REFRACTIVE_INDEX = 1.5
 
 # Indices of the three Fresnel terms along the first axis of tensors. SCHLICK
 # has F0 = 1 and F90 = 0, EDGE has F0 = 0 and F90 = 1, and DIELECTRIC has the
-# exact term for the refractive index INDEX.
+# exact term for the refractive index REFRACTIVE_INDEX.
 SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
@@ -89,8 +89,8 @@ def fresnel(cosine: Tensor) -> Tensor:
     Returns:
         F for SCHLICK, EDGE and DIELECTRIC, in [0, 1], shape (3, ...).
     """
-    # Snell's law gives INDEX times the cosine of the refracted ray.
-    refracted = (INDEX**2 - 1 + cosine**2).sqrt()
+    # Snell's law gives REFRACTIVE_INDEX times the cosine of the refracted ray.
+    refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()
     # These are the reflected fractions of the amplitude, for light that is
     # polarized perpendicular and parallel to the plane of incidence.
     perpendicular = (refracted - cosine) / (refracted + cosine)

@@ -35,7 +35,7 @@ from renderer.surface.albedo import changed_albedo
 
 # Largest number of texels of a new texture. If charts need more, they get a
 # coarser grid.
-MOST_TEXELS = 2**26
+MAX_TEXELS = 2**26
 # Number of texels that are painted at once. It limits the memory.
 BLOCK = 2**20
 # Texels that packing may waste, as a factor for the area of the charts.
@@ -114,7 +114,9 @@ def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) ->
     if not (mesh.texture_ids >= 0).all():
         # A face without a texture has the full corner color.
         return largest_corner
-    largest_texel = max((float(linear_values[texture.max()]) for texture in mesh.textures), default=1.0)
+    largest_texel = max(
+        (float(linear_values[texture.max()]) for texture in mesh.textures), default=1.0
+    )
     return largest_corner * largest_texel
 
 
@@ -255,7 +257,7 @@ class _Charts:
         # v points up, and rows are counted from the top.
         old_positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * old_size
         area = (np.ptp(old_positions, axis=1) + 2).prod(axis=1).sum()
-        self.scale = min(1.0, np.sqrt(MOST_TEXELS / max(area, 1)))
+        self.scale = min(1.0, np.sqrt(MAX_TEXELS / max(area, 1)))
         # Positions of the corners in units of new texels, shape (N, 3, 2).
         self._positions = old_positions * self.scale
         # Interpolation reads the texels whose centers surround a position.

@@ -100,7 +100,9 @@ def joined(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
     return SparseTransfer(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis) -> SparseTransfer:
+def local_transfer(
+    rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis
+) -> SparseTransfer:
     """Compute the transfer matrix of local light in a view.
 
     Each sample casts a ray to each source, so shadows are as sharp as the
@@ -281,7 +283,9 @@ class LocalLightView:
             if basis not in self._fixed_paths:
                 self._fixed_paths[basis] = self._find_paths(basis, None)
             paths = self._fixed_paths[basis]
-        radiance = local_radiance(self._surface, albedo.cpu().double(), paths, light.cpu().double(), fragments)
+        radiance = local_radiance(
+            self._surface, albedo.cpu().double(), paths, light.cpu().double(), fragments
+        )
         return radiance.to(light)
 
     def _find_paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:

@@ -66,7 +66,9 @@ class TransferOperators(Sequence[TransferOperator]):
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
             if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                raise InputError("operators differ in image settings, basis of light or dtype: give equal ones")
+                raise InputError(
+                    "operators differ in image settings, basis of light or dtype: give equal ones"
+                )
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
@@ -203,7 +205,9 @@ class TransferOperators(Sequence[TransferOperator]):
         views = zip(self, lights, background, strict=True)
         return torch.stack([operator.image(light, behind) for operator, light, behind in views])
 
-    def _stacked_images(self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]) -> Tensor:
+    def _stacked_images(
+        self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]
+    ) -> Tensor:
         """Render lights (V, *B, coefficients, 3), one stack of operators after the other.
 
         The background has the shape (3, size, size) or that of the images.
@@ -231,7 +235,7 @@ class TransferOperators(Sequence[TransferOperator]):
             covered.append(encode(clamp(radiance + term), encoding))
         canvas = backgrounds.expand(len(lights), -1, -1)
         canvas = canvas.clone(memory_format=torch.contiguous_format)
-        return InPlace.apply(canvas, targets, *covered).view(image_shape)
+        return ScatterLayers.apply(canvas, targets, *covered).view(image_shape)
 
 
 def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
@@ -246,7 +250,7 @@ def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
         ) from error
 
 
-class InPlace(torch.autograd.Function):
+class ScatterLayers(torch.autograd.Function):
     """Write layers of pixel values into images, in place.
 
     Its arguments are a canvas (N, 3, size²), and for each layer its target and
@@ -256,7 +260,9 @@ class InPlace(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor
+    ) -> Tensor:
         ctx.targets = targets
         for (rows, pixels), values in zip(targets, covered, strict=True):
             # index_copy_ takes twice as long as scatter_ on a CPU.

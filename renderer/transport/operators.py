@@ -27,7 +27,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.camera import Camera
-from renderer.errors import LARGEST, InputError, as_device, require_bounded
+from renderer.errors import MAX_MAGNITUDE, InputError, as_device, require_bounded
 from renderer.geometry.mesh import Mesh
 from renderer.image import as_background, background_term, composite, encode, encode_gradient
 from renderer.light import harmonics
@@ -179,7 +179,9 @@ class TransferOperator:
         gradient = self._gradient_of_images(image_gradient.detach(), is_passing, clamped)
         return images, gradient
 
-    def radiance(self, lights: Float[Tensor, "*lights coefficients 3"]) -> Float[Tensor, "*lights 3 P"]:
+    def radiance(
+        self, lights: Float[Tensor, "*lights coefficients 3"]
+    ) -> Float[Tensor, "*lights 3 P"]:
         """Compute the linear radiance of the covered pixels, differentiable in the lights.
 
         The product is computed in the dtype of the operator.
@@ -223,10 +225,14 @@ class TransferOperator:
         if radiance_gradient.shape[-2:] != self.albedo.shape:
             given = tuple(radiance_gradient.shape)
             expected = tuple(self.albedo.shape)
-            raise InputError(f"radiance_gradient of shape {given} is not of the operator's pixels: give {expected}")
+            raise InputError(
+                f"radiance_gradient of shape {given} is not of the operator's pixels: give {expected}"
+            )
         return self._light_gradient(radiance_gradient)
 
-    def _images(self, lights: Tensor, background: _PreparedBackground) -> tuple[Tensor, Tensor, Tensor]:
+    def _images(
+        self, lights: Tensor, background: _PreparedBackground
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Render without a graph.
 
         Returns the images (*B, 3, size, size), ones and zeros where the clamp
@@ -251,7 +257,9 @@ class TransferOperator:
         images.scatter_(-1, rows, encoded)
         return images.view(image_shape), is_passing, clamped
 
-    def _gradient_of_images(self, image_gradient: Tensor, is_passing: Tensor, clamped: Tensor) -> Tensor:
+    def _gradient_of_images(
+        self, image_gradient: Tensor, is_passing: Tensor, clamped: Tensor
+    ) -> Tensor:
         """Compute the gradient by the lights from that by the images of `_images`.
 
         The gradient by the images has the shape (*B, 3, size, size).
@@ -288,7 +296,7 @@ class TransferOperator:
         # This takes half the time of `require_bounded` in small images.
         # `require_bounded` finds and names the fault.
         values = lights.detach().reshape(-1)
-        if not torch.dot(values, values).item() <= LARGEST**2:
+        if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
@@ -327,9 +335,13 @@ class TransferOperator:
             selected = upstream.mT.index_select(-2, self.sparse.pixel)
             arriving = selected * self.sparse.weight
             gradient = gradient.index_add(-2, self.sparse.function, arriving)
-        return gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
+        return (
+            gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
+        )
 
-    def _prepare_background(self, background: float | Tensor, lights: Tensor) -> _PreparedBackground:
+    def _prepare_background(
+        self, background: float | Tensor, lights: Tensor
+    ) -> _PreparedBackground:
         """Prepare a background for lights.
 
         A gray value behind one light is kept for the next call.
@@ -466,7 +478,9 @@ class _Image(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground) -> Tensor:
+    def forward(
+        ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground
+    ) -> Tensor:
         images, is_passing, clamped = operator._images(lights, background)
         ctx.operator = operator
         ctx.is_passing = is_passing
@@ -493,7 +507,9 @@ def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
     is_tensor = isinstance(image_gradient, Tensor)
     if not is_tensor or image_gradient.shape != images.shape:
         given = tuple(image_gradient.shape) if is_tensor else type(image_gradient).__name__
-        raise InputError(f"loss_gradient returned {given}: return a tensor of the images' shape {tuple(images.shape)}")
+        raise InputError(
+            f"loss_gradient returned {given}: return a tensor of the images' shape {tuple(images.shape)}"
+        )
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
@@ -553,7 +569,9 @@ def build_operators(
             scale is not finite.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
-    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
+    views = build_fragments(
+        mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed
+    )
     transport = build_transport(mesh, settings, albedo_scale, basis)
     builder = _OperatorBuilder(
         mesh=mesh,
@@ -697,7 +715,9 @@ class _OperatorBuilder:
         """Return the scaled albedo (S, 3) at the samples."""
         return surface_albedo(self.mesh, fragments, self.settings.encoding) * self.albedo_scale
 
-    def _environment_rows(self, part: EnvironmentPart, surface: Surface, channels: _Channels) -> _DenseRows:
+    def _environment_rows(
+        self, part: EnvironmentPart, surface: Surface, channels: _Channels
+    ) -> _DenseRows:
         """Compute the rows of environment light, with shadows and bounces."""
         harmonics_basis = part.basis
         everything = torch.arange(harmonics_basis.size)
@@ -707,7 +727,9 @@ class _OperatorBuilder:
             coefficients = harmonics_basis.nonzero
         else:
             albedo = channels.sample_albedo
-            transfer = _glossy_box_filter(surface, surface.gloss, albedo, harmonics_basis, self.dtype)
+            transfer = _glossy_box_filter(
+                surface, surface.gloss, albedo, harmonics_basis, self.dtype
+            )
             coefficients = everything
         change = None
         if self.transport is not None:
@@ -717,7 +739,9 @@ class _OperatorBuilder:
             coefficients = everything
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
-    def _local_entries(self, part: LocalPart, surface: Surface, channels: _Channels) -> SparseTransfer:
+    def _local_entries(
+        self, part: LocalPart, surface: Surface, channels: _Channels
+    ) -> SparseTransfer:
         """Compute the nonzero entries of a local light."""
         return local_transfer(self.rays, surface, channels.sample_albedo, part.basis)
 
@@ -726,7 +750,9 @@ class _OperatorBuilder:
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
-    def _sparse_rows(self, part: LocalPart, entries: SparseTransfer, channels: _Channels) -> SparseTransfer:
+    def _sparse_rows(
+        self, part: LocalPart, entries: SparseTransfer, channels: _Channels
+    ) -> SparseTransfer:
         """Return the entries of a local light in three channels, with their albedo."""
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
         return SparseTransfer(part.rows.start + entries.function, entries.pixel, weight)
@@ -764,7 +790,9 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel.T if is_equal.all() else None
 
 
-def _box_filter(surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype) -> Tensor:
+def _box_filter(
+    surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype
+) -> Tensor:
     """Sum albedo × A_l Y_lm(n) over each pixel's samples, in float64.
 
     This is the transfer of a matte surface under an open sky, with the factors

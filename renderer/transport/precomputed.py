@@ -139,7 +139,9 @@ class Patches:
         return torch.from_numpy(self.pieces.face_normals())
 
 
-def _group_sides(pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell: float) -> np.ndarray:
+def _group_sides(
+    pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell: float
+) -> np.ndarray:
     """Return the patch (S,) of each side, given its piece (S,) and its facing (S, 1).
 
     Sides share a patch if their centers lie in one cell of a grid with cells of
@@ -274,7 +276,9 @@ class Transport:
         return torch.einsum("ckp,kc->cp", change.to(light), light)
 
 
-def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis) -> Transport | None:
+def build_transport(
+    mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis
+) -> Transport | None:
     """Compute the shadows and bounces of environment light.
 
     Local lights are left out here, because they cast their shadows by
@@ -294,14 +298,18 @@ def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, ba
         InputError: If the basis has local lights and light is to bounce.
     """
     if basis.local_lights and settings.bounces:
-        raise InputError(f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows")
+        raise InputError(
+            f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows"
+        )
     environment = basis.environment
     if environment is None or not settings.global_illumination:
         return None
     return Transport(mesh, settings, albedo_scale, environment.basis)
 
 
-def _radiosity(patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics) -> Tensor:
+def _radiosity(
+    patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
+) -> Tensor:
     """Return the radiance B (N, size, 3) that patches send, or (N, size, 1) if all are gray."""
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
     albedo = patches.mean(sample_albedo) * albedo_scale

@@ -238,7 +238,9 @@ class Rays:
         is_bent = (surface.normals * surface.planes).sum(1) < 1 - 2 * BENT
         return fragments.pixel[is_face_below[fragments.face] | is_bent].unique()
 
-    def first_hit(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
+    def first_hit(
+        self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None
+    ) -> Tensor:
         """Find the first face that each ray hits.
 
         Args:
@@ -250,7 +252,9 @@ class Rays:
             Indices of faces, or `NO_FACE`, int64, shape (N,).
         """
         rays = [origins, directions] if lengths is None else [origins, directions, lengths]
-        faces = self._scene.run(*(np.ascontiguousarray(array.numpy(), np.float32) for array in rays))
+        faces = self._scene.run(
+            *(np.ascontiguousarray(array.numpy(), np.float32) for array in rays)
+        )
         return torch.from_numpy(faces).long()
 
 

@@ -374,7 +374,9 @@ class _Interpolation(torch.autograd.Function):
         return _distribute(upstream, face, weights, ctx.corners_shape), None, None
 
 
-def _distribute(values: Tensor, face: Tensor, weights: Tensor, corners_shape: Sequence[int]) -> Tensor:
+def _distribute(
+    values: Tensor, face: Tensor, weights: Tensor, corners_shape: Sequence[int]
+) -> Tensor:
     """Add weighted values of samples to the corners of their faces.
 
     Args:
@@ -439,7 +441,9 @@ def build_fragments(
     projected = coordinates.swapaxes(1, 2)
     # The third coordinate is -1 at the near plane.
     is_uncut = bool((projected[..., 2] >= -1).all())
-    face_ids = rasterizer.rasterize(projected, faces, settings.size * settings.samples, closed=closed and is_uncut)
+    face_ids = rasterizer.rasterize(
+        projected, faces, settings.size * settings.samples, closed=closed and is_uncut
+    )
     views = []
     for camera, points, ids in zip(cameras, projected, face_ids, strict=True):
         depths = camera.depths(vertices)

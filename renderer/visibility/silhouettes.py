@@ -467,7 +467,9 @@ class _Silhouettes:
             samples[:, kept],
         )
 
-    def _is_visible(self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray) -> np.ndarray:
+    def _is_visible(
+        self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray
+    ) -> np.ndarray:
         """Tell which cuts are visible.
 
         A cut is hidden if the surfaces at both samples beside it are nearer.
@@ -536,7 +538,9 @@ class _Cuts(NamedTuple):
     next_sample: np.ndarray
 
 
-def _cut(start: np.ndarray, end: np.ndarray, across: np.ndarray, end_across: np.ndarray, resolution: int) -> _Cuts:
+def _cut(
+    start: np.ndarray, end: np.ndarray, across: np.ndarray, end_across: np.ndarray, resolution: int
+) -> _Cuts:
     """Cut edges at each line of samples between their starts and ends.
 
     Cuts before the first sample or after the last sample of a line are left
@@ -622,7 +626,9 @@ def _edges(faces: bytes) -> _Edges:
     high = np.maximum(first, second).ravel()
     vertex_count = int(high.max()) + 1
     # np.unique sorts one number per side faster than a pair of vertices.
-    keys, edge_of_side, face_count = np.unique(low * vertex_count + high, return_inverse=True, return_counts=True)
+    keys, edge_of_side, face_count = np.unique(
+        low * vertex_count + high, return_inverse=True, return_counts=True
+    )
     return _Edges(
         corners=corners,
         ends=np.stack(np.divmod(keys, vertex_count)),

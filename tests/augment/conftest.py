@@ -61,8 +61,8 @@ def make_scene(stone) -> Callable[..., Scene]:
         size: int = SIZE,
     ) -> Scene:
         draws = torch.Generator().manual_seed(0)
-        even_light = ambient(torch.full((3,), 0.22))
-        light = even_light + 0.03 * torch.randn(49, 3, generator=draws)
+        soft_front_light = ambient(torch.full((3,), 0.22))
+        light = soft_front_light + 0.03 * torch.randn(49, 3, generator=draws)
         if backgrounds is None:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
         settings = ImageSettings(size, samples=2, encoding=encoding)
@@ -178,7 +178,7 @@ def attacked(by_color) -> Callable[..., augment.AttackResult]:
         choices = {
             "allow_negative": True,
             "margin": 0.0,
-            "rounded": False,
+            "quantized": False,
             "sensor_noise": 0.0,
             "max_steps": 8,
         }

@@ -31,19 +31,32 @@ def test_more_than_the_free_memory_is_refused_before_it_is_allocated(tmp_path, m
         require_memory("renders", 2**32, device)
 
 
-@pytest.mark.parametrize("at_once, camera", [(2**16, {}), (2**24, {}), (2**24, {"blur": 0.8, "pattern_fraction": 0.7})])
-def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_free(monkeypatch, at_once, camera):
+@pytest.mark.parametrize(
+    "at_once, camera", [(2**16, {}), (2**24, {}), (2**24, {"blur": 0.8, "pattern_fraction": 0.7})]
+)
+def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_free(
+    monkeypatch, at_once, camera
+):
     """By torch's profiler, for all images at once and for few; with the renders as bytes, as they are trained on."""
     needed = []
     monkeypatch.setattr(scene, "AT_ONCE", at_once)
     monkeypatch.setattr(scene, "require_memory", lambda name, bytes_, device: needed.append(bytes_))
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=1))
     settings.vary.camera = CameraEffectSettings(**camera)
-    grays = {"views": 2, "backgrounds": [row / 128 for row in range(128)], "samples": 1, "rasterizer": "numpy"}
+    grays = {
+        "views": 2,
+        "backgrounds": [row / 128 for row in range(128)],
+        "samples": 1,
+        "rasterizer": "numpy",
+    }
     service = AugmentationService.from_meshes([("solid:orange:0", 0)], 32, settings, **grays)
-    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as recorded:
+    with torch.profiler.profile(
+        activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
+    ) as recorded:
         to_bytes(service.regenerate(nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 2)), 0).images)
-    events = [event for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]"]
+    events = [
+        event for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]"
+    ]
     changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
     assert needed[-1] / 2 < max(itertools.accumulate(changes)) <= needed[-1]
 

@@ -8,10 +8,14 @@ import torch
 from torch import nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.descent import Criterion, DescentResult, descend
 from augment.model_passes import warn_once
 
-SAID = "can't allocate memory: you tried", "CUDA error: out of memory", "CUDA error: CUBLAS_STATUS_ALLOC_FAILED"
+SAID = (
+    "can't allocate memory: you tried",
+    "CUDA error: out of memory",
+    "CUDA error: CUBLAS_STATUS_ALLOC_FAILED",
+)
 SAID += (
     "cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED",
     "GET was unable to find an engine to execute",
@@ -38,8 +42,8 @@ class Shades:
 
     start = torch.linspace(0.2, 1, 10, dtype=torch.float64)[:, None]
 
-    def __init__(self, at_once: int):
-        self.at_once = at_once
+    def __init__(self, group_size: int):
+        self.group_size = group_size
 
     def render(self, values, examples):
         return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
@@ -48,10 +52,10 @@ class Shades:
         return (values - length * 0.05 * gradient.sign()).clamp(0, 1)
 
 
-def attack(model: nn.Module, batch_size: int = 4, at_once: int = 10) -> DescentResult:
-    goal = Goal(torch.zeros(10, 1, dtype=torch.int64))
+def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> DescentResult:
+    criterion = Criterion(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, batch_size=batch_size)
-    return descend(model, Shades(at_once), goal, settings, restarts=[Shades.start.flip(0)])
+    return descend(model, Shades(group_size), criterion, settings, restarts=[Shades.start.flip(0)])
 
 
 def assert_same(actual: DescentResult, expected: DescentResult) -> None:
@@ -64,9 +68,15 @@ def test_an_attack_without_memory_goes_on_in_smaller_batches_with_the_same_resul
     warn_once.cache_clear()
     small = Small(3, error)
     assert_same(attack(small, batch_size=8), attack(Small(), batch_size=2))
-    assert small.sizes[:3] == [8, 4, 2] and small.sizes.count(8) <= 2  # not tried again in every step
-    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert warnings == [f"memory ran out: the attack goes on with {size} images per pass" for size in (4, 2)]
+    assert (
+        small.sizes[:3] == [8, 4, 2] and small.sizes.count(8) <= 2
+    )  # not tried again in every step
+    warnings = [
+        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
+    ]
+    assert warnings == [
+        f"memory ran out: the attack goes on with {size} images per pass" for size in (4, 2)
+    ]
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("shapes differ")])
@@ -75,8 +85,8 @@ def test_no_memory_for_one_image_and_other_errors_are_raised(error):
         attack(Small(0, error))
 
 
-@pytest.mark.parametrize("at_once", [1, 3, 4])
-def test_an_attack_in_parts_is_the_attack(at_once):
+@pytest.mark.parametrize("group_size", [1, 3, 4])
+def test_an_attack_in_parts_is_the_attack(group_size):
     expected = attack(Small())
     assert 0 < expected.success.sum() < 10 or expected.steps.unique().numel() > 1
-    assert_same(attack(Small(), at_once=at_once), expected)
+    assert_same(attack(Small(), group_size=group_size), expected)

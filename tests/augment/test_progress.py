@@ -18,7 +18,9 @@ class Terminal(io.StringIO):
 
 @pytest.mark.parametrize("stream", [Terminal, io.StringIO])
 @pytest.mark.parametrize("seconds, ends", [(0.3, True), (0.3, False), (0.0, True)])
-def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(monkeypatch, stream, seconds, ends):
+def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(
+    monkeypatch, stream, seconds, ends
+):
     """And leaves nothing on a terminal, also where the loop ends early."""
     monkeypatch.setattr(progress_module, "PATIENCE", 0.1)
     monkeypatch.setattr(sys, "stderr", stream())
@@ -31,7 +33,9 @@ def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(monk
     assert done == [(item, seconds > 0) for item in ([1, 2] if ends else [1])]
     if stream is io.StringIO:
         lines = sys.stderr.getvalue().splitlines()
-        assert lines[:1] == (["attack ..."] if seconds else []) and len(lines) < 5  # at 0.1, 0.3, 0.7 seconds ...
+        assert (
+            lines[:1] == (["attack ..."] if seconds else []) and len(lines) < 5
+        )  # at 0.1, 0.3, 0.7 seconds ...
     else:
         assert sys.stderr.getvalue().rpartition("\r")[2].strip() == ""
 

@@ -94,11 +94,11 @@ def serve(scene, labels):
     def build(
         seed: int = 0,
         labels: Tensor = labels,
-        studied: tuple[int, ...] = (),
+        positive_classes: tuple[int, ...] = (),
         **settings,
     ) -> AugmentationService:
         choices = AugmentationSettings(**{"attack": SHORT, **settings})
-        return AugmentationService(choices, scene, labels, seed, Phases(), studied)
+        return AugmentationService(choices, scene, labels, seed, Phases(), positive_classes)
 
     return build
 
@@ -114,7 +114,7 @@ def logits_of(model: nn.Module, images: Tensor) -> Tensor:
 # --------------------------------------------------------------- what is returned
 
 
-@pytest.mark.parametrize("settings", [{"arm": "none"}, {"arm": "random", "examples": 0}])
+@pytest.mark.parametrize("settings", [{"mode": "none"}, {"mode": "random", "examples": 0}])
 def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(model, settings):
     no_labels = torch.zeros(0, dtype=torch.int64)
     choices = AugmentationSettings(**settings)
@@ -125,9 +125,9 @@ def test_without_an_arm_or_examples_there_are_no_renders_and_no_scene_is_needed(
     assert renders.diagnostics == {}
 
 
-@pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_renders_are_images_with_the_labels_of_the_scene(serve, model, labels, arm):
-    renders = serve(arm=arm).regenerate(model, 0)
+@pytest.mark.parametrize("mode", ["random", "adversarial"])
+def test_renders_are_images_with_the_labels_of_the_scene(serve, model, labels, mode):
+    renders = serve(mode=mode).regenerate(model, 0)
     assert renders.images.shape == (EXAMPLE_COUNT, 3, 8, 8)
     assert not renders.images.requires_grad
     assert renders.images.min() >= 0
@@ -136,9 +136,9 @@ def test_renders_are_images_with_the_labels_of_the_scene(serve, model, labels, a
     assert torch.equal(renders.labels, labels)
 
 
-@pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_diagnostics_are_finite_numbers(serve, model, arm):
-    service = serve(arm=arm)
+@pytest.mark.parametrize("mode", ["random", "adversarial"])
+def test_diagnostics_are_finite_numbers(serve, model, mode):
+    service = serve(mode=mode)
     diagnostics = service.regenerate(model, 0).diagnostics
     for value in diagnostics.values():
         assert type(value) is float
@@ -149,7 +149,9 @@ def test_diagnostics_are_finite_numbers(serve, model, arm):
     assert service.phases.take().keys() == {"attack_classifier"}
 
 
-@pytest.mark.parametrize("settings", [{"arm": "random"}, {"arm": "adversarial", "init": "random"}])
+@pytest.mark.parametrize(
+    "settings", [{"mode": "random"}, {"mode": "adversarial", "init": "random"}]
+)
 def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     images = serve(seed=1, **settings).regenerate(model, 3).images
     resumed = serve(seed=1, **settings)
@@ -160,7 +162,7 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     assert not torch.equal(serve(seed=2, **settings).regenerate(model, 3).images, images)
 
 
-# --------------------------------------------------------------- the arm "folder"
+# --------------------------------------------------------------- the mode "folder"
 
 FOLDER_SIZE = 7
 ROUND_COUNT = 21
@@ -184,7 +186,7 @@ def always_class_0() -> nn.Module:
 @pytest.mark.parametrize(("examples", "shown"), [(3, 3), (None, 7), (10, 10)])
 def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(folder_images, examples, shown):
     labels = torch.arange(FOLDER_SIZE) % 3
-    settings = AugmentationSettings(arm="folder", folder="unread", examples=examples)
+    settings = AugmentationSettings(mode="folder", folder="unread", examples=examples)
     service = AugmentationService(settings, None, labels, 5, Phases(), images=folder_images)
     assert len(service) == shown
     model = always_class_0()
@@ -201,7 +203,7 @@ def test_all_images_of_a_folder_are_shown_before_any_is_shown_again(folder_image
     assert rounds[4].diagnostics["attack_success"] == pytest.approx(float(error_rate))
 
 
-# --------------------------------------------------------------- the arm "random"
+# --------------------------------------------------------------- the mode "random"
 
 
 @pytest.mark.parametrize(
@@ -216,7 +218,7 @@ def test_diagnostics_of_random_light_are_those_of_the_classified_images(
     rows,
 ):
     monkeypatch.setattr("augment.service.CLASSIFIED", classified)
-    renders = serve(arm="random").regenerate(model, 0)
+    renders = serve(mode="random").regenerate(model, 0)
     labels = renders.labels[rows]
     logits = logits_of(model, renders.images[rows])
     error_rate = (logits.argmax(1) != labels).double().mean()
@@ -226,16 +228,16 @@ def test_diagnostics_of_random_light_are_those_of_the_classified_images(
 
 
 def test_random_light_changes_by_half_of_a_unit_or_by_its_radius(serve, model):
-    uniform = serve(arm="random").regenerate(model, 0)
+    uniform = serve(mode="random").regenerate(model, 0)
     # The norm of 147 numbers in ±1/2 is 3.5. Its standard deviation over 100 examples is 0.013.
     expected = pytest.approx(math.sqrt(147 / 12), abs=5 * 0.013)
     assert uniform.diagnostics["light_change"] == expected
     settings = RandomLightSettings(radius=1.5)
-    in_a_ball = serve(arm="random", random_light=settings).regenerate(model, 0)
+    in_a_ball = serve(mode="random", random_light=settings).regenerate(model, 0)
     assert in_a_ball.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
 
 
-# --------------------------------------------------------------- the arm "adversarial"
+# --------------------------------------------------------------- the mode "adversarial"
 
 PAPER_STEPS = 10
 PAPER_STEP_SIZE = 0.05
@@ -346,10 +348,10 @@ def test_the_state_of_another_scene_is_refused(serve, model):
 # --------------------------------------------------------------- errors
 
 
-@pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labels, arm):
+@pytest.mark.parametrize("mode", ["random", "adversarial"])
+def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labels, mode):
     with pytest.raises(InputError, match="label=53"):
-        serve(arm=arm, labels=labels + 51).regenerate(model, 0)
+        serve(mode=mode, labels=labels + 51).regenerate(model, 0)
 
 
 @pytest.mark.parametrize(
@@ -358,7 +360,7 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(serve, model, labe
         ({"init": "dark"}, "init=dark"),
         ({"warm_start": True, "vary": VariationSettings(instances=True)}, "warm_start=True"),
         (
-            {"arm": "random", "attack": TrainingAttackSettings(albedo=StepSettings())},
+            {"mode": "random", "attack": TrainingAttackSettings(albedo=StepSettings())},
             "radius is None",
         ),
     ],
@@ -381,18 +383,18 @@ def test_an_attack_without_a_scene_is_refused():
 # --------------------------------------------------------------- shape and albedo
 
 
-@pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, arm):
+@pytest.mark.parametrize("mode", ["random", "adversarial"])
+def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, mode):
     """Shapes are rasterized in every step, so that one view before one background is enough."""
     attack = TrainingAttackSettings(
         geometry=StepSettings("linf", 0.02, "sign", 0.01),
         albedo=StepSettings("linf", 0.1, "sign", 0.05),
         max_steps=2,
-        shorten=True,
+        backtracking=True,
     )
     scene = built(1, 0.5)
     labels = torch.tensor(list(CLASSES.values()))
-    settings = AugmentationSettings(arm=arm, examples=2, attack=attack)
+    settings = AugmentationSettings(mode=mode, examples=2, attack=attack)
     service = AugmentationService(settings, scene, labels, 0, Phases())
     renders = service.regenerate(model, 0)
     assert renders.images.shape == (2, 3, 8, 8)
@@ -403,7 +405,7 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(model, arm):
     assert 0 < diagnostics["vertices_change"] <= 0.02 * math.sqrt(coordinate_count)
     assert diagnostics["albedo_change"] > 0
     assert diagnostics["light_change"] == 0
-    if arm == "adversarial":
+    if mode == "adversarial":
         assert diagnostics["loss"] > diagnostics["loss_before"]
 
 
@@ -480,7 +482,7 @@ def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_i
     """Tables are complementary to a plate, so that every step raises the plate's probability."""
     is_plate = labels == 0
     mixed = torch.where(is_plate, labels, complementary_label(0))
-    renders = serve(labels=mixed, studied=(0,)).regenerate(model, 0)
+    renders = serve(labels=mixed, positive_classes=(0,)).regenerate(model, 0)
     assert torch.equal(renders.labels, mixed)
     rises = probability_rises(model, render_in(scene, LIGHT), renders.images)[:, 0]
     for change in (-rises[is_plate], rises[~is_plate]):
@@ -489,7 +491,7 @@ def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_i
 
 
 def test_hard_negatives_with_a_class_succeed_as_the_studied_class_alone(serve, model, labels):
-    renders = serve(studied=(0,)).regenerate(model, 0)
+    renders = serve(positive_classes=(0,)).regenerate(model, 0)
     predicts_plate = logits_of(model, renders.images).argmax(1) == 0
     success = predicts_plate == (labels != 0)
     expected = pytest.approx(float(success.double().mean()))
@@ -505,7 +507,7 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
     """Plates belong to neither of the two classes, and tables to the second."""
     is_plate = labels == 0
     mixed = torch.where(is_plate, complementary_label(1), labels)
-    images = serve(labels=mixed, studied=(1, 2)).regenerate(model, 0).images
+    images = serve(labels=mixed, positive_classes=(1, 2)).regenerate(model, 0).images
     rises = probability_rises(model, render_in(scene, LIGHT), images)
     turns = torch.arange(EXAMPLE_COUNT) % 2
     for turn, target in ((0, 1), (1, 2)):

@@ -156,7 +156,9 @@ def test_the_change_of_light_is_drawn_over_the_epochs_that_have_attacks(tmp_path
 
 
 @pytest.mark.parametrize(("fraction_of_radius", "success"), [(0.9, True), (1.1, False)])
-def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(fraction_of_radius, success):
+def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(
+    fraction_of_radius, success
+):
     radius = 0.02
     scene = make_scene(1)
     image = common.render_all(scene)
@@ -190,7 +192,7 @@ def test_views_that_share_a_light_or_shape_have_the_sum_of_their_gradients(kind)
     shared_values = shared_problem.start.clone().requires_grad_()
     values = problem.start.clone().requires_grad_()
     views = shared_problem.render(shared_values, torch.tensor([0]))
-    images = problem.render(values, problem.everything)
+    images = problem.render(values, problem.all_examples)
     assert torch.equal(views[0], images[:, 0])
     views.square().sum().backward()
     images.square().sum().backward()
@@ -230,7 +232,9 @@ def test_the_bootstrap_resamples_cameras_and_not_renders():
         ("source", "first_random", [False] * 4),
     ],
 )
-def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts(network, state, outcomes):
+def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts(
+    network, state, outcomes
+):
     source = {
         "before": ["orange", "orange", "orange", "orange"],
         "first": ["coal", "coal", "coal", "orange"],

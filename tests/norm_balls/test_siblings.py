@@ -9,7 +9,7 @@ import pytest
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 
-FOREIGN = ("renderer.py", "augment.py", "train.py", "conf/__init__.py")
+OTHER_PREFIX = ("renderer.py", "augment.py", "train.py", "conf/__init__.py")
 USE = """
 import norm_balls as nb
 
@@ -23,7 +23,7 @@ assert nb.load_run("pretrained/none").size == 32
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder whose modules must not be imported by the library."""
-    for name in FOREIGN:
+    for name in OTHER_PREFIX:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("raise SystemExit('this module is not the library')")

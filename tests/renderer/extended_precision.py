@@ -69,7 +69,16 @@ def view(
     corners = faces[seen]
     facing = (cross(*_edges(lift(placed), corners)) * lift(towards)[:, None]).sum(axis=0)
     side = np.where(facing < 0, -1, 1)
-    return View(*_edges(lift(vertices), corners), side, albedo[seen], corners, pixel, face, pixels, samples**2)
+    return View(
+        *_edges(lift(vertices), corners),
+        side,
+        albedo[seen],
+        corners,
+        pixel,
+        face,
+        pixels,
+        samples**2,
+    )
 
 
 def image(view: View, light: np.ndarray) -> np.ndarray:
@@ -87,7 +96,9 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
     return gradient
 
 
-def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertices: int) -> np.ndarray:
+def vertex_gradient(
+    view: View, upstream: np.ndarray, light: np.ndarray, vertices: int
+) -> np.ndarray:
     """(V, 3) of Σ upstream (P, 3) × image. Zero for a face without area."""
     weight = _face_weight(view, upstream)
 
@@ -95,9 +106,15 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
         return (irradiance(unit(cross(first, second)) * view.side, light) * weight).sum(axis=1)
 
     area = (cross(view.first, view.second) ** 2).sum(axis=0)
-    by_first = np.stack([derivative(loss(stepped(view.first, axis), view.second)) for axis in AXES], axis=1)
-    by_second = np.stack([derivative(loss(view.first, stepped(view.second, axis))) for axis in AXES], axis=1)
-    by_corner = np.stack([-by_first - by_second, by_first, by_second], axis=1) * (area != 0)[:, None, None]
+    by_first = np.stack(
+        [derivative(loss(stepped(view.first, axis), view.second)) for axis in AXES], axis=1
+    )
+    by_second = np.stack(
+        [derivative(loss(view.first, stepped(view.second, axis))) for axis in AXES], axis=1
+    )
+    by_corner = (
+        np.stack([-by_first - by_second, by_first, by_second], axis=1) * (area != 0)[:, None, None]
+    )
     return added(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
@@ -115,7 +132,9 @@ def basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 def basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
     """(N, (degree + 1)², 3) derivatives of `basis`."""
-    scale = abs(directions).max(axis=0)  # the step is relative to the length, which may be a denormal's
+    scale = abs(directions).max(
+        axis=0
+    )  # the step is relative to the length, which may be a denormal's
     slopes = [derivative(basis(stepped(directions, axis * scale), degree)) for axis in AXES]
     return np.stack(slopes, axis=-1) / np.where(scale == 0, 1, scale)[:, None, None]
 
@@ -126,34 +145,49 @@ def harmonics(directions: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndar
     powers, cosine, sine = [1 + 0 * z], [1 + 0 * z], [0 * z]
     for _ in range(max(bands)):
         powers.append(powers[-1] * z)
-        cosine, sine = [*cosine, x * cosine[-1] - y * sine[-1]], [*sine, x * sine[-1] + y * cosine[-1]]
+        cosine, sine = (
+            [*cosine, x * cosine[-1] - y * sine[-1]],
+            [*sine, x * sine[-1] + y * cosine[-1]],
+        )
     values = {}
     for l in bands:
         for m in range(l + 1):
-            legendre = sum(as_in(directions, factor) * powers[power] for power, factor in _legendre(l, m))
+            legendre = sum(
+                as_in(directions, factor) * powers[power] for power, factor in _legendre(l, m)
+            )
             values[l * l + l - m], values[l * l + l + m] = legendre * sine[m], legendre * cosine[m]
     return values
 
 
 def lambertian(l: int) -> Fraction:
     """What the clamped cosine keeps of band l, over 2π: ∫₀¹ P_l(z) z dz."""
-    return sum((factor / (power + 2) for power, factor in _derivative_of_legendre(l, 0)), Fraction())
+    return sum(
+        (factor / (power + 2) for power, factor in _derivative_of_legendre(l, 0)), Fraction()
+    )
 
 
 def stepped(values: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Moved by an imaginary step: a function's value there has its `derivative` along the step."""
-    return values + along * (MP.mpc(0, STEP) if values.dtype == object else np.clongdouble(1j) * np.longdouble(STEP))
+    return values + along * (
+        MP.mpc(0, STEP) if values.dtype == object else np.clongdouble(1j) * np.longdouble(STEP)
+    )
 
 
 def derivative(values: np.ndarray) -> np.ndarray:
-    return _imag(values) / MP.mpf(STEP) if values.dtype == object else values.imag / np.longdouble(STEP)
+    return (
+        _imag(values) / MP.mpf(STEP)
+        if values.dtype == object
+        else values.imag / np.longdouble(STEP)
+    )
 
 
 def reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
     """{l² + l + m: A_l Y_lm(n)}, without the bands whose A_l is zero."""
     live = [l for l in range(degree + 1) if lambertian(l)]
     factors = {l: as_in(normals, 2 * MP.pi * _number(lambertian(l))) for l in live}
-    return {index: value * factors[int(index**0.5)] for index, value in harmonics(normals, live).items()}
+    return {
+        index: value * factors[int(index**0.5)] for index, value in harmonics(normals, live).items()
+    }
 
 
 def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
@@ -172,7 +206,9 @@ def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    return np.stack(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -192,14 +228,22 @@ def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
 @cache
 def _legendre(l: int, m: int) -> list[tuple[int, Any]]:
     """Normalized dᵐP_l/dzᵐ as (power, 256-bit factor)."""
-    norm = MP.sqrt((2 * l + 1) * (2 if m else 1) * MP.mpf(factorial(l - m)) / factorial(l + m) / (4 * MP.pi))
+    norm = MP.sqrt(
+        (2 * l + 1) * (2 if m else 1) * MP.mpf(factorial(l - m)) / factorial(l + m) / (4 * MP.pi)
+    )
     return [(power, norm * _number(factor)) for power, factor in _derivative_of_legendre(l, m)]
 
 
 def _derivative_of_legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
     """dᵐP_l/dzᵐ as (power, factor), from 2ˡ P_l = Σ (-1)ᵏ C(l, k) C(2l - 2k, l) z^(l - 2k)."""
-    terms = [(l - 2 * k, (-1) ** k * comb(l, k) * comb(2 * l - 2 * k, l)) for k in range(l // 2 + 1)]
-    return [(power - m, Fraction(factor * perm(power, m), 2**l)) for power, factor in terms if power >= m]
+    terms = [
+        (l - 2 * k, (-1) ** k * comb(l, k) * comb(2 * l - 2 * k, l)) for k in range(l // 2 + 1)
+    ]
+    return [
+        (power - m, Fraction(factor * perm(power, m), 2**l))
+        for power, factor in terms
+        if power >= m
+    ]
 
 
 def _number(fraction: Fraction) -> Any:
@@ -214,7 +258,9 @@ def as_in(like: np.ndarray, number: Any) -> Any:
 # ---------------------------------------------------------------------------- shadows
 
 
-def shadow(view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int) -> np.ndarray:
+def shadow(
+    view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int
+) -> np.ndarray:
     """(P, (degree + 1)², 3) radiance that shadows take from each pixel, per unit of each coefficient.
 
     Faces of corners (F, 3 corners, 3) block rays from the samples' origins (S, 3) in directions (D, 3), which share the
@@ -233,6 +279,8 @@ def shadow(view: View, points: np.ndarray, corners: np.ndarray, directions: np.n
 def blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(D,) whether rays from a point (3,) meet a face: they pass all of its edges on the side that it lies on."""
     a, b, c = (corners[:, corner] - point for corner in range(3))
-    passed = np.stack([directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))])
+    passed = np.stack(
+        [directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))]
+    )
     volume = (a * np.cross(b, c)).sum(axis=1)
     return (passed * np.sign(volume) > 0).all(axis=0).any(axis=1)

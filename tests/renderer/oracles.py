@@ -62,7 +62,9 @@ def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarra
     return real_harmonics(sph_harm_y_all(degree, degree, polar, azimuth)).T
 
 
-def scipy_irradiance(normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor) -> np.ndarray:
+def scipy_irradiance(
+    normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor
+) -> np.ndarray:
     """Compute the irradiance Σ A_l U_lm Y_lm(n), shape (N, 3).
 
     test_harmonics.py checks the factors A_l that this function takes from the

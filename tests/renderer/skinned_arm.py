@@ -141,7 +141,9 @@ def write(
     return path
 
 
-def _tree(arrays: GltfArrays, weights: np.ndarray | None, joints: np.ndarray | None) -> dict[str, Any]:
+def _tree(
+    arrays: GltfArrays, weights: np.ndarray | None, joints: np.ndarray | None
+) -> dict[str, Any]:
     """Build the JSON tree, and fill its arrays."""
     if weights is None:
         weights = np.rint(255 * WEIGHTS)

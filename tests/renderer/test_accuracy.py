@@ -52,7 +52,9 @@ Case = tuple[str, float, Callable[[Any], Errors], Iterable[Any]]
 
 def light(degree: int = 6) -> Tensor:
     """Coefficients of order one, also in the bands that no diffuse surface reflects."""
-    return torch.randn((degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(degree), dtype=torch.float64)
+    return torch.randn(
+        (degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(degree), dtype=torch.float64
+    )
 
 
 @dataclass(frozen=True)
@@ -75,19 +77,37 @@ class Setup:
 
     def shaded(self) -> Tensor:
         """(V, 3) in the dtype."""
-        return torch.from_numpy(self.mesh.vertices if self.vertices is None else self.vertices).to(self.dtype)
+        return torch.from_numpy(self.mesh.vertices if self.vertices is None else self.vertices).to(
+            self.dtype
+        )
 
     def view(self) -> wide.View:
         mesh, samples = self.mesh, self.settings.samples
         points = self.camera.project(mesh.vertices)
         closed = mesh.closed and bool((points[:, 2] >= -1).all())
-        [ids] = self.rasterizer.rasterize(points[None], mesh.faces, self.settings.size * samples, closed=closed)
-        albedo, vertices = mesh.corner_colors[:, 0].astype(np.float64), self.shaded().double().numpy()
-        return wide.view(ids, samples, mesh.vertices, vertices, mesh.faces, albedo, self.camera.axes()[2], self.lift)
+        [ids] = self.rasterizer.rasterize(
+            points[None], mesh.faces, self.settings.size * samples, closed=closed
+        )
+        albedo, vertices = (
+            mesh.corner_colors[:, 0].astype(np.float64),
+            self.shaded().double().numpy(),
+        )
+        return wide.view(
+            ids,
+            samples,
+            mesh.vertices,
+            vertices,
+            mesh.faces,
+            albedo,
+            self.camera.axes()[2],
+            self.lift,
+        )
 
     def fragments(self) -> Fragments:
         mesh = self.mesh
-        return build_fragments(mesh.vertices, mesh.faces, [self.camera], self.settings, self.rasterizer, mesh.closed)[0]
+        return build_fragments(
+            mesh.vertices, mesh.faces, [self.camera], self.settings, self.rasterizer, mesh.closed
+        )[0]
 
 
 # ---------------------------------------------------------------------------- conditions
@@ -97,14 +117,25 @@ def of_harmonics(degree: int) -> Iterator[Case]:
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
     units = directions / directions.norm(dim=1, keepdim=True)
     tilts = [(0, 1), (0, -1), (1e-1, 1), (1e-4, -1), (1e-8, 1), (1e-300, -1)]
-    poles = torch.tensor([[0.6 * tilt, 0.8 * tilt, pole] for tilt, pole in tilts], dtype=torch.float64)
-    signed = torch.tensor([[-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, 1.0, -0.0], [-1.0, -0.0, 0.0]]).double()
+    poles = torch.tensor(
+        [[0.6 * tilt, 0.8 * tilt, pole] for tilt, pole in tilts], dtype=torch.float64
+    )
+    signed = torch.tensor(
+        [[-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, 1.0, -0.0], [-1.0, -0.0, 0.0]]
+    ).double()
     lengths = directions * torch.tensor([[1e-29], [1e-15], [1e-3], [1e3], [1e15], [1e29]])
     denormal = [units.to(dtype) * (torch.finfo(dtype).smallest_normal / 2) for dtype in DTYPES[:2]]
     rounding = 8.0 * degree  # a recurrence adds a rounding per band
-    every, last, low, first = (partial(harmonics_errors, degrees=d) for d in (range(1, degree + 1), [degree], [6], [1]))
+    every, last, low, first = (
+        partial(harmonics_errors, degrees=d) for d in (range(1, degree + 1), [degree], [6], [1])
+    )
     yield f"degree 1 to {degree}, float64", rounding, every, [directions]
-    yield f"degree 1 to {degree}, narrower types", 1, every, [directions.to(dtype) for dtype in DTYPES[1:]]
+    yield (
+        f"degree 1 to {degree}, narrower types",
+        1,
+        every,
+        [directions.to(dtype) for dtype in DTYPES[1:]],
+    )
     yield f"0 and 10⁻¹ to 10⁻³⁰⁰ rad from a pole, degree {degree}", rounding, last, [poles]
     yield f"components of −0, degree {degree}", rounding, last, [signed]
     yield "lengths of 10⁻²⁹ to 10²⁹, degree 6", 16, low, [lengths]
@@ -124,19 +155,39 @@ def of_meshes(subdivisions: int) -> Iterator[Case]:
     yield "moved by 10⁶", 8, both, [moved(ball.vertices + offset) for offset in offsets]
     rounded_vertices = [moved(ball.vertices + offset, torch.float32) for offset in offsets]
     yield "moved by 10⁶, float32 vertices, which are 1/16 apart there", 8, both, rounded_vertices
-    unseen = [Setup(replace(ball, vertices=vertices)) for vertices in (ball.vertices * 1e6, ball.vertices + 1e6)]
+    unseen = [
+        Setup(replace(ball, vertices=vertices))
+        for vertices in (ball.vertices * 1e6, ball.vertices + 1e6)
+    ]
     yield "scaled or moved by 10⁶, not normalized: an empty image", 0, both, unseen
-    yield "three faces without area beside each", 12, both, [Setup(hard.with_faces_without_area(ball))]
+    yield (
+        "three faces without area beside each",
+        12,
+        both,
+        [Setup(hard.with_faces_without_area(ball))],
+    )
     merged = ball.vertices.copy()
     for face in ball.faces[::9]:
         merged[face[1]] = merged[face[2]]
-    yield "faces that lose their area after rasterization", 8, by_geometry, [Setup(ball, vertices=merged)]
+    yield (
+        "faces that lose their area after rasterization",
+        8,
+        by_geometry,
+        [Setup(ball, vertices=merged)],
+    )
     yield "every face twice", 8, both, [Setup(twice)]
     yield "inverted winding", 8, both, [Setup(hard.painted(ball.vertices, ball.faces[:, ::-1]))]
     yield "open, its inside visible", 8, both, [Setup(hard.opened(ball))]
-    yield "not manifold: three faces on an edge, two solids in a point", 8, both, [Setup(hard.non_manifold())]
+    yield (
+        "not manifold: three faces on an edge, two solids in a point",
+        8,
+        both,
+        [Setup(hard.non_manifold())],
+    )
     yield "a single triangle", 8, both, [Setup(hard.TRIANGLE)]
-    fine = ImageSettings(size=256, samples=1)  # sums over many pixels with terms of either sign cost digits
+    fine = ImageSettings(
+        size=256, samples=1
+    )  # sums over many pixels with terms of either sign cost digits
     name = f"{20 * 4**subdivisions:,} faces at 256²"
     yield name, 64, both, (Setup(hard.sphere(count), settings=fine) for count in [subdivisions])
 
@@ -174,7 +225,12 @@ def of_number_types() -> Iterator[Case]:
     for dtype in DTYPES:
         bound = 1 if torch.finfo(dtype).bits == 16 else 8
         setup = Setup(rounded(hard.sphere(), dtype), dtype=dtype)
-        yield str(dtype).removeprefix("torch."), bound, lambda scene: both(scene, scene.dtype), [setup]
+        yield (
+            str(dtype).removeprefix("torch."),
+            bound,
+            lambda scene: both(scene, scene.dtype),
+            [setup],
+        )
 
 
 def of_images(size: int) -> Iterator[Case]:
@@ -182,11 +238,18 @@ def of_images(size: int) -> Iterator[Case]:
     tiny = [Setup(ball, settings=ImageSettings(size=1, samples=samples)) for samples in (1, 16)]
     yield "1 × 1, 1 and 256 samples", 8, both, tiny
     large = Setup(ball, settings=ImageSettings(size=size, samples=1), camera=framing(6.0))
-    yield f"{size} × {size}", 8 + size / 16, both, [large]  # sums over many pixels with terms of either sign
+    yield (
+        f"{size} × {size}",
+        8 + size / 16,
+        both,
+        [large],
+    )  # sums over many pixels with terms of either sign
     around = replace(ball, vertices=1.5 * ball.vertices + 1.2 * TOWARDS)
     yield "the camera inside the mesh", 8, both, [Setup(around)]
     yield "a mesh far larger than the frame", 8, both, [Setup(ball, camera=framing(1e-3))]
-    aside, behind = (replace(ball, vertices=ball.vertices + 10 * axis) for axis in (CAMERA.axes()[0], TOWARDS))
+    aside, behind = (
+        replace(ball, vertices=ball.vertices + 10 * axis) for axis in (CAMERA.axes()[0], TOWARDS)
+    )
     edge_on = hard.painted([-0.5 * TOWARDS, 0.5 * TOWARDS, 0.5 * CAMERA.axes()[1]], [[0, 1, 2]])
     unseen = list(map(Setup, (aside, behind, edge_on)))
     yield "outside the frame, behind the camera, edge on: an empty image", 0, both, unseen
@@ -194,7 +257,9 @@ def of_images(size: int) -> Iterator[Case]:
 
 def of_shadows() -> Iterator[Case]:
     lumpy = hard.sphere(1, lowest=0.5)  # its dents shade each other
-    small = Setup(replace(lumpy, vertices=1e-3 * lumpy.vertices), camera=framing(1e-3 * CAMERA.width))
+    small = Setup(
+        replace(lumpy, vertices=1e-3 * lumpy.vertices), camera=framing(1e-3 * CAMERA.width)
+    )
     yield "closed and lumpy", 8, with_shadows, [Setup(lumpy)]
     yield "open, self-touching, of several parts", 8, with_shadows, [Setup(hard.heap())]
     yield "thin boards, 0.03 apart", 8, with_shadows, [Setup(hard.boards())]
@@ -202,7 +267,12 @@ def of_shadows() -> Iterator[Case]:
     yield "not manifold", 8, with_shadows, [Setup(hard.non_manifold())]
     yield "convex", 8, with_shadows, [Setup(hard.box())]
     yield "scaled by 10⁻³, not normalized", 8, with_shadows, [small]
-    yield "closed and lumpy, float64", 8, lambda scene: with_shadows(scene, torch.float64), [Setup(lumpy)]
+    yield (
+        "closed and lumpy, float64",
+        8,
+        lambda scene: with_shadows(scene, torch.float64),
+        [Setup(lumpy)],
+    )
 
 
 def tables(degree: int, subdivisions: int, size: int, slivers: int) -> dict[str, Iterator[Case]]:
@@ -255,18 +325,28 @@ def both(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     return by_operator(setup, dtype) | by_geometry(setup)
 
 
-def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarray | None = None) -> Errors:
+def by_operator(
+    setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarray | None = None
+) -> Errors:
     """Image and its gradient by the light, through an operator in `dtype`. lost: (P, (degree + 1)², 3) what the image
     loses to shadows per unit of each coefficient."""
     [operator] = build_operators(
-        setup.mesh, [setup.camera], setup.settings, setup.rasterizer, basis=Harmonics(setup.degree), dtype=dtype
+        setup.mesh,
+        [setup.camera],
+        setup.settings,
+        setup.rasterizer,
+        basis=Harmonics(setup.degree),
+        dtype=dtype,
     )
     view, light = setup.view(), setup.light.to(dtype)
     upstream = random_upstream(len(view.pixels))
     lit, above = setup.lift(light.double().numpy()), setup.lift(upstream.double().numpy())
     image, gradient = wide.image(view, lit), wide.light_gradient(view, above, setup.degree)
     if lost is not None:
-        image, gradient = image - (lost * lit).sum(axis=1), gradient - (lost * above[:, None]).sum(axis=0)
+        image, gradient = (
+            image - (lost * lit).sum(axis=1),
+            gradient - (lost * above[:, None]).sum(axis=0),
+        )
     return {
         "image": units(operator.radiance(light).T, image),
         "light gradient": units(operator.light_gradient(upstream.to(dtype).T), gradient),
@@ -275,7 +355,11 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarr
 
 def by_geometry(setup: Setup) -> Errors:
     """Image and its gradient by the vertices, through `renderer.shading.shading`."""
-    view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
+    view, vertices, light = (
+        setup.view(),
+        setup.shaded().requires_grad_(),
+        setup.light.to(setup.dtype),
+    )
     fragments, upstream = setup.fragments(), random_upstream(len(view.pixels))
     image = radiance(fragments, vertices, light, surface_albedo(setup.mesh, fragments, "linear"))
     (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
@@ -288,7 +372,10 @@ def by_geometry(setup: Setup) -> Errors:
 
 def with_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     """`by_operator` with one sample per pixel, which then casts all rays, whose origins are the renderer's."""
-    mesh, setup = setup.mesh, replace(setup, settings=replace(setup.settings, samples=1, shadows=True))
+    mesh, setup = (
+        setup.mesh,
+        replace(setup, settings=replace(setup.settings, samples=1, shadows=True)),
+    )
     view, directions = setup.view(), extended(rays.sphere(rays.DIRECTIONS).numpy())
     surface = Surface(mesh, setup.fragments(), setup.settings)
     points = extended((surface.points + rays.Rays(mesh).offset * surface.planes).numpy())
@@ -308,7 +395,9 @@ def harmonics_errors(directions: Tensor, degrees: Sequence[int]) -> Errors:
         variable = directions.clone().requires_grad_()
         upstream = random_upstream((degree + 1) ** 2)[:, 0].to(directions)
         values = basis(variable, degree)
-        (summed,) = torch.autograd.grad(values @ upstream, variable, torch.ones_like(variable[:, 0]))
+        (summed,) = torch.autograd.grad(
+            values @ upstream, variable, torch.ones_like(variable[:, 0])
+        )
         gradient = gradient_to[:, : values.shape[1]]
         sums = (gradient * exact(upstream.double().numpy())[:, None]).sum(axis=1)
         return {
@@ -329,7 +418,11 @@ def random_upstream(rows: int, seed: int = 0) -> Tensor:
 
 @pytest.mark.parametrize(
     "bound, measure, setups",
-    [pytest.param(*case, id=f"{title}: {name}") for title, cases in tables(**QUICK).items() for name, *case in cases],
+    [
+        pytest.param(*case, id=f"{title}: {name}")
+        for title, cases in tables(**QUICK).items()
+        for name, *case in cases
+    ],
 )
 def test_every_error_is_rounding(bound, measure, setups):
     """A few ε each, more where many terms cancel: thousands of pixels, hundreds of harmonics."""
@@ -341,7 +434,9 @@ def test_every_error_is_rounding(bound, measure, setups):
 def test_the_references_harmonics_are_scipys_without_the_condon_shortley_sign(lift):
     directions = np.random.default_rng(0).normal(size=(20, 3))
     values = wide.basis(lift(directions.T), 6).astype(float)
-    np.testing.assert_allclose(values, scipy_basis(directions, 6), rtol=0, atol=1e-14)  # scipy's own rounding
+    np.testing.assert_allclose(
+        values, scipy_basis(directions, 6), rtol=0, atol=1e-14
+    )  # scipy's own rounding
 
 
 # ---------------------------------------------------------------------------- the tables
@@ -356,7 +451,10 @@ def main() -> int:
         quantities = list(dict.fromkeys(name for _, errors in results.values() for name in errors))
         print(f"|{title}|{'|'.join(quantities)}|\n|-|{'-|' * len(quantities)}")
         for name, (bound, errors) in results.items():
-            texts = {key: f"{error:.3g}" if error <= bound else f"**{error:.3g}**" for key, error in errors.items()}
+            texts = {
+                key: f"{error:.3g}" if error <= bound else f"**{error:.3g}**"
+                for key, error in errors.items()
+            }
             print(f"|{name}|{'|'.join(texts.get(key, '–') for key in quantities)}|", flush=True)
             beyond |= any(not error <= bound for error in errors.values())
         print()

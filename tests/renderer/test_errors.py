@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
-from renderer.errors import LARGEST, InputError
+from renderer.errors import MAX_MAGNITUDE, InputError
 from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import face_normals, vertex_normals
 from renderer.image import tonemap
@@ -152,6 +152,6 @@ def test_nan_and_infinity_are_refused_by_the_name_of_the_tensor(name, good, take
 
 @pytest.mark.parametrize(("name", "good", "take"), BOUNDED)
 def test_magnitudes_that_would_overflow_are_refused_by_name(name, good, take):
-    take(good * LARGEST * 0.99)
+    take(good * MAX_MAGNITUDE * 0.99)
     with pytest.raises(InputError, match=f"^{name} "):
-        take(good * LARGEST * 1.01)
+        take(good * MAX_MAGNITUDE * 1.01)

@@ -32,7 +32,15 @@ SEEDS = 32  # independent images of Mitsuba's, from which its noise is estimated
 SIGMAS = 5  # a right image fails a bound once in a million times
 FEW = 0.02  # of a pixel: less surface is hit too seldom for a normal distribution
 MAP_ROWS = 192  # linear interpolation dims band l by l(l + 1) (π / 191)² / 12: 5e-5 of band 1, 1e-3 of the faint band 6
-BAND_WEIGHTS = [0, 1, 1, 0.3, 1, 0.3, 1]  # bands 3 and 5 reach no diffuse surface and only add noise
+BAND_WEIGHTS = [
+    0,
+    1,
+    1,
+    0.3,
+    1,
+    0.3,
+    1,
+]  # bands 3 and 5 reach no diffuse surface and only add noise
 
 VIEWS = {
     "near the pole": OrthographicCamera(1.72, 22.9, 2.5),
@@ -46,7 +54,9 @@ def positive_light(seed: int) -> np.ndarray:
     """(49, 3): every coefficient at random, over just enough ambient light to be positive everywhere."""
     weights = np.repeat(BAND_WEIGHTS, 2 * np.arange(7) + 1)
     light = weights[:, None] * np.random.default_rng(seed).normal(size=(49, 3))
-    light[0] = (0.1 - mitsuba_map(torch.from_numpy(light), MAP_ROWS).numpy().min(axis=(0, 1))) * math.sqrt(4 * math.pi)
+    light[0] = (
+        0.1 - mitsuba_map(torch.from_numpy(light), MAP_ROWS).numpy().min(axis=(0, 1))
+    ) * math.sqrt(4 * math.pi)
     return light / light[0]
 
 
@@ -58,14 +68,18 @@ def ball() -> Mesh:
 
 
 def colored_cube() -> Mesh:
-    return mesh_of(trimesh.creation.box((1.1, 1.1, 1.1)), np.random.default_rng(1).uniform(0.1, 1, (8, 3)))
+    return mesh_of(
+        trimesh.creation.box((1.1, 1.1, 1.1)), np.random.default_rng(1).uniform(0.1, 1, (8, 3))
+    )
 
 
 def textured_hull() -> Mesh:
     """Twelve points on an ellipsoid; the texture repeats and each face has its own piece of it."""
     rng = np.random.default_rng(2)
     points = rng.normal(size=(12, 3))
-    hull = trimesh.convex.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True) * [1.0, 0.8, 0.9])
+    hull = trimesh.convex.convex_hull(
+        points / np.linalg.norm(points, axis=1, keepdims=True) * [1.0, 0.8, 0.9]
+    )
     count = len(hull.faces)
     return replace(
         Mesh.plain(hull.vertices, hull.faces),
@@ -96,7 +110,9 @@ def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -
     return canvas.reshape(size, size, 4)
 
 
-def mitsuba_image(folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int, **settings) -> tuple[np.ndarray, ...]:
+def mitsuba_image(
+    folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int, **settings
+) -> tuple[np.ndarray, ...]:
     """The mean (size, size, 4) of SEEDS images of files, of so many rays per pixel, and its standard error."""
     write_map(folder / "light.exr", mitsuba_map(torch.from_numpy(LIGHT), MAP_ROWS))
     write_mitsuba_scene(folder, mesh, 1.0, [camera], ImageSettings(size, **settings), "light.exr")
@@ -104,7 +120,9 @@ def mitsuba_image(folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int,
     file.write_text(file.read_text().replace("multijitter", "independent"))
     with mitsuba() as mi:
         scene = mi.load_file(str(file))
-        images = np.stack([np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]).astype(float)
+        images = np.stack(
+            [np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]
+        ).astype(float)
     return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
@@ -119,7 +137,9 @@ def mitsuba_image(folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int,
 @pytest.mark.parametrize(
     ("size", "samples", "rays"), [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)]
 )
-def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(tmp_path, solid, view, size, samples, rays):
+def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(
+    tmp_path, solid, view, size, samples, rays
+):
     """Our error, in Mitsuba's standard errors: its root mean square is one and its mean is zero.
 
     A standard error from n images makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
@@ -139,7 +159,9 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(tmp_path, so
 
     inside = np.minimum(ours, theirs)[..., 3] == 1
     total_noise = np.sqrt((noise[inside, :3] ** 2).sum(axis=0))
-    np.testing.assert_array_less(np.abs((ours - theirs)[inside, :3].sum(axis=0)), SIGMAS * total_noise)
+    np.testing.assert_array_less(
+        np.abs((ours - theirs)[inside, :3].sum(axis=0)), SIGMAS * total_noise
+    )
 
 
 @pytest.mark.parametrize(
@@ -159,17 +181,25 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(tmp_path, so
         ),
     ],
 )
-def test_shadows_and_bounces_are_mitsubas_within_its_noise(tmp_path, solid, view, bounces, normals, monkeypatch):
+def test_shadows_and_bounces_are_mitsubas_within_its_noise(
+    tmp_path, solid, view, bounces, normals, monkeypatch
+):
     """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average. Of a closed
     mesh that shows no smooth normal turned away from the camera: Mitsuba takes the normal's other side there."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    theirs, noise = mitsuba_image(tmp_path, solid(), VIEWS[view], 32, 128, bounces=bounces, normals=normals)
+    theirs, noise = mitsuba_image(
+        tmp_path, solid(), VIEWS[view], 32, 128, bounces=bounces, normals=normals
+    )
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
         our_image(solid(), VIEWS[view], 32, 8, normals=normals, **options)
-        for options in (({"bounces": bounces}, {"shadows": True}) if bounces else ({"shadows": True}, {}))
+        for options in (
+            ({"bounces": bounces}, {"shadows": True}) if bounces else ({"shadows": True}, {})
+        )
     )
-    error, without, noise = (values[inside, :3] / brightest for values in (ours - theirs, less - theirs, noise))
+    error, without, noise = (
+        values[inside, :3] / brightest for values in (ours - theirs, less - theirs, noise)
+    )
     assert (error**2).mean() < 0.005**2 + (noise**2).mean()
     assert abs(error.mean()) < 0.001
     assert (without**2).mean() > 0.02**2

@@ -42,8 +42,8 @@ def stone() -> renderer.Mesh:
 @pytest.fixture(scope="module")
 def light() -> Tensor:
     """Return a light under which no value of an image is clipped."""
-    even_light = ambient(torch.full((3,), 0.2).double())
-    return even_light + 0.02 * draw(49, 3)
+    soft_front_light = ambient(torch.full((3,), 0.2).double())
+    return soft_front_light + 0.02 * draw(49, 3)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -241,8 +241,8 @@ def test_a_light_sphere_shows_a_lamp_by_the_inverse_square_law():
     """
     position = torch.tensor([0.3, -0.4, 2.5], dtype=torch.float64)
     power = torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    even_light = ambient(torch.full((3,), 0.1))
-    light = torch.cat([even_light, power[None].float()])
+    soft_front_light = ambient(torch.full((3,), 0.1))
+    light = torch.cat([soft_front_light, power[None].float()])
     lamp = Lamps((tuple(position.tolist()),))
     camera = renderer.OrthographicCamera(0.0, 0.0, 2.0)
     image = light_sphere(light, 64, camera, SumBasis((HARMONICS, lamp)))

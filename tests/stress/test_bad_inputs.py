@@ -32,30 +32,52 @@ from train.system.hashing import content_hash
 
 from .conftest import PATIENCE, RENDERER, TRAINING, run_here
 
-CODE_RAN = "code_ran"  # a file that appears in the working folder where a reader runs code from its input
+CODE_RAN = (
+    "code_ran"  # a file that appears in the working folder where a reader runs code from its input
+)
 SECONDS = 60  # for a reader; a command has `PATIENCE`
-MEMORY = 12 * 2**30  # bytes of address space beyond today's: what asks for more fails here, and not the machine
+MEMORY = (
+    12 * 2**30
+)  # bytes of address space beyond today's: what asks for more fails here, and not the machine
 
 MESHES = ("mesh.obj", "mesh.glb", "mesh.ply", "mesh.stl", "mesh.off")
 READERS: dict[str, Callable[[Path], Any]] = {  # the library's, by the file that is damaged
     **dict.fromkeys(MESHES, load_mesh),
     "mesh.mtl": lambda path: load_mesh(path.with_name("mesh.obj")),
     "peel.png": lambda path: load_mesh(path.with_name("mesh.obj")),
-    **dict.fromkeys(("light.npy", "light.hdr", "light.exr", "light.json"), lambda path: load_light(str(path))),
+    **dict.fromkeys(
+        ("light.npy", "light.hdr", "light.exr", "light.json"), lambda path: load_light(str(path))
+    ),
     "background.png": lambda path: gray_or_image("background", str(path), 16),
     "data.npz": lambda path: load_npz(str(path)),
     "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
 }
-PHOTOGRAPHS = ("evaluate", "photos=photographs", "run=finished", "out=out", "device=cpu", "precision=float32")
+PHOTOGRAPHS = (
+    "evaluate",
+    "photos=photographs",
+    "run=finished",
+    "out=out",
+    "device=cpu",
+    "precision=float32",
+)
 ATTACK = (
-    *("attack", "classifier=run:finished", "scene.meshes=[mesh.obj]", "out=out", "device=cpu", "attack.max_steps=1"),
+    *(
+        "attack",
+        "classifier=run:finished",
+        "scene.meshes=[mesh.obj]",
+        "out=out",
+        "device=cpu",
+        "attack.max_steps=1",
+    ),
     *("attack.force=true", "attack.checks=false", *RENDERER),
 )
 RESUME = ("train", "run=finished", *TRAINING, "train.epochs=3", "train.resume=true")
 COMPARE = ("compare", "runs=[finished]")
 COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
     "finished/best.pt": PHOTOGRAPHS,
-    "published/model.safetensors": tuple(word.replace("run=finished", "run=published") for word in PHOTOGRAPHS),
+    "published/model.safetensors": tuple(
+        word.replace("run=finished", "run=published") for word in PHOTOGRAPHS
+    ),
     "finished/last.pt": RESUME,
     "finished/config.yaml": RESUME,
     "finished/metrics.jsonl": COMPARE,
@@ -63,8 +85,16 @@ COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
     "finished/photographs/predictions.csv": COMPARE,
     "photographs/orange/0.png": PHOTOGRAPHS,
     "photographs/photos.csv": PHOTOGRAPHS,
-    "lamps.json": (*ATTACK, "attack=lamps", "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"),
-    "pattern.png": (*ATTACK, "attack=projector", "scene.projector={pixels: 4, pattern: pattern.png}"),
+    "lamps.json": (
+        *ATTACK,
+        "attack=lamps",
+        "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}",
+    ),
+    "pattern.png": (
+        *ATTACK,
+        "attack=projector",
+        "scene.projector={pixels: 4, pattern: pattern.png}",
+    ),
 }
 UNLIMITED = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 QUICK, MANY = 8, 100  # examples; a command takes longer: a fifth of them
@@ -72,14 +102,38 @@ SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]  # they 
 
 
 NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
-TOKENS = (b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"9" * 19, b"9" * 400, b"word", b"[]", b"null", b"")
-OTHER = (b"", np.random.default_rng(0).bytes(1000), b"<html>404</html>\n", b"[" * 10**5, b"1", b"[]", b"{}")
+TOKENS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"0",
+    b"1e300",
+    b"1e-300",
+    b"9" * 19,
+    b"9" * 400,
+    b"word",
+    b"[]",
+    b"null",
+    b"",
+)
+OTHER = (
+    b"",
+    np.random.default_rng(0).bytes(1000),
+    b"<html>404</html>\n",
+    b"[" * 10**5,
+    b"1",
+    b"[]",
+    b"{}",
+)
 VALUES = (-1, 0, 10**9, 10**30, float("nan"), float("inf"), "word", None, [], {}, [1, "a"])
 ARRAY_EDITS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     lambda values: values[: len(values) // 2],
     lambda values: values[..., None],
     lambda values: values.T,
-    *(lambda values, fill=fill: np.full(values.shape, fill) for fill in (np.nan, -1, 2**63 + 1, "word", 1j)),
+    *(
+        lambda values, fill=fill: np.full(values.shape, fill)
+        for fill in (np.nan, -1, 2**63 + 1, "word", 1j)
+    ),
     lambda values: np.full(values.shape, {}, dtype=object),
 )
 TENSOR_EDITS: tuple[Callable[[torch.Tensor], Any], ...] = (
@@ -103,7 +157,9 @@ def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
     if kind == "number":
         begin, end = numbers[draw(st.integers(0, len(numbers) - 1))]
         token = draw(st.sampled_from(TOKENS))
-        return good[:begin] + token.ljust(end - begin) + good[end:]  # padded: headers of binary files keep their length
+        return (
+            good[:begin] + token.ljust(end - begin) + good[end:]
+        )  # padded: headers of binary files keep their length
     changed = bytearray(good)
     for place in draw(st.lists(st.integers(0, len(good) - 1), min_size=1, max_size=8)):
         changed[place] ^= draw(st.integers(1, 255))
@@ -129,7 +185,11 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
     while isinstance(node[key], Mapping) and node[key] and draw(st.integers(0, 3)):
         node = node[key]
         key = draw(st.sampled_from(list(node)))
-    edits = [edit(node[key]) for edit in TENSOR_EDITS] if isinstance(node[key], torch.Tensor) else VALUES
+    edits = (
+        [edit(node[key]) for edit in TENSOR_EDITS]
+        if isinstance(node[key], torch.Tensor)
+        else VALUES
+    )
     node[key] = draw(st.sampled_from(edits))
     content = io.BytesIO()
     torch.save({**state, checkpoint.HASH: content_hash(state)}, content)
@@ -139,7 +199,11 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
 def damages(file: str, good: bytes) -> st.SearchStrategy[bytes]:
     if file.endswith(".npz"):
         return bytes_changed(good) | arrays_changed(good)
-    return bytes_changed(good) | checkpoint_changed(good) if file.endswith(".pt") else bytes_changed(good)
+    return (
+        bytes_changed(good) | checkpoint_changed(good)
+        if file.endswith(".pt")
+        else bytes_changed(good)
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -178,7 +242,9 @@ def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]]
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(corpus, folder)
         edit(folder / file)
-        signal.signal(signal.SIGALRM, lambda *_: pytest.fail(f"{file} was read for minutes"))  # no handler catches it
+        signal.signal(
+            signal.SIGALRM, lambda *_: pytest.fail(f"{file} was read for minutes")
+        )  # no handler catches it
         signal.alarm(SECONDS if file in READERS else PATIENCE)
         try:
             sentence = by_library(file, folder) if file in READERS else by_command(file)
@@ -186,7 +252,11 @@ def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]]
             signal.alarm(0)
         assert not list(folder.glob(f"**/{CODE_RAN}")), "code ran"
         if sentence is not None:
-            names = (*Path(file).parts, "mesh.obj", "checkpoint")  # of whose NaN the training reports
+            names = (
+                *Path(file).parts,
+                "mesh.obj",
+                "checkpoint",
+            )  # of whose NaN the training reports
             assert "\n" not in sentence and any(name in sentence for name in names), sentence
         return sentence
 
@@ -198,7 +268,13 @@ def require_finite(result: Any) -> None:
     if isinstance(result, torch.Tensor | np.ndarray):
         values = torch.as_tensor(result)
         assert not values.is_floating_point() or values.isfinite().all()
-    parts = result if isinstance(result, list | tuple) else vars(result).values() if hasattr(result, "__dict__") else ()
+    parts = (
+        result
+        if isinstance(result, list | tuple)
+        else vars(result).values()
+        if hasattr(result, "__dict__")
+        else ()
+    )
     for part in parts:
         require_finite(part)
 
@@ -212,7 +288,9 @@ def require_finite(result: Any) -> None:
         *(pytest.param(file, MANY // 5, marks=pytest.mark.slow) for file in COMMANDS),
     ],
 )
-def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(corpus, outcome, file, examples):
+def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
+    corpus, outcome, file, examples
+):
     @settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
     @given(content=damages(file, (corpus / file).read_bytes()))
     def used_or_refused(content: bytes) -> None:
@@ -238,7 +316,9 @@ def npy_header(shape: str) -> bytes:
 def zip_bomb(path: Path) -> None:
     """Arrays of 10 TB, by their headers, in a small file."""
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (10**13,)})
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "|u1", "fortran_order": False, "shape": (10**13,)}
+    )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("train_images", "train_labels", "test_images", "test_labels", "classes"):
             archive.writestr(f"{name}.npy", header.getvalue() + bytes(10**6))
@@ -252,10 +332,17 @@ def huge_png() -> bytes:
     """A small file whose header says 10¹⁰ pixels."""
 
     def chunk(name: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        return (
+            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        )
 
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", 10**5, 10**5, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(10**6))) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + head
+        + chunk(b"IDAT", zlib.compress(bytes(10**6)))
+        + chunk(b"IEND", b"")
+    )
 
 
 def safetensors(**header: object) -> bytes:
@@ -272,15 +359,25 @@ YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
     f"{letter}: &{letter} [{', '.join(9 * [f'*{before}'])}]\n"
     for before, letter in zip("abcdefgh", "bcdefghi", strict=True)
 )
-FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [  # file, what is wrong with it, the content
+FORGED: list[
+    tuple[str, str, str | bytes | Callable[[Path], object]]
+] = [  # file, what is wrong with it, the content
     ("mesh.obj", "vertex 10¹²", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n"),
     ("mesh.ply", "10¹² vertices", PLY.format(10**12, "0 0 0")),
     ("mesh.ply", "a negative vertex", PLY.format(3, "0 0 0\n1 0 0\n0 1 0\n3 0 1 -2")),
     ("mesh.stl", "2³² faces", bytes(80) + b"\xff\xff\xff\xff" + bytes(50)),
     ("light.npy", "10 TB", npy_header("(1000000, 1000000, 3)")),
     ("light.npy", "code for a shape", npy_header("__import__('os').getcwd()")),
-    ("light.npy", "objects", lambda path: np.save(path, np.array([[{}]], dtype=object), allow_pickle=True)),
-    ("light.hdr", "10⁹ wide", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1000000000 +X 1000000000\n"),
+    (
+        "light.npy",
+        "objects",
+        lambda path: np.save(path, np.array([[{}]], dtype=object), allow_pickle=True),
+    ),
+    (
+        "light.hdr",
+        "10⁹ wide",
+        "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1000000000 +X 1000000000\n",
+    ),
     ("light.exr", "a name that is not UTF-8", name_not_text),
     ("background.png", "10¹⁰ pixels", huge_png()),
     ("data.npz", "10 TB", zip_bomb),
@@ -291,7 +388,11 @@ FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [  # fil
         lambda path: (pickled_code(path), path.with_name(checkpoint.PREVIOUS).unlink()),
     ),
     ("published/model.safetensors", "10 TB", safetensors(a=LARGE)),
-    ("published/model.safetensors", "depth 10⁹", safetensors(__metadata__={"architecture": json.dumps(DEEP)})),
+    (
+        "published/model.safetensors",
+        "depth 10⁹",
+        safetensors(__metadata__={"architecture": json.dumps(DEEP)}),
+    ),
     ("finished/config.yaml", "code", f"a: !!python/object/apply:os.system ['touch {CODE_RAN}']\n"),
     ("finished/config.yaml", "aliases of 9⁸ items", YAML_BOMB),
 ]
@@ -306,17 +407,27 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize(
     "file, content",
     [
-        pytest.param(file, content, id=f"{file}: {fault}", marks=[pytest.mark.slow] if file in SLOW_COMMANDS else [])
+        pytest.param(
+            file,
+            content,
+            id=f"{file}: {fault}",
+            marks=[pytest.mark.slow] if file in SLOW_COMMANDS else [],
+        )
         for file, fault, content in FORGED
     ],
 )
 def test_a_forged_file_is_refused(outcome, file, content):
     content = content.encode() if isinstance(content, str) else content
-    assert outcome(file, content if callable(content) else partial(Path.write_bytes, data=content)) is not None
+    assert (
+        outcome(file, content if callable(content) else partial(Path.write_bytes, data=content))
+        is not None
+    )
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("instead", INSTEAD)
-@pytest.mark.parametrize("file", ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"])
+@pytest.mark.parametrize(
+    "file", ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"]
+)
 def test_what_is_no_file_is_refused(outcome, file, instead):
     assert outcome(file, lambda path: (path.unlink(), INSTEAD[instead](path))) is not None

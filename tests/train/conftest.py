@@ -112,11 +112,11 @@ def made_up_run(tiny) -> Callable[..., Path]:
 
     def make(
         folder: Path,
-        arm: str = "none",
+        method: str = "none",
         photographs: dict | None = None,
         *overrides: str,
     ) -> Path:
-        write_config(folder, tiny(f"augment={arm}", "seed=0", *overrides))
+        write_config(folder, tiny(f"augment={method}", "seed=0", *overrides))
         (folder / "metrics.jsonl").write_text(log_of_two_epochs())
         for name, summary in (photographs or {}).items():
             (folder / name).mkdir()

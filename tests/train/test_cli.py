@@ -23,7 +23,7 @@ from train.runs.checkpoint import LAST
 from train.runs.run_lock import locked
 from train.system import user_errors as errors
 from train.system.hashing import content_hash
-from train.system.user_errors import one_sentence, writable_folder
+from train.system.user_errors import user_message, writable_folder
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -42,8 +42,8 @@ SMALL = [
 
 
 @pytest.fixture
-def two_arms(tiny_npz) -> list[str]:
-    """Return the overrides of an adversarial arm and one without renders."""
+def two_methods(tiny_npz) -> list[str]:
+    """Return the overrides of an adversarial method and one without renders."""
     return ["data=npz", f"data.path={tiny_npz}", "compare=[none]"]
 
 
@@ -59,8 +59,8 @@ def modification_times(folder: Path) -> dict[Path, int]:
 
 class TestTrainingOfTwoArms:
     @pytest.fixture
-    def overrides(self, two_arms, photos) -> list[str]:
-        return ["run=here", *two_arms, f"evaluate.photos={photos}"]
+    def overrides(self, two_methods, photos) -> list[str]:
+        return ["run=here", *two_methods, f"evaluate.photos={photos}"]
 
     @pytest.fixture
     def printed(self, call, capsys, overrides):
@@ -87,8 +87,8 @@ class TestTrainingOfTwoArms:
         assert errors == ""
         table_lines = [line for line in printed.out.splitlines() if line.startswith("|")]
         names = [line.split("|")[1].strip() for line in table_lines]
-        arms = [name for name in names if name in ("none", "adversarial")]
-        assert arms == ["none", "adversarial"] * 2
+        methods = [name for name in names if name in ("none", "adversarial")]
+        assert methods == ["none", "adversarial"] * 2
         for run in (folder, folder / "none"):
             assert (run / LAST).is_file()
             assert (run / "photographs" / "contact_sheet.png").is_file()
@@ -126,17 +126,17 @@ def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(
     call,
     capsys,
     tmp_path,
-    two_arms,
+    two_methods,
 ):
-    assert call("train", "run=here", *two_arms, *SMALL, "scene.views=3") == USER_ERROR
+    assert call("train", "run=here", *two_methods, *SMALL, "scene.views=3") == USER_ERROR
     assert "augment.examples=4" in capsys.readouterr().err
     assert not list(tmp_path.rglob(LAST))
 
 
 @pytest.mark.parametrize("busy", ["here", "here/none"])
-def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_arms, busy):
+def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, two_methods, busy):
     with locked(tmp_path / busy):
-        assert call("train", "run=here", *two_arms, *SMALL, "train.resume=true") == USER_ERROR
+        assert call("train", "run=here", *two_methods, *SMALL, "train.resume=true") == USER_ERROR
     error = capsys.readouterr().err
     assert error.startswith(f"error: run={tmp_path / busy} is being written by another process")
     assert not list(tmp_path.rglob("config.yaml"))
@@ -151,10 +151,10 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
 
 class TestAStoppedRun:
     @pytest.fixture
-    def stopped(self, call, capsys, no_report, tmp_path, two_arms, photos) -> Path:
-        """Stop a run of two arms by SIGTERM, and move its folder."""
+    def stopped(self, call, capsys, no_report, tmp_path, two_methods, photos) -> Path:
+        """Stop a run of two methods by SIGTERM, and move its folder."""
         folder = tmp_path / "begun"
-        overrides = [*two_arms, f"evaluate.photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
+        overrides = [*two_methods, f"evaluate.photos={photos}", "seed=3", *SMALL, "train.epochs=2"]
         with pytest.MonkeyPatch.context() as patch:
 
             def save_and_stop(*arguments):
@@ -170,7 +170,7 @@ class TestAStoppedRun:
         return folder.rename(tmp_path / "moved")
 
     def test_is_resumed_by_its_folder_alone(self, call, tmp_path, stopped):
-        """Resume both arms, with an additional setting, to the weights of a whole run."""
+        """Resume both methods, with an additional setting, to the weights of a whole run."""
         before = yaml.safe_load((stopped / "config.yaml").read_text())
         additional = "train.checkpoint_every=2"
         assert call("train", f"run={stopped}", "train.resume=true", additional) == 0
@@ -181,12 +181,12 @@ class TestAStoppedRun:
         whole = tmp_path / "whole"
         _, _, _, *overrides = shlex.split(config["command"])
         assert call("train", f"run={whole}", *overrides) == 0
-        for arm in (".", "none"):
-            resumed_state = torch.load(stopped / arm / LAST, weights_only=True)
-            whole_state = torch.load(whole / arm / LAST, weights_only=True)
+        for method in (".", "none"):
+            resumed_state = torch.load(stopped / method / LAST, weights_only=True)
+            whole_state = torch.load(whole / method / LAST, weights_only=True)
             assert resumed_state["epoch"] == 2
             assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
-            assert (stopped / arm / "photographs" / "summary.json").is_file()
+            assert (stopped / method / "photographs" / "summary.json").is_file()
 
     def test_is_resumed_arm_by_arm(self, call, stopped):
         assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0
@@ -369,7 +369,7 @@ CLOSED_CONNECTION = RuntimeError("[/gloo/x.cc:1] Connection closed by peer")
     ],
 )
 def test_an_error_is_one_sentence_if_the_user_can_fix_it(error, start):
-    sentence = one_sentence(error)
+    sentence = user_message(error)
     assert sentence.startswith(start)
     assert "\n" not in sentence
 

@@ -396,9 +396,9 @@ class TestANetworkThatIsPartOfThePackage:
             load_run("pretrained/none")
 
 
-@pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
-def test_the_published_networks_are_classifiers_of_cifar_100(arm):
-    classifier = load_network(f"run:{PRETRAINED / arm}")
+@pytest.mark.parametrize("method", ["none", "random", "adversarial"])
+def test_the_published_networks_are_classifiers_of_cifar_100(method):
+    classifier = load_network(f"run:{PRETRAINED / method}")
     assert len(classifier.classes) == 100
     assert classifier.size == 32
     assert classifier.label("orange") == 53

@@ -19,15 +19,15 @@ from augment.classifiers import Classifier
 from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.light.presets import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.auditing import audit_page as page
-from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfers
+from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfer_success
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
-from train.data.photographs import FOREIGN, find_photographs
+from train.data.photographs import OTHER_PREFIX, find_photographs
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
@@ -160,7 +160,7 @@ class _Plan:
         others = [other for other in self.networks.values() if other is not network]
         if others:
             path = own / page.TRANSFER
-            _write_part(path, transfers, network, *others, self.attacked_views, own)
+            _write_part(path, transfer_success, network, *others, self.attacked_views, own)
 
 
 def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
@@ -191,7 +191,7 @@ def _require_classes(
     label: str,
 ) -> None:
     """Raise InputError if a network lacks the class of a mesh or of a photograph."""
-    labels = {item.label for item in items if not item.label.startswith(FOREIGN)}
+    labels = {item.label for item in items if not item.label.startswith(OTHER_PREFIX)}
     for network in networks:
         for name in labels:
             network.label(name)
@@ -252,7 +252,7 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
 def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[ObjectSettings]]:
     """Read the settings of the meshes and of the hard negatives.
 
-    A hard negative without a label gets a label that starts with FOREIGN. The
+    A hard negative without a label gets a label that starts with OTHER_PREFIX. The
     networks need not have a class for this label.
 
     Args:
@@ -268,7 +268,7 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
     look_alikes = [*read_objects(settings.look_alikes, "", "look_alikes").values()]
     for item in look_alikes:
-        item.label = item.label or FOREIGN + (solid_name(item.mesh) or Path(item.mesh).stem)
+        item.label = item.label or OTHER_PREFIX + (solid_name(item.mesh) or Path(item.mesh).stem)
     for item in meshes:
         if item.label != settings.label:
             raise _wrong_class("meshes", item, settings.label)
@@ -294,7 +294,7 @@ def _own_results(out: Path) -> Collection[str]:
 def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
     """Call a function and write its result as JSON, unless the file exists."""
     if not path.exists():
-        write_whole(path, json.dumps(measure(*arguments)) + "\n", durable=True)
+        atomic_write(path, json.dumps(measure(*arguments)) + "\n", durable=True)
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:

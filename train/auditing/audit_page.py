@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
-from train.auditing.lights import FURTHER, KINDS, RANDOM, SIDE, STEPS
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -33,7 +33,7 @@ TRANSFER = "transfer.json"
 WORST = 10
 # Minimum fraction of correctly classified images of a network that is called
 # safe, both of the label and of other things.
-SAFE = 0.9
+PASS_THRESHOLD = 0.9
 # Predictions by the name of a network and by part, in the order of the images.
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
 
@@ -72,15 +72,15 @@ def write_audit_page(
     return write_page(
         out,
         "audit.html.jinja",
-        title=f"Audit: {label} in strange light",
+        title=f"Audit: {label} under unusual lighting",
         about=" and ".join(paths),
         label=label,
         kinds=KINDS,
-        steps=(STEPS, FURTHER),
+        steps=(STEPS, ADDITIONAL_STEPS),
         counts=counts,
         correct=correct,
         pictures=_attack_pictures(paths, counts),
-        transfers=transfers,
+        transfers=transfer_success,
         answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},
@@ -158,15 +158,15 @@ def write_answer(label: str, name: str, folder: Path, parts: Collection[str]) ->
         A question and its answer.
     """
     findings = _find_rates(label, folder, parts)
-    faults = [finding.text for finding in findings if finding.right < SAFE]
+    faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
     faults += _attack_faults(folder)
     if faults:
         answer = f"No: {'; '.join(faults)}."
-    elif parts and all(finding.least >= SAFE for finding in findings):
+    elif parts and all(finding.least >= PASS_THRESHOLD for finding in findings):
         answer = "Yes, as far as this audit looks."
     else:
         answer = "No fault is shown, but so few images leave room for one."
-    return f"Is {name} safe in strange light? {answer}"
+    return f"Is {name} safe under unusual lighting? {answer}"
 
 
 def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Finding]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.validation import as_path
 from train.auditing.audit_page import CLASSIFIER, HARDENED, RECOGNIZED, TRANSFER, write_answer
 from train.auditing.lights import KINDS
@@ -90,7 +90,7 @@ class AuditReport:
         """
         file = as_path("path", path)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file, self.page)
+        atomic_write(file, self.page)
         return file
 
     def __str__(self) -> str:

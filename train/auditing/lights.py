@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.attack_settings import NOISE_MARGIN, AttackSettings
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.checks import success_by_radius
-from augment.attacks.descent import Goal
+from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
@@ -33,9 +33,9 @@ from augment.scene.scene import Scene
 from augment.scene.variation import vary
 from augment.settings import LampsSettings, ProjectorSettings, VariationSettings
 from renderer.camera import orbit_cameras
-from renderer.errors import FACTOR
+from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
@@ -61,7 +61,7 @@ VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
 # Steps of the attack at each radius, and random draws at each radius.
 STEPS = 10
 # Steps of an attack that continues after its success.
-FURTHER = 20
+ADDITIONAL_STEPS = 20
 # Steps of an attack that are as long together as the radius.
 STEPS_PER_RADIUS = 4
 # Pixels per side of a picture on the page.
@@ -200,7 +200,7 @@ def adversaries(
     classifier: Classifier,
     views: Views,
     kind: str,
-    further: bool = False,
+    additional: bool = False,
 ) -> AttackResult:
     """Attack the lighting within the largest radius of its kind.
 
@@ -211,7 +211,7 @@ def adversaries(
         classifier: Attacked classifier.
         views: Views to attack.
         kind: Key of KINDS.
-        further: Whether to take all FURTHER steps. By default an attack ends
+        additional: Whether to take all ADDITIONAL_STEPS steps. By default an attack ends
             when noise of a camera's sensor no longer corrects the prediction,
             or after STEPS steps.
 
@@ -222,8 +222,8 @@ def adversaries(
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
     step_size = radius / STEPS_PER_RADIUS
     limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
-    if further:
-        limits |= {"max_steps": FURTHER, "margin": FACTOR}
+    if additional:
+        limits |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
         limits |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
     return attack(
@@ -284,7 +284,7 @@ def success_by_light(
     is_wrong = clean & result.success
     content = io.BytesIO()
     np.savez(content, wrong=is_wrong.cpu(), values=result.descent.values.cpu())
-    write_whole(out / f"{kind}.npz", content.getbuffer())
+    atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
         logits = torch.stack([result.logits_before[example, 0], result.logits[example, 0]])
@@ -303,7 +303,7 @@ def _draw_pair(result: AttackResult, example: int) -> Image.Image:
     return Image.fromarray(pair.numpy()).resize((2 * SIDE, SIDE), method)
 
 
-def transfers(
+def transfer_success(
     attacked: Classifier,
     other: Classifier,
     views: Views,
@@ -329,7 +329,7 @@ def transfers(
     """
     counts: dict[str, dict[str, list[int]]] = {}
     for kind in progress(KINDS, "transfer"):
-        result = adversaries(attacked, views, kind, further=True)
+        result = adversaries(attacked, views, kind, additional=True)
         is_wrong = result.clean_correct & result.success
         found = {"further": (is_wrong, result.descent.values)}
         with np.load(out / f"{kind}.npz") as saved:
@@ -348,7 +348,7 @@ class _TransferTest:
         self.result = result
         self.problem = problem
         self.is_correct = _is_correct(other, problem.scene, problem.images(problem.start))
-        self.goal = Goal(torch.full_like(result.goal.source, label))
+        self.criterion = Criterion(torch.full_like(result.criterion.source, label))
         self.model = preprocessed_model(result.settings, other)
 
     def count(self, is_wrong: Tensor, values: Tensor) -> list[int]:
@@ -368,11 +368,11 @@ class _TransferTest:
             self.model,
             images,
             predicted,
-            self.problem.everything,
-            self.goal,
+            self.problem.all_examples,
+            self.criterion,
             self.result.settings,
             self.result.seed,
         ).all(1)
-        is_fooled_without_noise = self.goal.reached(predicted)
+        is_fooled_without_noise = self.criterion.reached(predicted)
         parts = (is_tested & is_fooled, is_tested, is_tested & is_fooled_without_noise)
         return [int(part.sum()) for part in parts]

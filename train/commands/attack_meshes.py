@@ -16,14 +16,14 @@ from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.attack_files import LINES, require_renderers, save
 from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
-from augment.attacks.descent import Goal
+from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.search import find_scene
 from augment.classifiers import Classifier
 from augment.losses import NO_CLASS
 from augment.random_streams import generator
 from augment.scene.build import build_scene
-from augment.scene.objects import SceneObject, load_object, on_ground
+from augment.scene.objects import SceneObject, add_table, load_object
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -353,7 +353,7 @@ def load_targets(
     for mesh in meshes.values():
         attacked.label(mesh.label)
         loaded = load_object(mesh, settings.scene.vertices)
-        objects.append(on_ground(loaded, settings.scene.ground))
+        objects.append(add_table(loaded, settings.scene.ground))
     return TransferTargets(classifiers, settings.transfer.azimuths, objects)
 
 
@@ -412,14 +412,14 @@ def format_reloaded(
     # The views are one example, so logits and predictions have shape (1, V, ...).
     logits = logits_of(model, images[None], len(images))
     predicted = logits.argmax(2)
-    # The goal of a view is met if it is classified as without noise.
-    goal = Goal(source=torch.full_like(predicted, NO_CLASS), target=predicted)
+    # The criterion of a view is met if it is classified as without noise.
+    criterion = Criterion(source=torch.full_like(predicted, NO_CLASS), target=predicted)
     is_steady = fooled_in_views(
         model,
         images[None],
         predicted,
         examples=torch.zeros(1, dtype=torch.int64),
-        goal=goal,
+        criterion=criterion,
         settings=settings,
         seed=seed,
     )

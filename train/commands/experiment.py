@@ -12,7 +12,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from augment import distributed
-from augment.settings import ARMS
+from augment.settings import MODES
 from train import console
 from train.command import program, read_settings
 from train.report.comparison import format_table
@@ -71,56 +71,56 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
     settings = read_settings(ExperimentSettings, config)
-    arms = _list_arms(settings, folder)
-    for path, arm_settings in arms.items():
+    methods = _list_arms(settings, folder)
+    for path, method_settings in methods.items():
         if settings.train.resume and (path / CONFIG).is_file():
-            require_same_run(path, arm_settings)
+            require_same_run(path, method_settings)
         require_new_run(path, "run", settings.overwrite, settings.train.resume)
     log = logged_to(writable_folder(run, "run") / LOG) if is_first else nullcontext()
     with log:
         try:
-            with sole_writer("run", *arms) if is_first else nullcontext():
-                _train_methods(arms, folder, command)
+            with sole_writer("run", *methods) if is_first else nullcontext():
+                _train_methods(methods, folder, command)
         except (Interrupted, KeyboardInterrupt) as stop:
             cause = f"ended by {stop.signal}; " if isinstance(stop, Interrupted) else ""
-            console.info("%s%s", cause, _advise_to_resume(arms, folder))
+            console.info("%s%s", cause, _advise_to_resume(methods, folder))
             raise
 
 
 def _list_arms(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
     """Return the settings of the baselines and, at the end, of the main run, by folder."""
-    arms = {}
-    for arm in settings.compare:
+    methods = {}
+    for method in settings.compare:
         with keyed("compare"):
-            augment = replace(settings.augment, arm=arm)
-            arms[folder / arm] = replace(settings, compare=[], augment=augment)
-    arms[folder] = settings
-    return arms
+            augment = replace(settings.augment, mode=method)
+            methods[folder / method] = replace(settings, compare=[], augment=augment)
+    methods[folder] = settings
+    return methods
 
 
-def _advise_to_resume(arms: Mapping[Path, ExperimentSettings], folder: Path) -> str:
+def _advise_to_resume(methods: Mapping[Path, ExperimentSettings], folder: Path) -> str:
     """Say how to continue a command that was interrupted."""
-    if not any(map(checkpoint.exists, arms)):
+    if not any(map(checkpoint.exists, methods)):
         return "no checkpoint yet: start again"
     words = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
     return f"to go on: {shlex.join(words)}"
 
 
 def _train_methods(
-    arms: Mapping[Path, ExperimentSettings],
+    methods: Mapping[Path, ExperimentSettings],
     folder: Path,
     command: str,
 ) -> None:
     """Train all runs in their folders, and print a table. The main run lies in `folder`."""
-    for run in load_runs(arms, command):
-        arm = run.settings.augment.arm
+    for run in load_runs(methods, command):
+        method = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"
-        console.info("\n== augment=%s: %s%s", arm, ARMS[arm], purpose)
+        console.info("\n== augment=%s: %s%s", method, MODES[method], purpose)
         run.fit()
         run.score()
         run.export()
     if distributed.rank() == 0:
-        console.info("\n%s", format_table([summarize(path) for path in arms]))
+        console.info("\n%s", format_table([summarize(path) for path in methods]))
         console.info("%s", report_of([folder], folder))
 
 

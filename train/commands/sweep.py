@@ -18,7 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from renderer.errors import InputError
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from train import console
 from train.command import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
@@ -31,7 +31,7 @@ from train.runs.run_config import given_command, require_same_run
 from train.runs.run_lock import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
-from train.system.user_errors import one_sentence, writable_folder
+from train.system.user_errors import user_message, writable_folder
 from train.training.run import load_runs
 
 
@@ -136,14 +136,14 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
         try:
             _run(config, folder, list(job.overrides.task))
         except Exception as error:
-            sentence = one_sentence(error)
+            sentence = user_message(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()
             # An error without such a sentence is a fault of the program, and is
             # shown with its traceback.
             console.error("failed: %s", reason, exc_info=None if sentence else error)
             # If the disk is full, the console alone shows the reason.
             with suppress(OSError):
-                write_whole(folder / FAILURE, f"{reason}\n")
+                atomic_write(folder / FAILURE, f"{reason}\n")
 
 
 def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from train import console
 from train.system.hashing import content_hash
 
@@ -103,7 +103,7 @@ class TensorCache:
         content = safetensors.torch.save(dict(tensors))
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_whole(self.folder / key, _checksum(key, content) + content)
+            atomic_write(self.folder / key, _checksum(key, content) + content)
         except OSError as error:
             console.warning(f"images and predictions are not cached: {error}")
             self.writable = False

@@ -18,7 +18,7 @@ from torch import Tensor
 from augment.classifiers.adapter import Label, class_index, nearest
 from augment.memory import require_memory
 from augment.progress import progress
-from renderer.errors import InputError, in_one_line
+from renderer.errors import InputError, single_line
 from renderer.io.images import read_square
 from train import console
 from train.settings import label_names
@@ -38,7 +38,7 @@ SUFFIXES = (
 # macOS puts this folder into archives.
 MACS = "__MACOSX"
 # The name of a folder begins with this if the network lacks its class.
-FOREIGN = "other_"
+OTHER_PREFIX = "other_"
 # The table of sources and objects in a folder.
 TABLE = "photos.csv"
 # The file in a folder that pnb-lab made.
@@ -99,7 +99,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     The folder holds a sub-folder per class, or images only. Images only are all of class `label`.
     A sub-folder of no class shows other things. It is warned of unless its name begins with
     "other_". Sub-folders are searched to any depth, through symbolic links, too. Hidden files and
-    other kinds (see `left_out`) are skipped.
+    other kinds (see `unsupported_files`) are skipped.
 
     A file photos.csv gives sources in its columns `path` and `source_tag`. Its column
     `hard_negatives` names further sources, separated by ";", and its column `mesh` names the
@@ -213,7 +213,7 @@ def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]
     return paths, files
 
 
-def left_out(folder: Path) -> list[PurePosixPath]:
+def unsupported_files(folder: Path) -> list[PurePosixPath]:
     """Find the files of a folder whose type is not supported.
 
     Args:
@@ -278,12 +278,12 @@ def _has_class_folders(
     lie beside folders.
     """
     names = folder_names(folder)
-    others = [name for name in names if name not in classes and not name.startswith(FOREIGN)]
+    others = [name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)]
     for name in others:
         if others == names or any(_is_like(name, label) for label in labels):
             suggestions = nearest(name, classes)
             problem = f"is not named after a class of the model (such as {suggestions})"
-            advice = f"rename it, to {FOREIGN}{name} if it shows other things"
+            advice = f"rename it, to {OTHER_PREFIX}{name} if it shows other things"
             raise InputError(f"{folder / name} {problem}: {advice}")
     if others:
         count = f"{len(others)} of {len(names)} folders in {folder}"
@@ -320,7 +320,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
     except (ValueError, LookupError, csv.Error, OSError) as error:
         columns = "the columns path and source_tag, separated by commas"
         advice = f"make it UTF-8 with {columns}, and a row per file"
-        raise InputError(f"{table} cannot be used ({in_one_line(error)}): {advice}") from error
+        raise InputError(f"{table} cannot be used ({single_line(error)}): {advice}") from error
     return rows
 
 

@@ -75,7 +75,7 @@ def load_shapes(
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)
 
 
-def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
+def soft_front_light(back: Tensor, draws: torch.Generator) -> Tensor:
     """Draw a light: a lamp near the camera, and bright surroundings.
 
     Args:
@@ -117,7 +117,7 @@ def _portraits(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> T
     lights = []
     for camera in cameras:
         back = torch.tensor(camera.axes()[2], dtype=torch.float32)
-        lights += [even_light(back, draws) for _ in backgrounds]
+        lights += [soft_front_light(back, draws) for _ in backgrounds]
     scene = Scene.grid(
         [SceneObject("", normalize(mesh))],
         cameras,

@@ -12,7 +12,7 @@ from torch import Tensor
 from augment.classifiers.adapter import class_index
 from augment.progress import progress
 from augment.random_streams import generator
-from renderer.errors import InputError, in_one_line
+from renderer.errors import InputError, single_line
 from train import console
 from train.data.images import RESIDENT, ImageFiles
 from train.data.photographs import (
@@ -230,7 +230,7 @@ def load_npz(path: str) -> DataSet:
             return _read_npz(archive)
     # zipfile, zlib and NumPy raise many kinds of errors for a damaged or foreign file.
     except Exception as error:
-        problem = f"is not an .npz file of labeled images: {in_one_line(error)}"
+        problem = f"is not an .npz file of labeled images: {single_line(error)}"
         raise InputError(f"path={path} {problem}", "path") from error
 
 
@@ -303,7 +303,7 @@ def load_folder(
     if len(classes) < 2:
         fault = f"path={path} holds {len(classes)} class folders"
         raise InputError(f"{fault}: it needs two or more", "path")
-    unread = left_out(root)
+    unread = unsupported_files(root)
     if unread:
         shown = ", ".join(map(str, unread[:3]))
         console.warning("%d files in %s are not images: %s", len(unread), root, shown)

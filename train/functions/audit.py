@@ -95,13 +95,15 @@ def audit(
             networks[page.HARDENED] = as_classifier(hardened, *options, argument="hardened")
         classifier = networks[page.CLASSIFIER]
         items = as_mappings("meshes", meshes, classifier)
-        studied = studied_classes(label, items, classifier)
-        if len(studied) > 1:
-            raise InputError(f"meshes are of several classes ({', '.join(studied)}): give one")
+        positive_classes = studied_classes(label, items, classifier)
+        if len(positive_classes) > 1:
+            raise InputError(
+                f"meshes are of several classes ({', '.join(positive_classes)}): give one"
+            )
         with folder_or_temporary(out) as folder:
             settings = AuditSettings(
                 classifier=classifier.name,
-                label=studied[0],
+                label=positive_classes[0],
                 meshes=items,
                 look_alikes=as_mappings("hard_negatives", hard_negatives, classifier),
                 photos=None if photographs is None else str(photographs),
@@ -115,4 +117,4 @@ def audit(
             )
             report = run_audit(settings, networks)
             names = {key: item.name for key, item in networks.items()}
-            return read_audit(studied[0], names, report)
+            return read_audit(positive_classes[0], names, report)

@@ -112,7 +112,9 @@ def evaluate(
         with sole_writer("out", target) if target else nullcontext():
             points = _points_of(classifier, labels)
             if calibrate is not None and false_positive_rate is not None:
-                points = _choose_points(predictor, calibrate, labels, false_positive_rate, skip_unreadable)
+                points = _choose_points(
+                    predictor, calibrate, labels, false_positive_rate, skip_unreadable
+                )
             answers = predictor.predict(folder, labels, skip_unreadable)
             scores = scoring.score(answers, by, points)
             if target:
@@ -120,7 +122,9 @@ def evaluate(
     return scores
 
 
-def _choose_labels(classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None) -> list[str]:
+def _choose_labels(
+    classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
+) -> list[str]:
     """Return the names of the classes under study."""
     if label is not None:
         return [classifier.classes[classifier.label(name)] for name in label_names(label)]

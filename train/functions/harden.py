@@ -71,7 +71,7 @@ def harden(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> nn.Module:
-    """Train a copy of a network to recognize objects in strange light.
+    """Train a copy of a network to recognize objects under unusual lighting.
 
     This is `pnb-train experiment=classifier`: the last layer learns from
     renders, and the network keeps its answers on photographs.
@@ -156,7 +156,9 @@ def harden(
     return _copy_with(network, classifier, trained)
 
 
-def _read_settings(changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]) -> ExperimentSettings:
+def _read_settings(
+    changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
+) -> ExperimentSettings:
     """Read the settings of the experiment with changes, and then those of the caller."""
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]

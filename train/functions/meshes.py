@@ -14,12 +14,12 @@ from train.settings import solid_name
 # What a caller names a mesh by: a file or solid:NAME, a pair of it and its
 # class, or settings.
 MeshItem = str | Path | tuple[str | Path, str | int] | ObjectSettings
-EXPECTED = (
-    "a list of files or solids such as 'solid:orange', of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
-)
+EXPECTED = "a list of files or solids such as 'solid:orange', of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
 
 
-def as_mappings(name: str, meshes: Sequence[MeshItem], classifier: Classifier) -> list[dict[str, Any]]:
+def as_mappings(
+    name: str, meshes: Sequence[MeshItem], classifier: Classifier
+) -> list[dict[str, Any]]:
     """Convert meshes to mappings with the fields of `ObjectSettings`.
 
     Args:
@@ -51,7 +51,9 @@ def as_mappings(name: str, meshes: Sequence[MeshItem], classifier: Classifier) -
     return mappings
 
 
-def studied_classes(label: str | int | None, meshes: Sequence[dict[str, Any]], classifier: Classifier) -> list[str]:
+def studied_classes(
+    label: str | int | None, meshes: Sequence[dict[str, Any]], classifier: Classifier
+) -> list[str]:
     """Return the classes under study.
 
     Args:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from augment.attacks.attack import AttackResult
 from augment.attacks.checks import warnings
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from train.evaluation.tables import Proportion, Table, format_fraction, fraction
 from train.report.plots import COLORS, LINES, MARKERS
 
@@ -165,7 +165,7 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
         without_noise = _count_correct(found[f"success{WITHOUT_NOISE}"], clean)
         correct = f"{rate.n} of {len(clean)}"
         rows.append([f"{kind} {found[kind]}", correct, format_fraction(rate), str(without_noise)])
-    write_whole(path, "".join(lines))
+    atomic_write(path, "".join(lines))
     header = ["adversaries shown to", "correct before", "success", "without noise"]
     return str(Table("", header, rows))
 
@@ -228,7 +228,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     table = csv.DictWriter(text, list(records[0]))
     table.writeheader()
     table.writerows(records)
-    write_whole(out / TABLE, text.getvalue())
+    atomic_write(out / TABLE, text.getvalue())
     last_mesh = records[-1]["mesh"]
     drawn = [record for record in records if record["mesh"] == last_mesh and record["n"]]
     _draw(drawn, norms, out / FIGURE)
@@ -273,4 +273,4 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
     image = io.BytesIO()
     figure.savefig(image, dpi=150)
-    write_whole(path, image.getbuffer())
+    atomic_write(path, image.getbuffer())

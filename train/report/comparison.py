@@ -1,8 +1,8 @@
 """Tables that compare finished runs: metrics on photographs by source, and differences.
 
-Runs that differ only in their seed are the runs of one arm. An `Evaluation`
+Runs that differ only in their seed are the runs of one method. An `Evaluation`
 holds the predictions of one run for one folder of photographs. `difference`
-compares a metric of two arms, with a 95% interval.
+compares a metric of two methods, with a 95% interval.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from statistics import fmean
 import numpy as np
 
 from augment.progress import progress
-from augment.settings import ARMS
+from augment.settings import MODES
 from renderer.errors import InputError
 from train.evaluation.scores.metrics import (
     METRICS,
@@ -94,7 +94,7 @@ class Evaluation:
     pools: Mapping[Part, Pool]
 
 
-# Evaluations by arm, in the order of their seeds.
+# Evaluations by method, in the order of their seeds.
 Evaluations = Mapping[str, Sequence[Evaluation]]
 
 
@@ -124,21 +124,21 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     """Read the predictions of runs that were scored on the same images.
 
     Args:
-        group: Scored runs of each arm, from `group_by_images`.
+        group: Scored runs of each method, from `group_by_images`.
         exclude: Sources that the pool of all images leaves out.
         by: "source" for a pool of each source, or "mesh" for a pool of each
             mesh.
 
     Returns:
-        Evaluations by arm. Published networks have no predictions and are
+        Evaluations by method. Published networks have no predictions and are
         left out.
 
     Raises:
         InputError: If predictions.csv cannot be read, if a source to exclude
             does not exist, or if `by` is "mesh" and no mesh is known.
     """
-    arms: dict[str, list[Evaluation]] = {}
-    for arm, scored_runs in group.items():
+    methods: dict[str, list[Evaluation]] = {}
+    for method, scored_runs in group.items():
         for scored in sorted(scored_runs, key=lambda item: item.run.seed or 0):
             path = scored.folder / PREDICTIONS
             if not path.is_file():
@@ -151,8 +151,8 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
                 raise InputError(f"by=mesh: {path} names no mesh: leave by=mesh out")
             properties = ("label", by) if scores.by_label else (by,)
             pools = pools_of(pooled, *properties)
-            arms.setdefault(arm, []).append(Evaluation(scored.run, pools))
-    return arms
+            methods.setdefault(method, []).append(Evaluation(scored.run, pools))
+    return methods
 
 
 def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) -> None:
@@ -166,10 +166,10 @@ def _require_sources(names: Sequence[str], predictions: Sequence[Prediction]) ->
 
 
 def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate | None:
-    """Average a metric over the seeds of an arm.
+    """Average a metric over the seeds of a method.
 
     Args:
-        group: Evaluations of the arm, one for each seed.
+        group: Evaluations of the method, one for each seed.
         part: Part of the images.
         name: Name in `METRICS`.
 
@@ -193,59 +193,59 @@ def mean_metric(group: Sequence[Evaluation], part: Part, name: str) -> Estimate 
     return Estimate(value=fmean(values), low=min(values), high=max(values))
 
 
-def group_table(arms: Evaluations, overall: str = "all", by: str = "source") -> Table:
-    """Make a table of the metrics of each part of the images and each arm.
+def group_table(methods: Evaluations, overall: str = "all", by: str = "source") -> Table:
+    """Make a table of the metrics of each part of the images and each method.
 
     Args:
-        arms: Evaluations of each arm.
+        methods: Evaluations of each method.
         overall: Title of the rows of all images.
         by: "source" or "mesh": the title of the first column.
 
     Returns:
-        Table with a row for each part and each arm. Cells hold the means
+        Table with a row for each part and each method. Cells hold the means
         over the seeds (see `mean_metric`).
     """
-    evaluations = [evaluation for group in arms.values() for evaluation in group]
+    evaluations = [evaluation for group in methods.values() for evaluation in group]
     parts = dict.fromkeys(part for evaluation in evaluations for part in evaluation.pools)
     rows: list[list[str]] = []
     for part in progress(parts, "intervals"):
-        for arm, group in arms.items():
+        for method, group in methods.items():
             cells = [format_interval(mean_metric(group, part, name)) for name in METRICS]
-            rows.append([part.title(overall), arm, *cells])
+            rows.append([part.title(overall), method, *cells])
     return Table(f"by {by}", [by, "network", *TITLES], rows)
 
 
-def choose_pairs(arms: Evaluations) -> list[tuple[str, str]]:
-    """Choose which arms are compared with which reference.
+def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
+    """Choose which methods are compared with which reference.
 
-    Each arm is compared with the network that its runs began with, and with
-    the first of the arms.
+    Each method is compared with the network that its runs began with, and with
+    the first of the methods.
 
     Args:
-        arms: Evaluations of each arm. Initial networks count as arms.
+        methods: Evaluations of each method. Initial networks count as methods.
 
     Returns:
-        Pairs of an arm and its reference.
+        Pairs of a method and its reference.
     """
-    first_runs = {arm: evaluations[0].run for arm, evaluations in arms.items()}
+    first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
     pairs = []
-    for arm, run in first_runs.items():
+    for method, run in first_runs.items():
         if run.before is None:
             continue
         for reference, reference_run in first_runs.items():
             if reference_run.settings == run.before.settings:
-                pairs.append((arm, reference))
-    trained = [arm for arm, run in first_runs.items() if run.arm != INITIAL]
-    return pairs + [(arm, trained[0]) for arm in trained[1:]]
+                pairs.append((method, reference))
+    trained = [method for method, run in first_runs.items() if run.method != INITIAL]
+    return pairs + [(method, trained[0]) for method in trained[1:]]
 
 
 @dataclass(frozen=True)
 class Difference(Estimate):
-    """Difference of a metric between two arms, with its 95% interval.
+    """Difference of a metric between two methods, with its 95% interval.
 
     Attributes:
         before: Mean of the metric over the seeds of the reference.
-        after: Mean of the metric over the seeds of the arm.
+        after: Mean of the metric over the seeds of the method.
     """
 
     before: float = 0.0
@@ -258,16 +258,16 @@ def difference(
     part: Part,
     name: str,
 ) -> Difference | None:
-    """Subtract the mean of a metric over the seeds of a reference from the mean of an arm.
+    """Subtract the mean of a metric over the seeds of a reference from the mean of a method.
 
     The 95% interval comes from a bootstrap over objects, images and seeds. Each
-    replicate draws the same objects and images for all runs. If both arms
+    replicate draws the same objects and images for all runs. If both methods
     have the same seeds, a seed is drawn for both of them at once. The bootstrap
     over n seeds underestimates the variance between seeds by a factor of
     1 - 1/n. With one seed, this variance is missing altogether.
 
     Args:
-        group: Evaluations of the arm, one for each seed.
+        group: Evaluations of the method, one for each seed.
         reference: Evaluations of the reference, one for each seed.
         part: Part of the images.
         name: Name in `METRICS`.
@@ -304,22 +304,22 @@ def _known_value(metrics: Metrics, name: str) -> float:
 
 
 def _have_equal_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
-    """Return whether both arms have the same seeds, in the same order."""
+    """Return whether both methods have the same seeds, in the same order."""
     seeds = [evaluation.run.seed or 0 for evaluation in group]
     reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
     return seeds == reference_seeds
 
 
 def difference_tables(
-    arms: Evaluations,
+    methods: Evaluations,
     overall: str = "all",
     by: str = "source",
     overall_only: bool = False,
 ) -> list[Table]:
-    """Make a table of the differences for each pair of arms that is compared.
+    """Make a table of the differences for each pair of methods that is compared.
 
     Args:
-        arms: Evaluations of each arm.
+        methods: Evaluations of each method.
         overall: Title of the row of all images.
         by: "source" or "mesh": the title of the first column.
         overall_only: Whether to leave out the rows of single sources or meshes.
@@ -329,9 +329,9 @@ def difference_tables(
         the images.
     """
     tables = []
-    for arm, base in progress(choose_pairs(arms), "differences"):
-        group = arms[arm]
-        reference = arms[base]
+    for method, base in progress(choose_pairs(methods), "differences"):
+        group = methods[method]
+        reference = methods[base]
         rows = []
         for part in reference[0].pools:
             if overall_only and not part.is_overall:
@@ -340,23 +340,23 @@ def difference_tables(
             cells = [format_interval(item, sign="+") for item in differences]
             rows.append([part.title(overall), *cells])
         paired = ", paired" if _have_equal_seeds(group, reference) else ""
-        title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
+        title = f"{method} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
         tables.append(Table(title, [by, *TITLES], rows))
     return tables
 
 
-def overall_differences(arms: Evaluations) -> Table:
+def overall_differences(methods: Evaluations) -> Table:
     """Make one table of the differences on the images of all sources.
 
     Args:
-        arms: Evaluations of each arm.
+        methods: Evaluations of each method.
 
     Returns:
         Table with a row for each pair from `choose_pairs` and, with several
         labels, for each label.
     """
     rows = []
-    for table in difference_tables(arms, overall="", overall_only=True):
+    for table in difference_tables(methods, overall="", overall_only=True):
         for name, *cells in table.rows:
             title = f"{table.title}, {name}" if name else table.title
             rows.append([title, *cells])
@@ -371,17 +371,17 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 
     Returns:
         Markdown tables of the accuracy, the metrics and their differences, a
-        line about the renders of each arm, and the paths of the contact
+        line about the renders of each method, and the paths of the contact
         sheets.
     """
-    arms = group_by_method(runs)
-    groups = group_by_images(arms)
-    tables = run_tables(arms, groups)
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    tables = run_tables(methods, groups)
     for group in groups.values():
         tables.append(overall_differences(read_evaluations(group)))
 
-    used_modes = {run.arm for run in runs}
-    captions = [f"{mode}: {caption}" for mode, caption in ARMS.items() if mode in used_modes]
+    used_modes = {run.method for run in runs}
+    captions = [f"{mode}: {caption}" for mode, caption in MODES.items() if mode in used_modes]
     sheets = []
     for run in runs:
         sheets += [f"image: {run.folder / name / CONTACT_SHEET}" for name in run.photographs]
@@ -419,16 +419,16 @@ def format_comparison(
             if no run has the sub-folder and its name is not the usual one, or
             if predictions cannot be read (see `read_evaluations`).
     """
-    arms = group_by_method(runs)
-    groups = group_by_images(arms)
-    tables = run_tables(arms, groups)
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    tables = run_tables(methods, groups)
     overall = f"all but {', '.join(exclude)}" if exclude else "all"
     group = _find_group(list(groups.values()), photographs)
     if group is not None:
         evaluations = read_evaluations(group, exclude, by)
         tables.append(group_table(evaluations, overall, by))
         tables += difference_tables(evaluations, overall, by)
-    tables.append(seconds_table(arms))
+    tables.append(seconds_table(methods))
     return _format_tables(tables)
 
 

@@ -77,10 +77,10 @@ class Picture:
 
 
 def style(index: int) -> dict[str, Any]:
-    """Return matplotlib's keywords for the lines of an arm.
+    """Return matplotlib's keywords for the lines of a method.
 
     Args:
-        index: The place of the arm among the arms.
+        index: The place of the method among the methods.
 
     Returns:
         The color and the line style.
@@ -89,14 +89,14 @@ def style(index: int) -> dict[str, Any]:
 
 
 def curves(
-    arms: Mapping[str, Sequence[Points]],
+    methods: Mapping[str, Sequence[Points]],
     title: str,
     x_title: str = "epoch",
 ) -> Picture | None:
-    """Plot a quantity over epochs or rounds, with a line for each seed of an arm.
+    """Plot a quantity over epochs or rounds, with a line for each seed of a method.
 
     Args:
-        arms: The points of each seed, by arm.
+        methods: The points of each seed, by method.
         title: The quantity.
         x_title: What x counts.
 
@@ -104,17 +104,17 @@ def curves(
         The plot. None if no line has two points that differ.
     """
     lines_of_arm: dict[str, list[list[tuple[float, float]]]] = {}
-    for arm, seeds in arms.items():
-        lines_of_arm[arm] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
+    for method, seeds in methods.items():
+        lines_of_arm[method] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
     all_lines = [line for lines in lines_of_arm.values() for line in lines]
     if not any(len({y for _, y in line}) > 1 for line in all_lines):
         return None
 
     means = []
-    for arm, lines in lines_of_arm.items():
+    for method, lines in lines_of_arm.items():
         ends = [line[-1][1] for line in lines if line]
         if ends:
-            means.append(f"{arm} {np.mean(ends):.2f}")
+            means.append(f"{method} {np.mean(ends):.2f}")
     alt = f"{title} by {x_title}, at the end: {', '.join(means)}"
     return _plot(lambda axes: _draw_curves(axes, lines_of_arm, x_title), title, alt)
 
@@ -124,9 +124,9 @@ def _draw_curves(
     lines_of_arm: Mapping[str, list[list[tuple[float, float]]]],
     x_title: str,
 ) -> None:
-    """Draw the lines of each arm in its color; the first one is named in the legend."""
-    for index, (arm, lines) in enumerate(lines_of_arm.items()):
-        name: str | None = arm
+    """Draw the lines of each method in its color; the first one is named in the legend."""
+    for index, (method, lines) in enumerate(lines_of_arm.items()):
+        name: str | None = method
         for line in lines:
             if len(line) < 2:
                 continue
@@ -138,27 +138,27 @@ def _draw_curves(
     axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
 
-def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
-    """Plot ROC curves, one for each seed of an arm.
+def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
+    """Plot ROC curves, one for each seed of a method.
 
     Args:
-        arms: The scores of the positives and the negatives of each seed, by arm.
+        methods: The scores of the positives and the negatives of each seed, by method.
         label: The classes under study, as the axes name them.
 
     Returns:
         The plot. None if no seed has scores of both kinds.
     """
     known = {}
-    for arm, pairs in arms.items():
-        known[arm] = [pair for pair in pairs if all(map(len, pair))]
+    for method, pairs in methods.items():
+        known[method] = [pair for pair in pairs if all(map(len, pair))]
     if not any(known.values()):
         return None
-    styles = {arm: style(index) for index, arm in enumerate(arms)}
+    styles = {method: style(index) for index, method in enumerate(methods)}
     means = []
-    for arm, pairs in known.items():
+    for method, pairs in known.items():
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
         if areas:
-            means.append(f"{arm} {np.mean(areas):.3f}")
+            means.append(f"{method} {np.mean(areas):.3f}")
     alt = f"ROC; AUC: {', '.join(means)}"
     return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", alt)
 

@@ -12,13 +12,13 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from augment.progress import announced
-from augment.settings import ARMS
+from augment.progress import progress_message
+from augment.settings import MODES
 from renderer.errors import InputError
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from train.evaluation.scores.metrics import metric_title
 from train.evaluation.scores.scoring import CONTACT_SHEET
-from train.evaluation.scores.sheet import evenly
+from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Table, as_text, format_fraction, format_interval, fraction
 from train.report import comparison as compare
 from train.report import plots, summary
@@ -27,17 +27,17 @@ from train.report.summary import Methods, RunSummary, Scored
 from train.runs.epoch_metrics import attack_success
 from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import RENDERS
-from train.system.user_errors import one_sentence
+from train.system.user_errors import user_message
 
 # Name of the file.
 PAGE = "report.html"
-# Number of arms, and of seeds of an arm, in plots and comparisons.
-MOST_ARMS = 6
-MOST_SEEDS = 5
+# Number of methods, and of seeds of a method, in plots and comparisons.
+MAX_METHODS = 6
+MAX_SEEDS = 5
 # Number of unfinished runs in plots.
-MOST_UNFINISHED = 3
+MAX_UNFINISHED = 3
 # Number of attacks with images, and of examples of such an attack.
-MOST_ATTACKS = 12
+MAX_ATTACKS = 12
 ATTACK_EXAMPLES = 4
 # Number of epochs of which the renders are shown.
 SHOWN_EPOCHS = 3
@@ -53,7 +53,7 @@ HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
 
-@announced("report")
+@progress_message("report")
 def write_report(folders: Sequence[Path], out: Path) -> Path:
     """Write the page of the runs and attacks in folders and below them.
 
@@ -68,25 +68,25 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         InputError: If a folder is missing or none holds a run or an attack.
     """
     found = summary.find(folders)
-    arms = summary.group_by_method(found.runs)
-    drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
+    methods = summary.group_by_method(found.runs)
+    drawn = {name: runs[:MAX_SEEDS] for name, runs in islice(methods.items(), MAX_METHODS)}
     renders = {}
     examples = {}
-    for arm, runs in drawn.items():
+    for method, runs in drawn.items():
         first = runs[0]
         if first.epochs:
-            renders[arm] = _pictures(first, "epoch", "Renders")
-            examples[arm] = _pictures(first, "attacks", "Renders before and after")
+            renders[method] = _pictures(first, "epoch", "Renders")
+            examples[method] = _pictures(first, "attacks", "Renders before and after")
     groups = summary.group_by_images(drawn)
     return write_page(
         out,
         "runs.html.jinja",
         about=_about(found, folders),
-        arms=arms,
-        title=_title(found, arms),
-        lead=_accuracy_sentences(arms),
-        tables=[table for table in summary.run_tables(arms, {}) if table.rows],
-        captions=ARMS,
+        methods=methods,
+        title=_title(found, methods),
+        lead=_accuracy_sentences(methods),
+        tables=[table for table in summary.run_tables(methods, {}) if table.rows],
+        captions=MODES,
         unfinished=[[str(run.folder), run.state, len(run.epochs)] for run in found.unfinished],
         curves=_curves(_drawn_epochs(drawn, found.unfinished)),
         seconds=summary.seconds_table(drawn),
@@ -94,7 +94,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         renders=renders,
         examples=examples,
         attacks=found.attacks,
-        shown=[_attack(attack) for attack in found.attacks[:MOST_ATTACKS]],
+        shown=[_attack(attack) for attack in found.attacks[:MAX_ATTACKS]],
     )
 
 
@@ -120,28 +120,28 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
     return about
 
 
-def _title(found: summary.Findings, arms: Methods) -> str:
-    """Name the positive classes and the arms. Without runs, name what else the page shows."""
-    if not arms:
+def _title(found: summary.Findings, methods: Methods) -> str:
+    """Name the positive classes and the methods. Without runs, name what else the page shows."""
+    if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
     labels: set[str] = set()
-    for runs in arms.values():
+    for runs in methods.values():
         for scores in runs[0].photographs.values():
             labels.update(scores.labels)
-    trained = [arm for arm, runs in arms.items() if runs[0].arm != summary.INITIAL]
+    trained = [method for method, runs in methods.items() if runs[0].method != summary.INITIAL]
     subject = " and ".join(sorted(labels)) or "Networks"
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-# Lines of metrics.jsonl of the epochs of each run of each arm.
+# Lines of metrics.jsonl of the epochs of each run of each method.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
 def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
     """Return the epochs of the runs in plots, with those of the first unfinished runs."""
-    epochs = {arm: [run.epochs for run in runs] for arm, runs in drawn.items()}
+    epochs = {method: [run.epochs for run in runs] for method, runs in drawn.items()}
     started = [run for run in unfinished if run.epochs]
-    for run in started[:MOST_UNFINISHED]:
+    for run in started[:MAX_UNFINISHED]:
         name = run.folder.name[-FOLDER_NAME_LENGTH:]
         epochs[f"unfinished: {name}"] = [run.epochs]
     return epochs
@@ -178,7 +178,7 @@ def write_page(out: Path, body: str, **content: Any) -> Path:
     page = environment.get_template("page.html.jinja").render(body=body, **content)
     out.mkdir(parents=True, exist_ok=True)
     path = out / PAGE
-    write_whole(path, page)
+    atomic_write(path, page)
     return path
 
 
@@ -198,7 +198,7 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
     try:
         return f"report: {write_report(folders, out)}"
     except Exception as error:
-        return f"no report: {one_sentence(error) or traceback.format_exc()}"
+        return f"no report: {user_message(error) or traceback.format_exc()}"
 
 
 def _command(config: Mapping[str, Any]) -> str:
@@ -211,17 +211,17 @@ def _command(config: Mapping[str, Any]) -> str:
     return command
 
 
-def _curves(arms: Epochs) -> list[Picture]:
+def _curves(methods: Epochs) -> list[Picture]:
     """Plot the metrics in `CURVES` by epoch, and the success of attacks by round of renders."""
     pictures = []
     for name, title in CURVES.items():
         lines = {}
-        for arm, runs in arms.items():
-            lines[arm] = [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
+        for method, runs in methods.items():
+            lines[method] = [[(epoch["epoch"], epoch.get(name)) for epoch in run] for run in runs]
         pictures.append(plots.curves(lines, title))
     rates = {}
-    for arm, runs in arms.items():
-        rates[arm] = [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
+    for method, runs in methods.items():
+        rates[method] = [list(enumerate(_attack_success_by_round(run), 1)) for run in runs]
     title = "attack success on clean-correct renders"
     pictures.append(plots.curves(rates, title, "round of renders"))
     return [picture for picture in pictures if picture is not None]
@@ -250,16 +250,16 @@ def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
         if number.isdigit():
             path_of_epoch[int(number)] = path
     pictures = []
-    for epoch in evenly(sorted(path_of_epoch), SHOWN_EPOCHS):
-        alt = f"{title}, epoch {epoch}, {run.arm}"
+    for epoch in evenly_spaced(sorted(path_of_epoch), SHOWN_EPOCHS):
+        alt = f"{title}, epoch {epoch}, {run.method}"
         pictures += plots.from_file(path_of_epoch[epoch], alt, GRID_WIDTH, f"epoch {epoch}")
     return pictures
 
 
-def _accuracy_sentences(arms: Methods) -> list[str]:
-    """Compare the mean test accuracy of each arm before and after training, in sentences."""
+def _accuracy_sentences(methods: Methods) -> list[str]:
+    """Compare the mean test accuracy of each method before and after training, in sentences."""
     sentences = []
-    for arm, runs in arms.items():
+    for method, runs in methods.items():
         initial = [run.before.accuracy for run in runs if run.before]
         known = [accuracy for accuracy in initial if accuracy is not None]
         if not known:
@@ -268,7 +268,7 @@ def _accuracy_sentences(arms: Methods) -> list[str]:
         after = fmean(run.scores["test/accuracy"] for run in runs)
         images = runs[0].config.get("test_images", "the test images")
         change = f"accuracy went from {before:.1%} to {after:.1%}"
-        sentences.append(f"{arm}: {change}, on {images}.")
+        sentences.append(f"{method}: {change}, on {images}.")
     return sentences
 
 
@@ -277,22 +277,22 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
     Args:
         title: Title of the images.
-        group: Scored runs of each arm, from `summary.group_by_images`.
+        group: Scored runs of each method, from `summary.group_by_images`.
 
     Returns:
         Values of the macro `scores` in page.html.jinja:
 
         - "name": the title;
-        - "sheets": contact sheet of the first run of each arm;
+        - "sheets": contact sheet of the first run of each method;
         - "rocs": plots of ROC curves;
         - "tables": tables of metrics and of their differences;
         - "sentences": differences in words, or why they are unknown.
     """
     sheets = {}
-    for arm, scored_runs in group.items():
+    for method, scored_runs in group.items():
         path = scored_runs[0].folder / CONTACT_SHEET
-        alt = f"predictions of {arm} on {title}"
-        sheets[arm] = plots.from_file(path, alt, SHEET_WIDTH)
+        alt = f"predictions of {method} on {title}"
+        sheets[method] = plots.from_file(path, alt, SHEET_WIDTH)
     tables = [summary.score_table("", group)]
     rocs: list[Picture | None] = []
     sentences: list[str] = []
@@ -313,40 +313,40 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
     }
 
 
-def _rocs(arms: compare.Evaluations) -> list[Picture | None]:
+def _rocs(methods: compare.Evaluations) -> list[Picture | None]:
     """Plot the ROC curves of all images and, with several labels, of each label."""
-    first_evaluation = next(iter(arms.values()))[0]
+    first_evaluation = next(iter(methods.values()))[0]
     pictures = []
     for part, pool in first_evaluation.pools.items():
         if not part.is_overall:
             continue
         scores = {}
-        for arm, evaluations in arms.items():
-            scores[arm] = [evaluation.pools[part].scores for evaluation in evaluations]
+        for method, evaluations in methods.items():
+            scores[method] = [evaluation.pools[part].scores for evaluation in evaluations]
         pictures.append(plots.roc(scores, pool.label))
     return pictures
 
 
-def _evaluation_tables(arms: compare.Evaluations) -> list[Table]:
+def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     """Make the table of differences and, if the images have parts, a table of their metrics."""
-    tables = [compare.overall_differences(arms)]
-    first_evaluation = next(iter(arms.values()))[0]
+    tables = [compare.overall_differences(methods)]
+    first_evaluation = next(iter(methods.values()))[0]
     if len(first_evaluation.pools) > 1:
-        tables.append(compare.group_table(arms))
+        tables.append(compare.group_table(methods))
     return tables
 
 
-def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
-    """Compare the metrics in `HEADLINES` of each pair of arms in a sentence."""
+def _difference_sentences(methods: compare.Evaluations, images: str) -> list[str]:
+    """Compare the metrics in `HEADLINES` of each pair of methods in a sentence."""
     sentences = []
-    for arm, base in compare.choose_pairs(arms):
+    for method, base in compare.choose_pairs(methods):
         parts = []
         for name in HEADLINES:
-            result = compare.difference(arms[arm], arms[base], compare.ALL, name)
+            result = compare.difference(methods[method], methods[base], compare.ALL, name)
             if result is not None:
                 parts.append(f"{metric_title(name)} {_compared(result)}")
         if parts:
-            sentences.append(f"{images}, {base} and {arm}: {'; '.join(parts)}.")
+            sentences.append(f"{images}, {base} and {method}: {'; '.join(parts)}.")
     return sentences
 
 
@@ -362,7 +362,7 @@ def _compared(result: compare.Difference) -> str:
 def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
     """Collect the examples, images, checks and configuration of an attack for the template."""
     images = {}
-    for row in evenly(attack.rows, ATTACK_EXAMPLES):
+    for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):
         title = f"Example {row.number}, {row.label}: {row.outcome}"
         alt = f"{title}; before, after, their difference and the lights; "
         alt += f"predicted {row.before}, then {row.after}"

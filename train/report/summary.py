@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.attack_files import LINES
-from augment.settings import ARMS
-from renderer.errors import InputError, in_one_line
+from augment.settings import MODES
+from renderer.errors import InputError, single_line
 from train.evaluation.scores.metrics import (
     METRICS,
     AreaUnderCurve,
@@ -29,11 +29,11 @@ from train.runs.run_log import BEFORE, PHASES, read_metrics
 from train.runs.saved_networks import PUBLISHED, load_selected
 from train.settings import label_names, published
 
-# Number of arms up to which they are named by their settings.
-MOST_NAMED = 30
+# Number of methods up to which they are named by their settings.
+MAX_NAMED = 30
 # Characters of the longest such name.
 LONGEST_NAME = 56
-# Name of a network that runs began with, in place of that of an arm.
+# Name of a network that runs began with, in place of that of a method.
 INITIAL = "the initial network"
 
 
@@ -123,7 +123,7 @@ class RunSummary:
 
     Attributes:
         folder: Folder of the run.
-        arm: Name of its renders, or of the network.
+        method: Name of its renders, or of the network.
         settings: Settings that decide its result, by dotted key.
         photographs: Scores by the name of their sub-folder.
         accuracy: Accuracy on the test images. None if it was not measured.
@@ -136,7 +136,7 @@ class RunSummary:
     """
 
     folder: Path
-    arm: str
+    method: str
     settings: Mapping[str, object]
     photographs: Mapping[str, PhotographScores]
     accuracy: float | None
@@ -147,7 +147,7 @@ class RunSummary:
     before: "RunSummary | None" = None
 
 
-# Runs by the name of their arm.
+# Runs by the name of their method.
 Methods = Mapping[str, Sequence[RunSummary]]
 
 
@@ -173,7 +173,7 @@ class ScoredRun(NamedTuple):
         return self.run.folder / self.name
 
 
-# The scored runs of each arm.
+# The scored runs of each method.
 Scored = Mapping[str, Sequence[ScoredRun]]
 
 
@@ -211,7 +211,7 @@ def summarize(folder: Path) -> RunSummary:
     except Exception as error:
         # Entries may be missing or of any type.
         files = f"{CONFIG}, {run_log.METRICS} or a {SUMMARY}"
-        reason = f"{type(error).__name__}: {in_one_line(error)}"
+        reason = f"{type(error).__name__}: {single_line(error)}"
         problem = f"{folder}: {files} is not as `pnb-train` wrote it ({reason})"
         raise InputError(f"{problem}: use another run") from error
     if summary is None:
@@ -247,14 +247,14 @@ def _read_run(folder: Path) -> RunSummary:
         path = folder / BEFORE
         before = RunSummary(
             folder=path,
-            arm=INITIAL,
+            method=INITIAL,
             settings={"train.init_from": config.train.init_from},
             photographs=read_summaries(path),
             accuracy=scores["test/accuracy_before"],
         )
     return RunSummary(
         folder=folder,
-        arm=str(config.augment.arm),
+        method=str(config.augment.mode),
         settings=run_config.decisive_settings(config),
         photographs=read_summaries(folder),
         accuracy=scores["test/accuracy"],
@@ -288,10 +288,10 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
         runs: Runs that are compared.
 
     Returns:
-        The setting in words by its key, without the arm and the seed, which
+        The setting in words by its key, without the method and the seed, which
         tables always show.
     """
-    keys = {key for run in runs for key in run.settings} - {"augment.arm", "seed"}
+    keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
     varied = {}
     for key in sorted(keys):
         if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs):
@@ -307,25 +307,25 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
         runs: Runs, which may have begun with other networks.
 
     Returns:
-        Runs by the name of their arm. The networks that they began with come
-        first, once. A name has the arm and the settings in which its groups
-        differ, or a number and the arm if those are many or long.
+        Runs by the name of their method. The networks that they began with come
+        first, once. A name has the method and the settings in which its groups
+        differ, or a number and the method if those are many or long.
     """
     groups: dict[str, list[RunSummary]] = {}
     for run in (*_initial_networks(runs), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     heads = [group[0] for group in groups.values()]
     varied = {}
-    for arm in {head.arm for head in heads}:
-        varied[arm] = varied_settings([head for head in heads if head.arm == arm])
+    for method in {head.method for head in heads}:
+        varied[method] = varied_settings([head for head in heads if head.method == method])
     named: dict[str, list[RunSummary]] = {}
     for number, group in enumerate(groups.values(), 1):
         head = group[0]
-        parts = [f"{words}={head.settings.get(key)}" for key, words in varied[head.arm].items()]
-        name = ", ".join([head.arm, *parts])
-        is_short = len(heads) <= MOST_NAMED and len(name) <= LONGEST_NAME
+        parts = [f"{words}={head.settings.get(key)}" for key, words in varied[head.method].items()]
+        name = ", ".join([head.method, *parts])
+        is_short = len(heads) <= MAX_NAMED and len(name) <= LONGEST_NAME
         if not is_short or name in named:
-            name = f"{number}: {head.arm}"
+            name = f"{number}: {head.method}"
         named[name] = group
     return named
 
@@ -340,21 +340,21 @@ def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
     return [*networks.values()]
 
 
-def group_by_images(arms: Methods) -> dict[str, Scored]:
+def group_by_images(methods: Methods) -> dict[str, Scored]:
     """Group runs by the images that they were scored on.
 
     Args:
-        arms: Runs of each arm.
+        methods: Runs of each method.
 
     Returns:
-        Scored runs of each arm, by a title of the images.
+        Scored runs of each method, by a title of the images.
     """
     groups: dict[str, dict[str, list[ScoredRun]]] = {}
-    for arm, runs in arms.items():
+    for method, runs in methods.items():
         for run in runs:
             for name, scores in run.photographs.items():
                 group = groups.setdefault(scores.images, {})
-                group.setdefault(arm, []).append(ScoredRun(run, name))
+                group.setdefault(method, []).append(ScoredRun(run, name))
     titled: dict[str, Scored] = {}
     for group in groups.values():
         title = _title_of(group)
@@ -382,43 +382,43 @@ def _title_of(group: Scored) -> str:
     return title
 
 
-def run_tables(arms: Methods, groups: Mapping[str, Scored]) -> list[Table]:
+def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
     """Make tables of the accuracy, the scores and the settings of runs.
 
     Args:
-        arms: Runs of each arm.
+        methods: Runs of each method.
         groups: Scored runs by a title of the images, as `group_by_images` groups them.
 
     Returns:
         Table of the accuracy, a table for each group, and a table of the
-        settings in which the arms differ, if there are any. They have a row per
-        run and, below several seeds of an arm, one with their mean ± standard
+        settings in which the methods differ, if there are any. They have a row per
+        run and, below several seeds of a method, one with their mean ± standard
         deviation.
     """
-    tables = [_accuracy_table(arms)]
+    tables = [_accuracy_table(methods)]
     tables += [score_table(title, group) for title, group in groups.items()]
-    heads = {arm: runs[0] for arm, runs in arms.items() if runs[0].seed is not None}
+    heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
     varied = varied_settings([*heads.values()])
     if varied:
         header = ["network", *varied.values()]
         rows = []
-        for arm, head in heads.items():
-            rows.append([arm, *(str(head.settings.get(key)) for key in varied)])
-        tables.append(Table("settings in which the arms differ", header, rows))
+        for method, head in heads.items():
+            rows.append([method, *(str(head.settings.get(key)) for key in varied)])
+        tables.append(Table("settings in which the methods differ", header, rows))
     return tables
 
 
-def _accuracy_table(arms: Methods) -> Table:
+def _accuracy_table(methods: Methods) -> Table:
     """Make the table of the accuracy on the test images."""
     lines: dict[str, list[Line]] = {}
     test_images = []
-    for arm, runs in arms.items():
+    for method, runs in methods.items():
         for run in runs:
             test_images.append(run.config.get("test_images", ""))
             if runs[0].accuracy is not None:
                 last = run.scores.get("test/accuracy_last")
                 line = (run.seed, [Estimate(run.accuracy), Estimate(last)])
-                lines.setdefault(arm, []).append(line)
+                lines.setdefault(method, []).append(line)
     # A dictionary keeps each name once, in order.
     names = dict.fromkeys(name for name in test_images if name)
     title = " or ".join(f"accuracy on {name}" for name in names)
@@ -430,17 +430,17 @@ def score_table(title: str, group: Scored) -> Table:
 
     Args:
         title: Title of the table.
-        group: Scored runs of each arm, as `group_by_images` groups them.
+        group: Scored runs of each method, as `group_by_images` groups them.
 
     Returns:
         Table with a row for each run and, with several labels, for each label.
     """
     lines: dict[str, list[Line]] = {}
-    for arm, scored_runs in group.items():
+    for method, scored_runs in group.items():
         for scored in scored_runs:
-            parts = {arm: scored.scores.metrics}
+            parts = {method: scored.scores.metrics}
             for label, metrics in scored.scores.by_label.items():
-                parts[f"{arm}, {label_title(label)}"] = metrics
+                parts[f"{method}, {label_title(label)}"] = metrics
             for name, metrics in parts.items():
                 line = (scored.run.seed, [metrics[metric] for metric in METRICS])
                 lines.setdefault(name, []).append(line)
@@ -463,14 +463,14 @@ def label_title(label: str) -> str:
     return f"label={label}"
 
 
-def seconds_table(arms: Methods) -> Table:
+def seconds_table(methods: Methods) -> Table:
     """Make a table of the seconds of an epoch.
 
     Args:
-        arms: Runs of each arm.
+        methods: Runs of each method.
 
     Returns:
-        Means over the epochs of the first run of each arm: of all phases, of
+        Means over the epochs of the first run of each method: of all phases, of
         each, of the classifier's part of the attack, and of the operators,
         which are computed once.
     """
@@ -478,12 +478,12 @@ def seconds_table(arms: Methods) -> Table:
     titles["attack_classifier"] = "attack: in the classifier"
     titles["operators"] = "operators, once"
     rows = []
-    for arm, (run, *_) in arms.items():
+    for method, (run, *_) in methods.items():
         means = {phase: _mean_seconds(run, phase) for phase in titles}
         if all(mean is None for mean in means.values()):
             continue
         total = sum(means[phase] or 0 for phase in PHASES)
-        rows.append([arm, *(f"{mean or 0:.2f}" for mean in (total, *means.values()))])
+        rows.append([method, *(f"{mean or 0:.2f}" for mean in (total, *means.values()))])
     return Table("seconds per epoch", ["network", "all", *titles.values()], rows)
 
 
@@ -499,15 +499,15 @@ Line = tuple[int | None, Sequence[Estimate | None]]
 
 
 def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
-    """Make a table with a row per run, and one with the mean of several seeds of an arm."""
+    """Make a table with a row per run, and one with the mean of several seeds of a method."""
     rows = []
-    for arm, runs in lines.items():
+    for method, runs in lines.items():
         for seed, metrics in runs:
             cells = map(format_interval, metrics)
-            rows.append([arm, "" if seed is None else str(seed), *cells])
+            rows.append([method, "" if seed is None else str(seed), *cells])
         if len({seed for seed, _ in runs}) > 1:
             columns = zip(*(metrics for _, metrics in runs), strict=True)
-            rows.append([arm, f"{len(runs)} seeds", *map(_spread, columns)])
+            rows.append([method, f"{len(runs)} seeds", *map(_spread, columns)])
     return Table(title, ["network", "seed", *header], rows)
 
 
@@ -588,7 +588,7 @@ def read_attack(folder: Path) -> AttackSummary:
     except Exception as error:
         # JSON of any depth and type raises errors of many kinds.
         problem = f"{path} is damaged or was written by no attack"
-        raise InputError(f"{problem} ({in_one_line(error)})") from error
+        raise InputError(f"{problem} ({single_line(error)})") from error
 
 
 def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
@@ -644,7 +644,7 @@ class Findings:
     """Runs and attacks that were found in folders.
 
     Attributes:
-        runs: Finished runs and scored networks, ordered by arm, so that the
+        runs: Finished runs and scored networks, ordered by method, so that the
             others are compared with `none`, or with a network that no run
             trained.
         attacks: Attacks.
@@ -683,8 +683,8 @@ def find(folders: Sequence[Path]) -> Findings:
         except (InputError, OSError) as error:
             # The lock in another user's folder raises OSError.
             found.unfinished.append(Unfinished(path, f"cannot be read: {error}", []))
-    arms = [*ARMS]
-    found.runs.sort(key=lambda run: arms.index(run.arm) if run.arm in arms else -1)
+    methods = [*MODES]
+    found.runs.sort(key=lambda run: methods.index(run.method) if run.method in methods else -1)
     return found
 
 

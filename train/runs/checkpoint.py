@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, cuda
 
 from renderer.errors import InputError, require_file
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from train.networks import VERSION
 from train.system.hashing import content_hash
 
@@ -28,7 +28,7 @@ HASH = "sha256"
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write a checkpoint with `write_whole`.
+    """Write a checkpoint with `atomic_write`.
 
     Args:
         path: Path of the file.
@@ -37,7 +37,7 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
     """
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
-    write_whole(path, content.getbuffer(), durable=True, previous=previous)
+    atomic_write(path, content.getbuffer(), durable=True, previous=previous)
 
 
 def load(path: Path) -> dict[str, Any]:

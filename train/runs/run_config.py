@@ -23,9 +23,10 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from renderer.errors import InputError, in_one_line
-from renderer.io.files import write_whole
+from renderer.errors import InputError, single_line
+from renderer.io.files import atomic_write
 from train.command import program
+from train.former_keys import rename_former_keys
 from train.runs.saved_networks import selected_file
 from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, mapped
 
@@ -55,7 +56,7 @@ def opened_text(path: Path) -> Iterator[str]:
             raise ValueError("there is no such file")
         yield path.read_text(encoding="utf-8")
     except Exception as error:
-        fault = f"{path} is damaged or of another kind ({in_one_line(error)})"
+        fault = f"{path} is damaged or of another kind ({single_line(error)})"
         raise InputError(f"{fault}: use another run") from error
 
 
@@ -99,7 +100,7 @@ def read_config(path: Path) -> DictConfig:
     The file may come from someone else. Aliases are refused, because a few
     nested aliases can stand for more values than the memory holds.
     Interpolations are refused, because they can show the environment variables
-    of the reader.
+    of the reader. Settings that had other names get their present names.
 
     Args:
         path: The file.
@@ -118,6 +119,7 @@ def read_config(path: Path) -> DictConfig:
         plain = yaml.safe_load(text)
         if not isinstance(plain, dict):
             raise ValueError("it holds no keys")
+        rename_former_keys(plain)
         return OmegaConf.create(plain)
 
 
@@ -141,7 +143,7 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     content |= {name: fact for name, fact in facts.items() if "${" not in str(fact)}
     content |= {"inputs": fingerprints(settings), "versions": versions}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    write_whole(folder / CONFIG, text.encode(), durable=True)
+    atomic_write(folder / CONFIG, text.encode(), durable=True)
 
 
 def _working_folder(folder: Path, command: str) -> str:

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from augment.service import AttackExamples
 from renderer.image import to_bytes
-from renderer.io.files import remove_unfinished, write_whole
+from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.io.tiles import draw_grid, tiles_of
 from renderer.rendering import light_sphere
@@ -99,7 +99,7 @@ class RunLog:
         self._metrics = folder / METRICS
         self._renders = folder / RENDERS
         self._epoch_count = len(history)
-        write_whole(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
+        atomic_write(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
         remove_unfinished(self._renders)
         self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
 

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
 from augment.classifiers.adapter import Normalized
-from renderer.errors import InputError, in_one_line
-from renderer.io.files import write_whole
+from renderer.errors import InputError, single_line
+from renderer.io.files import atomic_write
 from renderer.validation import as_path, require_kind
 from train.networks import PYTHON, WIDERESNET, build_network
 from train.runs.checkpoint import BEST, checked, load
@@ -120,7 +120,7 @@ def of_one_architecture(path: Path) -> Iterator[None]:
     try:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
-        reason = textwrap.shorten(in_one_line(error), LONGEST_REASON)
+        reason = textwrap.shorten(single_line(error), LONGEST_REASON)
         problem = f"checkpoint {path} is from another architecture ({reason})"
         raise InputError(f"{problem}: use the model settings of its training") from error
 
@@ -189,7 +189,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
     weights = {}
     for name, value in state["model"].items():
         weights[name] = value.half().contiguous() if value.is_floating_point() else value
-    write_whole(path, safetensors.torch.save(weights, metadata), durable=True)
+    atomic_write(path, safetensors.torch.save(weights, metadata), durable=True)
 
 
 def _load_published(path: Path) -> dict[str, Any]:
@@ -217,7 +217,7 @@ def export(path: Path, network: nn.Module) -> None:
     state = without_normalization(network).state_dict()
     content = io.BytesIO()
     torch.save({name: value.cpu() for name, value in state.items()}, content)
-    write_whole(path, content.getbuffer(), durable=True)
+    atomic_write(path, content.getbuffer(), durable=True)
 
 
 def without_normalization(network: nn.Module) -> nn.Module:

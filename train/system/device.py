@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.progress import announced
+from augment.progress import progress_message
 from augment.settings import RendererSettings
 from renderer.errors import InputError, as_device, require_choice
 from renderer.visibility.rasterizers import Rasterizer, choose
@@ -246,5 +246,5 @@ def choose_rasterizer(settings: RendererSettings) -> Rasterizer:
         InputError: If it does not start on this machine. The sentence begins with the
             field `rasterizer`.
     """
-    with keyed("rasterizer"), announced("starting the rasterizer"):
+    with keyed("rasterizer"), progress_message("starting the rasterizer"):
         return choose(settings.rasterizer)

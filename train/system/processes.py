@@ -40,7 +40,7 @@ def process_group() -> Iterator[None]:
 
 
 @contextmanager
-def first_process_first() -> Iterator[None]:
+def main_process_first() -> Iterator[None]:
     """Let the first process run the block before the others, which then find a download done."""
     if distributed.rank() > 0:
         dist.barrier()
@@ -64,7 +64,7 @@ def broadcast(value: str) -> str:
     return values[0]
 
 
-def summed(values: Tensor) -> Tensor:
+def all_reduce_sum(values: Tensor) -> Tensor:
     """Add up values over all processes, in place.
 
     Args:
@@ -78,7 +78,7 @@ def summed(values: Tensor) -> Tensor:
     return values
 
 
-def replicated(model: nn.Module) -> nn.Module:
+def wrap_ddp(model: nn.Module) -> nn.Module:
     """Wrap a model so that its gradients are averaged over all processes.
 
     Batch normalization takes its statistics over the whole batch on GPUs, and over each process's
@@ -111,7 +111,7 @@ class Interrupted(SystemExit):
         self.signal = signal.Signals(number).name
 
 
-class Interruption:
+class SignalHandler:
     """Notes the first of `SIGNALS` while its block runs.
 
     A second signal acts as it would without the block. So does the first one if nobody asks for
@@ -127,7 +127,7 @@ class Interruption:
         # Handlers of the signals before the block.
         self._handlers: dict[int, Any] = {}
 
-    def __enter__(self) -> "Interruption":
+    def __enter__(self) -> "SignalHandler":
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 if signal.getsignal(number) != signal.SIG_IGN:

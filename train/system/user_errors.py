@@ -69,7 +69,7 @@ def keys_of(key: str, settings: Settings) -> dict[str, str]:
     return {name: f"{key}.{name}" for name in vars(settings)}
 
 
-def one_sentence(error: BaseException) -> str | None:
+def user_message(error: BaseException) -> str | None:
     """Say what the user can do about an error.
 
     Args:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.attacks.norm_ball import project, sample, take_step
 from augment.losses import label_loss
-from augment.model_passes import as_found
+from augment.model_passes import frozen_eval_mode
 from augment.parameter_settings import StepSettings
 from augment.random_streams import generator, stream_seed
 from renderer.image import to_bytes, to_unit
@@ -108,7 +108,7 @@ def pgd(
     clean = to_unit(images)
     possible = partial(nearest_in_box, low=0, high=1)
     adversarial = project(PGD, sample(PGD, clean, draws), clean, possible)
-    with as_found(model):
+    with frozen_eval_mode(model):
         for _ in range(PGD_STEPS):
             adversarial.requires_grad_(True)
             cost = -label_loss(model(adversarial), labels, absent=absent).sum()

@@ -7,7 +7,7 @@ from train.data.cache import TensorCache, cache_folder
 from train.data.rendered_shapes import load_shapes
 from train.data.sets import DataSet, load_cifar100, load_folder, load_npz, load_unlabeled
 from train.settings import MIN_SIZE, ExperimentSettings
-from train.system.processes import first_process_first
+from train.system.processes import main_process_first
 from train.system.user_errors import keyed, keys_of
 from train.training.initial import Initial
 
@@ -36,7 +36,7 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
     console.info("data: %s", name)
-    with first_process_first(), keyed(**keys_of("data", settings.data)):
+    with main_process_first(), keyed(**keys_of("data", settings.data)):
         data = _load(name, settings, initial)
     with keyed("data.path"):
         require_range("image size", data.size, MIN_SIZE, MAX_SIZE)

@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 from augment import distributed
 from augment.model_passes import eval_mode
-from augment.progress import announced, progress
+from augment.progress import progress, progress_message
 from augment.random_streams import stream_seed
 from augment.service import AugmentationService, Renders
-from renderer.errors import InputError, in_one_line
+from renderer.errors import InputError, single_line
 from renderer.image import to_bytes, to_unit
 from train import console
 from train.data.batches import Round, TrainingImages, rounds_of_epoch, training_batches
@@ -33,7 +33,7 @@ from train.runs.epoch_metrics import epoch_metrics, format_epoch
 from train.runs.run_log import PHASES, RunLog
 from train.settings import TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
-from train.system.processes import Interruption, replicated, summed
+from train.system.processes import SignalHandler, all_reduce_sum, wrap_ddp
 from train.system.user_errors import keyed
 from train.training.averages import Averages
 from train.training.baselines import Baseline
@@ -77,7 +77,7 @@ class EpochState:
             "images": to_bytes(self.renders.images),
             "labels": self.renders.labels,
             "diagnostics": [dict(diagnostics) for diagnostics in self.diagnostics],
-            "sums": summed(self.sums.clone()),
+            "sums": all_reduce_sum(self.sums.clone()),
             "step": self.step,
         }
 
@@ -139,9 +139,9 @@ class Trainer:
         labeled: bool = True,
     ):
         _require_equal_shares(settings)
-        if settings.ranking and not service.studied:
+        if settings.ranking_weight and not service.positive_classes:
             needed = "name some in the scene, or give a folder of images of other things"
-            raise InputError(f"ranking ranks hard negatives: {needed}", "ranking")
+            raise InputError(f"ranking ranks hard negatives: {needed}", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service
@@ -180,20 +180,20 @@ class Trainer:
     def _build_step(self, labeled: bool) -> None:
         """Build what a step needs: the optimizer, the loss and the augmentation."""
         settings = self.settings
-        studied = self.service.studied
+        positive_classes = self.service.positive_classes
         # This may replace layers, so the optimizer comes after it.
-        replica = replicated(self.model)
-        with announced("loading the optimizer"):  # torch imports its compiler here: seconds.
+        replica = wrap_ddp(self.model)
+        with progress_message("loading the optimizer"):  # torch imports its compiler here: seconds.
             self.optimizer = build_optimizer(self.model, settings)
         is_scaled = self.model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
-        teacher = self.initial if settings.distillation else None
-        self._loss = TrainingLoss(replica, settings, studied, teacher, labeled).compute
+        teacher = self.initial if settings.distillation_weight else None
+        self._loss = TrainingLoss(replica, settings, positive_classes, teacher, labeled).compute
         self._baseline = Baseline(
             settings.augmentation,
             self.model,
             self.seed,
-            studied[1:],
+            positive_classes[1:],
         )
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
@@ -227,23 +227,23 @@ class Trainer:
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
-        with Interruption() as interruption:
+        with SignalHandler() as signals:
             while self.epoch < self.settings.epochs:
-                if self._train_epoch(split, train, interruption, log):
+                if self._train_epoch(split, train, signals, log):
                     self._end_epoch(split, validation, log)
-                is_stopping = interruption.requested()
+                is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
                 if is_stopping or is_last or (is_due and self._under_way is None):
                     self._save()
                 if is_stopping:
-                    interruption.stop()
+                    signals.stop()
 
     def _train_epoch(
         self,
         split: Split,
         rows: Tensor,
-        interruption: Interruption,
+        signals: SignalHandler,
         log: RunLog | None,
     ) -> bool:
         """Take the epoch's remaining steps; return whether all were taken before a signal came."""
@@ -258,7 +258,7 @@ class Trainer:
                 number = self.epoch * plan.total + state.step
                 state.sums += self._step(*batch, state.step / plan.total, number)
                 state.step += 1
-                if interruption.requested():
+                if signals.requested():
                     return state.step == plan.total
                 if state.step < plan.total and self._saving_is_due():
                     self._save()
@@ -273,7 +273,7 @@ class Trainer:
             self.seed,
             self.epoch,
             settings.images_per_epoch,
-            self.service.settings.every,
+            self.service.settings.regenerate_every,
         )
         steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
         return EpochPlan(split, rows, rounds, steps)
@@ -351,14 +351,14 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         sums = torch.zeros(2, device=self.device)
         parts = zip(
-            images.chunk(settings.accumulate),
-            labels.chunk(settings.accumulate),
-            rendered.chunk(settings.accumulate),
+            images.chunk(settings.accumulation_steps),
+            labels.chunk(settings.accumulation_steps),
+            rendered.chunk(settings.accumulation_steps),
             strict=True,
         )
         for part in parts:
             loss, hits = self._loss(*part)
-            self.scaler.scale(loss / settings.accumulate).backward()
+            self.scaler.scale(loss / settings.accumulation_steps).backward()
             count = len(part[0])
             sums += torch.stack([loss.detach() * count, hits])
         if settings.clip_gradient:
@@ -373,7 +373,7 @@ class Trainer:
         """Validate on some rows of a split, remember the best network, and log the metrics."""
         state = cast(EpochState, self._under_way)
         self._under_way = None
-        loss_sum, hits = summed(state.sums).tolist()
+        loss_sum, hits = all_reduce_sum(state.sums).tolist()
         self.averages.end_epoch()
         with self.phases("evaluation"):
             validated = evaluate(self._validated, split, rows)
@@ -448,7 +448,7 @@ class Trainer:
             "architecture": self.architecture,
             "epoch": self.epoch,
             "seed": self.seed,
-            "arm": self.service.settings.arm,
+            "mode": self.service.settings.mode,
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -509,7 +509,7 @@ class Trainer:
             self._require_own_architecture(state)
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            reason = in_one_line(error)
+            reason = single_line(error)
             fault = f"the checkpoint in {self.folder} is not one that this run can go on from"
             remedy = f"restore {checkpoint.LAST}, or start in another folder"
             raise InputError(f"{fault} ({reason}): {remedy}") from error
@@ -535,7 +535,7 @@ class Trainer:
             best = checkpoint.load(path)
             self._require_own_architecture(best)
             own = self._description()
-            if (best["seed"], best["arm"]) != (own["seed"], own["arm"]):
+            if (best["seed"], best.get("mode", best.get("arm"))) != (own["seed"], own["mode"]):
                 raise ValueError("it is of another run")
             # The file may be newer than the checkpoint. A later network is then found again.
             if best["epoch"] <= len(self.history):
@@ -543,7 +543,7 @@ class Trainer:
                 if line["validation/accuracy"] != best["validation_accuracy"]:
                     raise ValueError("its accuracy is not the one that this run had")
         except (LookupError, TypeError, ValueError) as error:
-            fault = f"{path} is not the network that this run kept ({in_one_line(error)})"
+            fault = f"{path} is not the network that this run kept ({single_line(error)})"
             remedy = f"restore {checkpoint.BEST}, or start in another folder"
             raise InputError(f"{fault}: {remedy}") from error
 
@@ -556,8 +556,8 @@ class Trainer:
 def _require_equal_shares(settings: TrainSettings) -> None:
     """Raise InputError if a batch cannot be divided equally among processes and parts."""
     processes = distributed.world_size()
-    if settings.batch_size % (processes * settings.accumulate):
-        divisor = f"{processes} processes × accumulate={settings.accumulate}"
+    if settings.batch_size % (processes * settings.accumulation_steps):
+        divisor = f"{processes} processes × accumulation_steps={settings.accumulation_steps}"
         message = f"batch_size={settings.batch_size} is no multiple of {divisor}"
         raise InputError(message, "batch_size")
 
@@ -589,5 +589,5 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
             labels = split.labels[batch]
             loss_sum += F.cross_entropy(logits, labels, reduction="sum")
             hits += (logits.argmax(1) == labels).sum()
-    loss_sum, hits = summed(totals).tolist()
+    loss_sum, hits = all_reduce_sum(totals).tolist()
     return {"loss": loss_sum / len(rows), "accuracy": hits / len(rows)}

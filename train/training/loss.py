@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from augment.losses import divergence, is_right, label_loss, ranking_loss
+from augment.losses import is_correct, kl_divergence, label_loss, ranking_loss
 from renderer.image import to_unit
 from train.settings import TrainSettings
 
@@ -19,7 +19,7 @@ class TrainingLoss:
     Args:
         model: The network, from images in [0, 1] to logits.
         settings: The settings, with the weights of the terms.
-        studied: Indices of the positive classes, which the ranking
+        positive_classes: Indices of the positive classes, which the ranking
             loss ranks against the others. Empty without a ranking loss.
         teacher: The network whose predictions are kept; None without distillation.
         labeled: Whether the labels of the data are known. Otherwise only renders have a label
@@ -30,13 +30,13 @@ class TrainingLoss:
         self,
         model: nn.Module,
         settings: TrainSettings,
-        studied: Sequence[int],
+        positive_classes: Sequence[int],
         teacher: nn.Module | None,
         labeled: bool = True,
     ):
         self._model = model
         self._settings = settings
-        self._studied = studied
+        self._positive_classes = positive_classes
         self._teacher = teacher
         self._labeled = labeled
 
@@ -61,18 +61,18 @@ class TrainingLoss:
                 labels = torch.where(rendered, labels, targets.argmax(1))
 
         # The first class is the one that a complementary label leaves out.
-        others = self._studied[1:]
+        others = self._positive_classes[1:]
         losses = label_loss(logits, labels, settings.label_smoothing, others)
         if not self._labeled:
             losses = losses * rendered
         loss = losses.mean()
         if targets is not None:
             changes = self._changes(logits, targets, rendered)
-            loss = loss + settings.distillation * changes.mean()
-        if self._studied and settings.ranking:
-            ranked = sum(ranking_loss(logits, labels, label) for label in self._studied)
-            loss = loss + settings.ranking * ranked / len(self._studied)
-        hits = is_right(logits.detach().argmax(1), labels, others).sum()
+            loss = loss + settings.distillation_weight * changes.mean()
+        if self._positive_classes and settings.ranking_weight:
+            ranked = sum(ranking_loss(logits, labels, label) for label in self._positive_classes)
+            loss = loss + settings.ranking_weight * ranked / len(self._positive_classes)
+        hits = is_correct(logits.detach().argmax(1), labels, others).sum()
         return loss, hits
 
     def _changes(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
@@ -81,9 +81,9 @@ class TrainingLoss:
         On renders, the classes under study may change, and only the others are compared. Without
         classes under study, renders have no divergence.
         """
-        changes = divergence(logits, targets) * ~rendered
-        if self._studied:
+        changes = kl_divergence(logits, targets) * ~rendered
+        if self._positive_classes:
             classes = torch.arange(logits.shape[1], device=logits.device)
-            is_kept = torch.stack([classes != label for label in self._studied]).all(0)
-            changes = changes + divergence(logits[:, is_kept], targets[:, is_kept]) * rendered
+            is_kept = torch.stack([classes != label for label in self._positive_classes]).all(0)
+            changes = changes + kl_divergence(logits[:, is_kept], targets[:, is_kept]) * rendered
         return changes

@@ -18,7 +18,7 @@ from train.data.photographs import find_photographs, load_photographs
 from train.data.sets import DataSet
 from train.settings import OTHER, ExperimentSettings, label_names
 from train.system.device import choose_rasterizer
-from train.system.processes import first_process_first
+from train.system.processes import main_process_first
 from train.system.user_errors import keyed, keys_of
 
 
@@ -47,11 +47,11 @@ def build_service(
     phases = Phases(device)
     names = label_names(settings.label)
     is_ranked = bool(settings.scene.hard_negatives) or len(names) > 1
-    studied: list[int] = []
+    positive_classes: list[int] = []
     if is_ranked or settings.augment.renders:
-        studied = [class_index(data.classes, name, "label") for name in names]
+        positive_classes = [class_index(data.classes, name, "label") for name in names]
 
-    if settings.augment.renders and settings.augment.arm == "folder":
+    if settings.augment.renders and settings.augment.mode == "folder":
         images, labels = load_renders(settings, data)
         images = images.to(device)
         labels = labels.to(device)
@@ -59,12 +59,12 @@ def build_service(
     elif settings.augment.renders:
         numbers = _class_numbers(settings, data)
         # Objects without a class have a complementary label: they belong to none
-        # of the studied classes.
-        numbers[OTHER] = complementary_label(studied[0])
+        # of the positive_classes classes.
+        numbers[OTHER] = complementary_label(positive_classes[0])
         scene = _build_scene(settings, data.size, device, phases)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
 
-    if len(studied) == len(data.classes) and (labels < 0).any():
+    if len(positive_classes) == len(data.classes) and (labels < 0).any():
         problem = f"label={settings.label} leaves no class of the network for other things"
         raise InputError(f"{problem}: leave these out")
     return AugmentationService(
@@ -73,7 +73,7 @@ def build_service(
         labels,
         settings.seed,
         phases,
-        studied if is_ranked else (),
+        positive_classes if is_ranked else (),
         distributed.rank(),
         distributed.world_size(),
         images,
@@ -90,7 +90,11 @@ def _build_scene(
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.info("rasterizer: %s", rasterizer.description)
-    with phases("operators"), first_process_first(), keyed("scene", **keys_of("scene", settings.scene)):
+    with (
+        phases("operators"),
+        main_process_first(),
+        keyed("scene", **keys_of("scene", settings.scene)),
+    ):
         return build_scene(
             list(settings.objects.values()),
             size,
@@ -127,13 +131,13 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, T
         InputError: The folder cannot be read, or it has no image of a class under study.
     """
     folder = Path(str(settings.augment.folder))
-    studied = label_names(settings.label)
+    positive_classes = label_names(settings.label)
     numbers = {name: index for index, name in enumerate(data.classes)}
-    other = complementary_label(numbers[studied[0]])
+    other = complementary_label(numbers[positive_classes[0]])
     with keyed("augment.folder"):
-        found = find_photographs(folder, data.classes, studied)
+        found = find_photographs(folder, data.classes, positive_classes)
         found, images, _ = load_photographs(folder, found, data.size, advice="")
-        missing = set(studied) - {item.label for item in found}
+        missing = set(positive_classes) - {item.label for item in found}
         if missing:
             problem = f"{folder} holds no image of label={min(missing)}"
             raise InputError(f"{problem}: add a folder of them")

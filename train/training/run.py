@@ -344,8 +344,8 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
 def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
     """Return the data in the classes that the run's network has."""
     if not data.labeled:
-        if not (initial and settings.train.distillation):
-            missing = "set train.init_from and train.distillation"
+        if not (initial and settings.train.distillation_weight):
+            missing = "set train.init_from and train.distillation_weight"
             problem = f"data.name={settings.data.name}: a network keeps its answers on it"
             raise InputError(f"{problem}: {missing}")
         return replace(data, classes=initial.classes)

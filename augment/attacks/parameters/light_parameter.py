@@ -52,9 +52,9 @@ class LightParameter(Parameter):
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace_light(conditions, self._rows, values.unflatten(1, (-1, 3)))
 
-    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
         if not self._nonnegative:
-            return super().domain(values, within)
+            return super().project_feasible(values, within)
         coefficients = values.unflatten(1, (-1, 3))
         ball = None if within is None else within.unflatten(-1, 3)
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)

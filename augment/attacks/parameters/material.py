@@ -19,17 +19,17 @@ from renderer.light.ball import Ball, nearest_in_box
 from renderer.settings import MIN_ROUGHNESS
 
 # Positions among the four attack values of an example (`MATERIAL`): roughness,
-# metallic and strength together, and the hue.
+# metallic and specular factor together, and the hue.
 GLOSS = slice(0, 3)
 HUE = slice(3, 4)
 
-# `Material` keeps average roughness, metallic and strength this far from 0 and
+# `Material` keeps average roughness, metallic and specular factor this far from 0 and
 # 1, because the renderer clamps there, which makes the gradient zero.
 ROUNDING = 1e-6
 
 
 class Material(Parameter):
-    """Roughness, metallic and strength of an object, averaged over its faces, and its hue.
+    """Roughness, metallic and specular factor of an object, averaged over its faces, and its hue.
 
     The four values of an example are divided by the units of
     `MaterialSettings`. An attack changes all faces of the object by the same
@@ -37,7 +37,7 @@ class Material(Parameter):
     and the roughness does not fall below the lowest value that the renderer
     shows.
 
-    A matte object starts with the material `VARNISH`. Otherwise its strength
+    A matte object starts with the material `SPECULAR_LAYER`. Otherwise its strength
     would be zero, and so would the gradient with respect to its roughness. A
     descent that lowers the strength would stay there.
 
@@ -53,7 +53,7 @@ class Material(Parameter):
         self._object_of = scene.object_of
         self._face_count = max(len(item.mesh.faces) for item in scene.objects)
 
-        gloss_units = [settings.roughness, settings.metallic, settings.strength]
+        gloss_units = [settings.roughness, settings.metallic, settings.specular_factor]
         units = torch.tensor([*gloss_units, settings.hue]).to(scene.lights)
         attacked_mask = units > 0
         self._changes_gloss = bool(attacked_mask[GLOSS].any())
@@ -98,7 +98,7 @@ class Material(Parameter):
         """Return a copy of the conditions with the given gloss and hue of the objects.
 
         Args:
-            values: Average roughness, metallic and strength, and rotation of
+            values: Average roughness, metallic and specular factor, and rotation of
                 the hue, divided by the units of the settings, shape (A, 4).
             conditions: Conditions of the A examples.
             examples: Indices of the examples in the scene, shape (A,).
@@ -127,7 +127,7 @@ class Material(Parameter):
 
         Args:
             conditions: Conditions of the A examples.
-            average_gloss: Average roughness, metallic and strength,
+            average_gloss: Average roughness, metallic and specular factor,
                 shape (A, 3).
             objects: Index of the object of each example, shape (A,).
         """
@@ -152,7 +152,7 @@ class Material(Parameter):
             albedo_offset = angle.new_zeros(len(angle), self._face_count, 3)
         return replace(conditions, hue=hue, albedo=albedo_offset)
 
-    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
         return nearest_in_box(values, self._lowest_values, self._highest_values, within)
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from augment.attacks.norm_ball import anywhere, project, sample, take_step
+from augment.attacks.norm_ball import project, sample, take_step, unconstrained
 from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
@@ -59,7 +59,7 @@ class Parameter(ABC):
             values.
         """
 
-    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
         """Find the nearest feasible values. By default, all values are feasible.
 
         Args:
@@ -70,7 +70,7 @@ class Parameter(ABC):
         Returns:
             Feasible values, shape (A, D), nearest in the Euclidean sense.
         """
-        return anywhere(values, within)
+        return unconstrained(values, within)
 
     def take_step(
         self,
@@ -92,7 +92,7 @@ class Parameter(ABC):
             Values after the step, shape (A, D).
         """
         center = self.start[examples]
-        return take_step(self.settings, values, gradient, center, self.domain, length)
+        return take_step(self.settings, values, gradient, center, self.project_feasible, length)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls around the start.
@@ -104,7 +104,7 @@ class Parameter(ABC):
         Returns:
             Projected values, shape (A, D).
         """
-        return project(self.settings, values, self.start[examples], self.domain)
+        return project(self.settings, values, self.start[examples], self.project_feasible)
 
     def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
         """Draw random feasible values for all examples.
@@ -128,7 +128,7 @@ class Parameter(ABC):
         if self.settings.radius is None and reached is not None:
             return self._sample_as_far_as(reached, generator)
         drawn = sample(self.settings, self.start, generator, self.used_mask)
-        return project(self.settings, drawn, self.start, self.domain)
+        return project(self.settings, drawn, self.start, self.project_feasible)
 
     def _sample_as_far_as(self, reached: Tensor, generator: torch.Generator) -> Tensor:
         """Draw values in random directions, as far from the start as `reached`, shape (E, D)."""
@@ -137,4 +137,4 @@ class Parameter(ABC):
             direction = direction * self.used_mask
         distance = (reached - self.start).norm(dim=1, keepdim=True)
         offset = direction * distance / direction.norm(dim=1, keepdim=True)
-        return self.domain(self.start + offset)
+        return self.project_feasible(self.start + offset)

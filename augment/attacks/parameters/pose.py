@@ -135,7 +135,7 @@ class Pose(Parameter):
             vertices = torch.stack(moved_vertices)
         return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
 
-    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
         return nearest_in_box(values, -self._limit, self._limit, within)
 
 

@@ -32,7 +32,9 @@ class Positions(Parameter):
         light = scene.basis.movable_light
         if light is None:
             kinds = " or ".join(name for name, kind in LOCAL_LIGHTS.items() if kind.is_movable)
-            raise InputError(f"{self.name}: the scene has no {kinds}: build it with {kinds}=...", self.name)
+            raise InputError(
+                f"{self.name}: the scene has no {kinds}: build it with {kinds}=...", self.name
+            )
         # Shape (L, 3) for L lamps. All examples start at the same positions.
         positions = light.basis.source_positions().to(scene.lights)
         super().__init__(settings, start=positions.flatten().expand(len(scene), -1))

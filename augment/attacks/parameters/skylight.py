@@ -85,10 +85,14 @@ class Skylight(Parameter):
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
 
-    def domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def project_feasible(self, values: Tensor, within: Ball | None = None) -> Tensor:
         # The sky model is defined for these ranges, and for any azimuth.
         lowest_zenith, highest_zenith = ZENITH
         lowest_turbidity, highest_turbidity = TURBIDITY
-        low = values.new_tensor([lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT])
-        high = values.new_tensor([highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT])
+        low = values.new_tensor(
+            [lowest_zenith / self._sun, -math.inf, lowest_turbidity / TURBIDITY_UNIT]
+        )
+        high = values.new_tensor(
+            [highest_zenith / self._sun, math.inf, highest_turbidity / TURBIDITY_UNIT]
+        )
         return nearest_in_box(values, low, high, within)

@@ -54,7 +54,9 @@ class Rasterizer:
     name: str
     description: str
 
-    def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
+    def rasterize(
+        self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False
+    ) -> np.ndarray:
         """Find the nearest face at each sample of N images.
 
         The module docstring of `renderer.visibility.rasterizers` describes the arguments in

@@ -24,7 +24,9 @@ except ImportError as error:  # numba also raises this for a version of NumPy th
 
 VERSION = numba.__version__
 # Types of the arguments of `_draw`.
-TYPES = "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
+TYPES = (
+    "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
+)
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
@@ -75,7 +77,9 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 
 
 @_njit
-def _covered_range(coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int) -> tuple[int, int]:
+def _covered_range(
+    coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int
+) -> tuple[int, int]:
     """Find the rows, or the columns, that a triangle can cover: the first one, and the end."""
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
@@ -106,7 +110,9 @@ def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> in
 
 
 @_compiled
-def _draw(positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids: Any, nearest: Any) -> None:
+def _draw(
+    positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids: Any, nearest: Any
+) -> None:
     """Draw the faces of one view in place.
 
     Faces are drawn in ascending order, so that the lower index stays if depths
@@ -152,7 +158,11 @@ def _draw(positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids:
             row_depth = depths[a] + (row - first_row) * slope_y
             # A row crosses the longest edge and one of the two other edges.
             one = _crossing(ax, ay, cx, cy, row_y, bits)
-            other = _crossing(ax, ay, bx, by, row_y, bits) if row_y < by else _crossing(bx, by, cx, cy, row_y, bits)
+            other = (
+                _crossing(ax, ay, bx, by, row_y, bits)
+                if row_y < by
+                else _crossing(bx, by, cx, cy, row_y, bits)
+            )
             for column in range(max(min(one, other), 0), min(max(one, other), resolution)):
                 sample = np.uint64(row), np.uint64(column)
                 depth = np.rint(row_depth + slope_x * (column - first_column))

@@ -114,7 +114,9 @@ def _context() -> Iterator[moderngl.Context]:
         _check(context)
         yield context
     except moderngl.Error as error:
-        raise InputError(f"the OpenGL driver failed ({error}): choose the rasterizer numpy") from error
+        raise InputError(
+            f"the OpenGL driver failed ({error}): choose the rasterizer numpy"
+        ) from error
     finally:
         context.release()
 
@@ -138,7 +140,9 @@ def _check(context: moderngl.Context) -> None:
     ids = _draw(context, points, faces, resolution=4, closed=True)
     if ids[0].tolist() != expected:
         name = context.info["GL_RENDERER"]
-        raise InputError(f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy")
+        raise InputError(
+            f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy"
+        )
 
 
 def _draw(

@@ -14,7 +14,7 @@ import augment
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
 from augment.parameter_settings import PARAMETER_NAMES
 from augment.scene.conditions import Example
-from augment.scene.objects import SceneObject, on_ground, with_props
+from augment.scene.objects import SceneObject, add_table, with_props
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh, normalize
@@ -29,10 +29,18 @@ SOFTWARE = choose("numpy")
 
 
 def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
-    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
+    classifier = augment.Classifier(
+        lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES
+    )
     radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
-    steps = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds & set(radii)}
-    steps |= {name: augment.MaterialSettings("linf", 1.0, "sign", 0.5, hue=40.0) for name in kinds & {"material"}}
+    steps = {
+        name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name])
+        for name in kinds & set(radii)
+    }
+    steps |= {
+        name: augment.MaterialSettings("linf", 1.0, "sign", 0.5, hue=40.0)
+        for name in kinds & {"material"}
+    }
     settings = augment.AttackSettings(**steps, allow_negative=True, max_steps=3)
     return augment.attack(classifier, scene, settings=settings, force=True)
 
@@ -51,7 +59,9 @@ def textured() -> Mesh:
 
 
 def adversary_of(done: augment.AttackResult) -> Adversary:
-    return Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
+    return Adversary.of(
+        done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,7 +82,9 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     done = attacked(kinds, scene)
     write_adversary(adversary_of(done), tmp_path)
     found = reload(tmp_path)
-    assert torch.equal(found.images, done.images[0]) and torch.equal(found.images_before, done.images_before[0])
+    assert torch.equal(found.images, done.images[0]) and torch.equal(
+        found.images_before, done.images_before[0]
+    )
     assert (done.images - done.images_before).abs().max() > 0.02
     limit = 1 / 255 if kinds & PAINTED else 1e-5
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
@@ -84,22 +96,36 @@ def test_an_adversary_with_gloss_is_read_back_to_the_same_images_within_a_255th(
     mesh = Gloss(0.4, metallic=0.3).on(normalize(textured()))
     size = (1, 1, 2) if kind in PAINTED else (4, 4, 2)
     texels = np.random.default_rng(1).integers(150, 255, size, dtype=np.uint8)
-    item = on_ground(SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2))
-    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6)
+    item = add_table(
+        SceneObject("orange", replace(mesh, gloss_textures=(texels,))), (0.4, 0.3, 0.2)
+    )
+    scene = augment.build_scene(
+        [("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6
+    )
     scene = scene.changed(objects=[item])
     done = attacked({kind}, scene)
     write_adversary(adversary_of(done), tmp_path)
     limit = 1 / 255 if kind in PAINTED else 1e-5
-    torch.testing.assert_close(reload(tmp_path).render(SOFTWARE), done.images[0], rtol=0, atol=limit)
-    matte = adversary_of(attacked({kind}, scene.changed(objects=[replace(item, mesh=replace(item.mesh, gloss=None))])))
+    torch.testing.assert_close(
+        reload(tmp_path).render(SOFTWARE), done.images[0], rtol=0, atol=limit
+    )
+    matte = adversary_of(
+        attacked(
+            {kind}, scene.changed(objects=[replace(item, mesh=replace(item.mesh, gloss=None))])
+        )
+    )
     assert (matte.images - done.images[0]).abs().max() > 0.02
 
 
 def test_props_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
     """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
-    item = on_ground(with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2))
-    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6)
+    item = add_table(
+        with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2)
+    )
+    scene = augment.build_scene(
+        [("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0, degree=6
+    )
     scene = scene.changed(objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]
     assert painted[item.own_faces].any() and not painted[~item.own_faces].any()
@@ -126,11 +152,16 @@ def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:
 def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
     scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy", fov=fov)
-    backgrounds = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
+    backgrounds = (
+        torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
+    )
     ((camera,),) = scene.cameras
     row = Example(0, (replace(camera, right=0.3, up=-0.2, width=3.0),), 1, exposure=1.7)
     objects = [replace(each, albedo_scale=0.6) for each in scene.objects]
-    done = attacked({"albedo", "lighting"}, scene.changed(examples=[row], objects=objects, backgrounds=backgrounds))
+    done = attacked(
+        {"albedo", "lighting"},
+        scene.changed(examples=[row], objects=objects, backgrounds=backgrounds),
+    )
     write_adversary(adversary_of(done), tmp_path)
     found = reload(tmp_path)
     assert torch.equal(found.background, backgrounds[1]) and found.cameras == row.cameras
@@ -158,7 +189,7 @@ def pipe(folder: Path) -> None:
     os.mkfifo(folder / "after.npy")
 
 
-def announced(folder: Path) -> None:
+def progress_message(folder: Path) -> None:
     """10 TB by its header, which is all of the file."""
     with open(folder / "after.npy", "wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
@@ -166,20 +197,32 @@ def announced(folder: Path) -> None:
 
 
 DAMAGES = {
-    "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
-    "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
+    "no description": (
+        lambda folder: (folder / DESCRIPTION).unlink(),
+        "does not exist: give a folder that an attack",
+    ),
+    "no JSON": (
+        lambda folder: (folder / DESCRIPTION).write_text("{"),
+        "does not describe an adversary",
+    ),
     "another size": (described(image={"size": 9}), "has shape"),
     "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "width": 0}]), "width=0"),
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
     "no mesh": (lambda folder: (folder / "mesh.glb").unlink(), "mesh.glb does not exist"),
-    "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),
+    "a list for a background": (
+        described(background=[1]),
+        r"adversary\.json: background=\[1\]: give gray values",
+    ),
     "a camera within the mesh": (
         described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0.5}]),
         r"adversary\.json: the mesh reaches the camera at distance 0\.5",
     ),
     "a pipe for images": (pipe, "after.npy is not a regular file"),
-    "images of 10 TB": (announced, "after.npy cannot be read"),
-    "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
+    "images of 10 TB": (progress_message, "after.npy cannot be read"),
+    "images of 1e300": (
+        lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)),
+        "cannot be read",
+    ),
 }
 
 

@@ -25,8 +25,12 @@ CLASSES = ("orange", "lime", "sky", "night")
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.5, 100.0])
-def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_color, tmp_path, margin):
-    result = attacked("lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=4, margin=margin)
+def test_each_example_has_a_line_and_a_last_one_holds_the_checks(
+    attacked, by_color, tmp_path, margin
+):
+    result = attacked(
+        "lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=4, margin=margin
+    )
     checks = augment.check(result)
     augment.save(result, tmp_path, checks)
     *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
@@ -40,7 +44,11 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_co
             assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
             assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
         lead = result.logits[example, 0, 1] - result.logits[example, 0, [0, 2, 3]].max()
-        assert line["success_with_margin"] is bool(lead >= margin) is result.success_with_margin[example].item()
+        assert (
+            line["success_with_margin"]
+            is bool(lead >= margin)
+            is result.success_with_margin[example].item()
+        )
         assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
         change = (result.descent.values[example] - result.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
@@ -63,7 +71,9 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_co
 
 
 @pytest.mark.parametrize(("light", "positive"), [("st_peters", True), ("grace", False)])
-def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positive(attacked, tmp_path, light, positive):
+def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positive(
+    attacked, tmp_path, light, positive
+):
     """`st_peters` is positive all round and stays so within a small ball; `grace` is negative in places."""
     steps = {"lighting": augment.StepSettings(radius=0.001)}
     result = attacked(steps, {"light": light, "exposure": 2.0}, force=True, max_steps=2)
@@ -71,10 +81,16 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positiv
     folder, values = tmp_path / "example_000", result.descent.values[0].unflatten(0, (49, 3))
     assert torch.equal(load_light(str(folder / "light.json")), values)
     assert torch.equal(load_light(str(folder / "light_before.json")), 2 * load_light(light))
-    assert (line["negative_light"] < 1e-6) == positive == (to_map(values, MAP_HEIGHT).min() >= 0).item()
+    assert (
+        (line["negative_light"] < 1e-6)
+        == positive
+        == (to_map(values, MAP_HEIGHT).min() >= 0).item()
+    )
     assert (folder / "light.hdr").is_file() == (folder / "light.exr").is_file() == positive
     in_mitsuba = mitsuba_map(values, MAP_HEIGHT).float().clamp(min=0)
-    torch.testing.assert_close(read_map(folder / "mitsuba" / "light.exr"), in_mitsuba, rtol=0, atol=0)
+    torch.testing.assert_close(
+        read_map(folder / "mitsuba" / "light.exr"), in_mitsuba, rtol=0, atol=0
+    )
     if positive:
         rgbe, exact = (read_map(folder / f"light.{suffix}") for suffix in ("hdr", "exr"))
         # A channel has 8 bits of the texel's largest.
@@ -132,17 +148,24 @@ def positions(sheet: np.ndarray, part: np.ndarray) -> list[tuple[int, int]]:
         same = (sheet[rows + at, columns + at] == part[at, at]).all(axis=1)
         rows, columns = rows[same], columns[same]
     candidates = zip(rows.tolist(), columns.tolist(), strict=True)
-    return [(y, x) for y, x in candidates if np.array_equal(sheet[y : y + height, x : x + width], part)]
+    return [
+        (y, x) for y, x in candidates if np.array_equal(sheet[y : y + height, x : x + width], part)
+    ]
 
 
 @pytest.mark.parametrize("size", [32, 200])
 def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they_are(result, size):
     before, after = random_images(size, 0), random_images(size, 1)
-    sheet, side = drawn(replace(result, images_before=before, images=after)), -(-SIDE // size) * size
+    sheet, side = (
+        drawn(replace(result, images_before=before, images=after)),
+        -(-SIDE // size) * size,
+    )
     row_height = side + 2 + 2 * LINE_HEIGHT + GAP  # the captions of the differences have two lines
     for column, images in enumerate((before[0], after[0])):
         for view, image in enumerate(images):
-            assert found(sheet, image) == [(MARGIN + TITLE_HEIGHT + view * row_height, MARGIN + column * (side + GAP))]
+            assert found(sheet, image) == [
+                (MARGIN + TITLE_HEIGHT + view * row_height, MARGIN + column * (side + GAP))
+            ]
 
 
 def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(result):
@@ -154,7 +177,9 @@ def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(r
     after[0, :, 1, 0, 0] += 0.05
     expected[0, 0, 1, 2], expected[1, :, 3, 0], expected[:, 1, 0, 0] = 255, 64, 159
     sheet = drawn(replace(result, images_before=before, images=after))
-    assert [column for image in expected for _, column in found(sheet, image / 255)] == [MARGIN + 2 * (SIDE + GAP)] * 2
+    assert [column for image in expected for _, column in found(sheet, image / 255)] == [
+        MARGIN + 2 * (SIDE + GAP)
+    ] * 2
 
 
 def test_captions_are_the_predicted_class_and_the_right_one_where_it_is_another(result):
@@ -165,7 +190,10 @@ def test_captions_are_the_predicted_class_and_the_right_one_where_it_is_another(
 def test_the_light_is_shown_where_the_attack_has_changed_it(attacked, result):
     """All of it, a pattern included."""
     column = SIDE + GAP
-    sheets = [drawn(result), drawn(attacked("projector", {"views": 2, "shared": True}, force=True, max_steps=1))]
+    sheets = [
+        drawn(result),
+        drawn(attacked("projector", {"views": 2, "shared": True}, force=True, max_steps=1)),
+    ]
     assert sheets[1].shape[1] - sheets[0].shape[1] == 2 * column
     spheres = [sheets[1][:, MARGIN + number * column :][:, :SIDE] for number in (3, 4)]
     assert (spheres[0][100:200] != spheres[1][100:200]).any()

@@ -20,8 +20,15 @@ def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(
     result = attacked(light, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
     checks = augment.check(result)
     assert checks["cost_before"] == pytest.approx(float(result.descent.cost_before.mean()))
-    assert checks["cost"] == pytest.approx(float(result.descent.cost.mean())) and checks["cost"] < checks["cost_before"]
-    assert checks["cost_fell"] == 1 and checks["zero_gradient"] == 0 and 0 <= checks["random_search"] <= 1
+    assert (
+        checks["cost"] == pytest.approx(float(result.descent.cost.mean()))
+        and checks["cost"] < checks["cost_before"]
+    )
+    assert (
+        checks["cost_fell"] == 1
+        and checks["zero_gradient"] == 0
+        and 0 <= checks["random_search"] <= 1
+    )
     assert list(checks["success_by_steps"]) == [3, 9, 30]
     rates = list(checks["success_by_steps"].values())
     # A longer descent repeats the shorter one: nothing here is drawn.
@@ -30,7 +37,9 @@ def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(
 
 
 def test_a_success_within_the_steps_counts_also_where_a_margin_sends_it_on(attacked):
-    checks = augment.check(attacked({"lighting": StepSettings(step_size=0.2)}, margin=100, max_steps=3))
+    checks = augment.check(
+        attacked({"lighting": StepSettings(step_size=0.2)}, margin=100, max_steps=3)
+    )
     assert checks["success"] == 1 and checks["success_by_steps"] == {3: 1, 9: 1, 30: 1}
 
 
@@ -52,13 +61,21 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
         return torch.stack([margin, 0 * margin], dim=1)
 
     light = {"lighting": StepSettings(radius=0.1)}
-    checks = augment.check(attacked(light, classifier=augment.Classifier(narrow, 8, ("orange", "other"))))
+    checks = augment.check(
+        attacked(light, classifier=augment.Classifier(narrow, 8, ("orange", "other")))
+    )
     assert checks["success"] == checks["random_search"] == 1
     assert warnings(checks) == ["random search does as well or better"]
 
 
 def test_warnings_follow_from_the_numbers():
-    good = {"cost_fell": 1.0, "zero_gradient": 0.0, "success": 0.8, "random_search": 0.5, "success_without_noise": 0.9}
+    good = {
+        "cost_fell": 1.0,
+        "zero_gradient": 0.0,
+        "success": 0.8,
+        "random_search": 0.5,
+        "success_without_noise": 0.9,
+    }
     none = {"random_search": 0.0, "success": 0.0, "success_without_noise": 0.0}
     assert warnings(good) == warnings(good | none) == []
     assert len(warnings(good | {"success": 0.4, "random_search": 0.0})) == 1
@@ -75,7 +92,7 @@ def linear(make_scene, make_linear) -> AttackResult:
     shown = make_scene()
     shown.objects[0] = replace(shown.objects[0], label="stone")
     pixels = StepSettings("linf", 0.05, "sign", 0.2)
-    settings = augment.AttackSettings(pixels=pixels, max_steps=2, margin=0.0, rounded=False)
+    settings = augment.AttackSettings(pixels=pixels, max_steps=2, margin=0.0, quantized=False)
     return augment.attack(classifier, shown, settings=settings)
 
 
@@ -93,7 +110,9 @@ def test_a_ball_holds_an_adversary_from_the_radius_on_at_which_a_linear_classifi
 def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_draws_find(linear):
     rows = augment.success_by_radius(linear, [0.3, 0.05, 1.0, 0.1])  # scales of its radius
     assert [row["radii"]["pixels"] for row in rows] == pytest.approx([0.0025, 0.005, 0.015, 0.05])
-    adversarial, random = (torch.stack([row[method] for row in rows]) for method in ("adversarial", "random"))
+    adversarial, random = (
+        torch.stack([row[method] for row in rows]) for method in ("adversarial", "random")
+    )
     for success in (adversarial, random):
         assert success.shape == (4, 3) and (success[1:] >= success[:-1]).all()
     assert (adversarial >= random).all()
@@ -107,7 +126,9 @@ CLASSES = ("orange", "lime", "sky")
 def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Classifier:
     """The brightest channel of the mean color, whatever the order of the classes."""
     order = [CLASSES.index(name) for name in classes]
-    return augment.Classifier(lambda images: 30 * images.mean((2, 3))[:, order], size, classes, f"{classes[0]}{size}")
+    return augment.Classifier(
+        lambda images: 30 * images.mean((2, 3))[:, order], size, classes, f"{classes[0]}{size}"
+    )
 
 
 @pytest.fixture
@@ -127,13 +148,17 @@ def test_the_attacked_network_itself_predicts_the_same(attacked, parameters):
     result = attacked(parameters, {"views": 2, "backgrounds": [0.4]}, network(), max_steps=20)
     (row,) = augment.transfer(result, [network()])
     chosen = result.success
-    assert row["network"] == "orange12" and all(row["clean_correct"] + row["success"]) and chosen.any()
+    assert (
+        row["network"] == "orange12" and all(row["clean_correct"] + row["success"]) and chosen.any()
+    )
     assert row["confidence_before"] == confidence(result.logits_before[chosen])
     assert row["confidence"] == confidence(result.logits[chosen])
 
 
 def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_classes(attacked):
-    result = attacked({"lighting": StepSettings(step_size=0.2)}, {"views": 2}, network(), "sky", max_steps=60)
+    result = attacked(
+        {"lighting": StepSettings(step_size=0.2)}, {"views": 2}, network(), "sky", max_steps=60
+    )
     other = network(("sky", "orange", "lime"), size=36)
     (row,) = augment.transfer(result, [other])
     assert row["predicted"] == [["sky"]] * 2 and all(row["clean_correct"] + row["success"])
@@ -151,8 +176,12 @@ def test_other_azimuths_and_other_meshes_are_those_of_a_scene_with_them(result):
     apple = scene.changed(objects=augment.build_scene([("solid:apple", "lime")], 12).objects)
     turned, other = augment.transfer(result, azimuths=[-30.0], objects=apple.objects)
     assert (turned["azimuth"], other["mesh"]) == ("-30°", "solid:apple")
-    cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - 30) for row in scene.examples]
-    rows = [replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)]
+    cameras = [
+        replace(row.cameras[0], azimuth=row.cameras[0].azimuth - 30) for row in scene.examples
+    ]
+    rows = [
+        replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)
+    ]
     for row, shown in ((turned, scene.changed(examples=rows)), (other, apple)):
         logits = network()(shown.render(result.conditions, torch.arange(2))[:, 0])[:, None]
         assert row["confidence"] == confidence(logits)

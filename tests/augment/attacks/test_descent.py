@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
-from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.descent import Criterion, DescentResult, descend
 from augment.attacks.norm_ball import project, sample, scale_gradient
 from augment.parameter_settings import STEPS, StepSettings
 
@@ -61,7 +61,7 @@ class LinearScene:
     views: int = 1
     center: Tensor | None = None
     """Centers of the balls, shape (E, D); None for the start."""
-    at_once: int = 1000
+    group_size: int = 1000
 
     def __post_init__(self):
         if self.center is None:
@@ -93,7 +93,7 @@ def settings_of(max_steps: int = 30, margin: float = 0.0, **others) -> AttackSet
 
 def attack(model: nn.Module, problem, labels: Tensor, steps: int = 30, **settings) -> DescentResult:
     """Run an untargeted descent on examples of one view each."""
-    return descend(model, problem, Goal(labels[:, None]), settings_of(steps, **settings))
+    return descend(model, problem, Criterion(labels[:, None]), settings_of(steps, **settings))
 
 
 # --------------------------------------------------------------- closed forms
@@ -218,8 +218,8 @@ def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step
     start = sample(ball, center, torch.Generator().manual_seed(0))
     problem = LinearScene(start, step, 0.3, ball, views, center)
     zeros = torch.zeros(8, views, dtype=torch.int64)
-    goal = Goal(zeros, zeros + 1)
-    result = descend(Linear(WEIGHT, bias=50.0), problem, goal, settings_of(120))
+    criterion = Criterion(zeros, zeros + 1)
+    result = descend(Linear(WEIGHT, bias=50.0), problem, criterion, settings_of(120))
     slope = (CAMERAS[:views] @ (WEIGHT[0] - WEIGHT[1])).sum(0)
     expected = center - 0.4 * slope / slope.norm()
     # Each step turns the values towards the end by a factor of at least 0.4 / 0.7.
@@ -234,8 +234,8 @@ def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step
     [([2, 2], True), ([1, 0], True), ([2, 1], False)],
 )
 def test_an_untargeted_goal_is_reached_when_every_view_is_misclassified(predicted, is_reached):
-    goal = Goal(torch.tensor([[0, 1]]))
-    assert goal.reached(torch.tensor([predicted])).tolist() == [is_reached]
+    criterion = Criterion(torch.tensor([[0, 1]]))
+    assert criterion.reached(torch.tensor([predicted])).tolist() == [is_reached]
 
 
 @pytest.mark.parametrize(
@@ -243,16 +243,16 @@ def test_an_untargeted_goal_is_reached_when_every_view_is_misclassified(predicte
     [([1, 2], True), ([2, 1], False), ([1, 1], False)],
 )
 def test_a_targeted_goal_is_reached_when_every_view_has_its_own_target(predicted, is_reached):
-    goal = Goal(torch.tensor([[0, 0]]), torch.tensor([[1, 2]]))
-    assert goal.reached(torch.tensor([predicted])).tolist() == [is_reached]
+    criterion = Criterion(torch.tensor([[0, 0]]), torch.tensor([[1, 2]]))
+    assert criterion.reached(torch.tensor([predicted])).tolist() == [is_reached]
 
 
 def test_a_goal_of_some_examples_is_theirs():
-    goal = Goal(torch.tensor([[0], [1], [2]]), torch.tensor([[1], [2], [0]]))
+    criterion = Criterion(torch.tensor([[0], [1], [2]]), torch.tensor([[1], [2], [0]]))
     predicted = torch.tensor([[1], [0], [0]])
-    assert goal.reached(predicted).tolist() == [True, False, True]
+    assert criterion.reached(predicted).tolist() == [True, False, True]
     rows = torch.tensor([2, 1])
-    assert goal.of(rows).reached(predicted[rows]).tolist() == [True, False]
+    assert criterion.select(rows).reached(predicted[rows]).tolist() == [True, False]
 
 
 # --------------------------------------------------------------- shorter steps
@@ -299,7 +299,7 @@ class Axis:
     """Images of one value, which steps of 1.5 change."""
 
     start: Tensor
-    at_once: int = 1000
+    group_size: int = 1000
 
     def __post_init__(self):
         self.rendered = []
@@ -332,8 +332,8 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
     """Every value is exact."""
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
     zeros = torch.zeros(3, 1, dtype=torch.int64)
-    goal = Goal(zeros, zeros + 1)
-    result = descend(Bowl(), Axis(start), goal, settings_of(steps, shorten=True))
+    criterion = Criterion(zeros, zeros + 1)
+    result = descend(Bowl(), Axis(start), criterion, settings_of(steps, backtracking=True))
     values = result.values.flatten()
     assert values.tolist() == [FROM_1[steps], FROM_EIGHTH[steps], FROM_THREE_QUARTERS[steps]]
     assert torch.equal(result.images.flatten(), values)
@@ -346,7 +346,7 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
 def test_a_step_that_succeeds_is_kept_even_if_its_cost_is_higher():
     """With three classes, the true one may gain while another overtakes it."""
     axis = Axis(torch.ones(1, 1, dtype=torch.float64))
-    result = attack(Detour(), axis, torch.zeros(1, dtype=torch.int64), steps=5, shorten=True)
+    result = attack(Detour(), axis, torch.zeros(1, dtype=torch.int64), steps=5, backtracking=True)
     assert result.success.tolist() == [True]
     assert result.steps.tolist() == [1]
     assert result.values.tolist() == [[-0.5]]
@@ -361,7 +361,7 @@ def test_after_a_success_of_higher_cost_steps_are_compared_with_where_they_start
     """
     axis = Axis(torch.ones(1, 1, dtype=torch.float64))
     labels = torch.zeros(1, dtype=torch.int64)
-    result = attack(Ridge(), axis, labels, steps=3, shorten=True, margin=1.0)
+    result = attack(Ridge(), axis, labels, steps=3, backtracking=True, margin=1.0)
     assert axis.rendered == [1, -0.5, 0.25, 0.625]
     assert result.success.tolist() == [True]
     assert result.values.tolist() == [[0.625]]  # Its cost is the lowest.
@@ -413,8 +413,8 @@ def attack_nine(views: int, **settings) -> DescentResult:
     """Attack nine examples, of which some succeed at once, some on the way and some never."""
     problem = LinearScene(NINE_STARTS, step_size=0.3, views=views)
     labels = torch.arange(9) % 4
-    goal = Goal(labels[:, None].expand(9, views))
-    return descend(small_network(), problem, goal, settings_of(8, **settings))
+    criterion = Criterion(labels[:, None].expand(9, views))
+    return descend(small_network(), problem, criterion, settings_of(8, **settings))
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -440,26 +440,26 @@ class OneOfNine(LinearScene):
         return whole.render(values, examples + self.row)
 
 
-@pytest.mark.parametrize("shorten", [False, True])
+@pytest.mark.parametrize("backtracking", [False, True])
 @pytest.mark.parametrize("views", [1, 2])
-def test_every_example_is_attacked_as_if_alone(views, shorten):
-    together = attack_nine(views, shorten=shorten)
-    settings = settings_of(8, shorten=shorten)
+def test_every_example_is_attacked_as_if_alone(views, backtracking):
+    together = attack_nine(views, backtracking=backtracking)
+    settings = settings_of(8, backtracking=backtracking)
     for row in range(9):
         alone = OneOfNine(NINE_STARTS[[row]], step_size=0.3, views=views)
         alone.row = row
-        goal = Goal(torch.full((1, views), row % 4))
-        result = descend(small_network(), alone, goal, settings)
+        criterion = Criterion(torch.full((1, views), row % 4))
+        result = descend(small_network(), alone, criterion, settings)
         for name in FIELDS:
             found = getattr(result, name)[0]
             expected = getattr(together, name)[row]
             torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("shorten", [False, True])
-def test_a_margin_changes_no_success_and_lets_successful_examples_continue(shorten):
-    without = attack_nine(2, shorten=shorten)
-    with_margin = attack_nine(2, shorten=shorten, margin=0.5)
+@pytest.mark.parametrize("backtracking", [False, True])
+def test_a_margin_changes_no_success_and_lets_successful_examples_continue(backtracking):
+    without = attack_nine(2, backtracking=backtracking)
+    with_margin = attack_nine(2, backtracking=backtracking, margin=0.5)
     assert torch.equal(with_margin.success, without.success)
     assert (with_margin.steps >= without.steps).all()
     assert (with_margin.steps > without.steps)[without.success].any()
@@ -485,15 +485,15 @@ def restarted() -> Restarted:
     center = random(40, VALUE_COUNT, seed=3)
     ball = StepSettings("linf", 0.5)
     network = Linear(WEIGHT)
-    goal = Goal(torch.arange(40)[:, None] % 2)
+    criterion = Criterion(torch.arange(40)[:, None] % 2)
     settings = settings_of(2)
     starts = [sample(ball, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, "sign", 0.1, ball)
-    result = descend(network, problem, goal, settings, restarts=starts)
+    result = descend(network, problem, criterion, settings, restarts=starts)
     single = []
     for start in (center, *starts):
         alone = LinearScene(start, "sign", 0.1, ball, center=center)
-        single.append(descend(network, alone, goal, settings))
+        single.append(descend(network, alone, criterion, settings))
     # The ball limits some values.
     radius = torch.tensor(0.5).double()
     assert torch.isclose((single[1].values - center).abs(), radius).any()

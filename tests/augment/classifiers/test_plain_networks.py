@@ -58,7 +58,9 @@ def test_values_are_scaled_to_the_range_of_the_network(network, images):
 def test_a_plain_network_is_attacked_like_its_classifier(network):
     classifier = augment.Classifier(network, SIZE, CLASSES)
     expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
-    by_name = augment.attack(network, scene("orange"), settings=light(), classes=CLASSES, force=True)
+    by_name = augment.attack(
+        network, scene("orange"), settings=light(), classes=CLASSES, force=True
+    )
     by_index = augment.attack(network, scene(0), settings=light(), force=True)
     for result in (by_name, by_index):
         assert torch.equal(result.images, expected.images)

@@ -12,12 +12,12 @@ from augment.scene.build import build_scene
 from augment.scene.degree import Smoothest, degree_of_scene, reached_gloss
 from augment.scene.scene import Scene
 from augment.scene.variation import vary
-from augment.settings import ObjectSettings, PropSettings, VariationSettings, VarnishSettings
+from augment.settings import ObjectSettings, PropSettings, SpecularLayerSettings, VariationSettings
 from renderer.geometry.shapes import solid
 from renderer.light.basis import Harmonics, harmonics_of
 from renderer.light.environment import to_map, write_map
 from renderer.light.harmonics import quadrature
-from renderer.light.highlights import degree_for
+from renderer.light.highlights import required_degree
 from renderer.light.presets import directional, load_light, probe
 from renderer.shading.gloss import Gloss, smoothest
 
@@ -50,7 +50,9 @@ def lowest_roughness(scene: Scene, settings: MaterialSettings) -> float:
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 @pytest.mark.parametrize("radius", [0.3, 0.64, 1.5, None])
 @pytest.mark.parametrize("faces", ["alike", "different"])
-def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_reaches(faces, radius, norm):
+def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_reaches(
+    faces, radius, norm
+):
     mesh = solid("pear")
     roughness = torch.full((len(mesh.faces),), 0.6)
     roughness[:9] -= 0.1 * (faces == "different")
@@ -62,14 +64,16 @@ def test_the_degree_shows_the_least_roughness_that_an_attack_on_the_material_rea
         attack=augment.AttackSettings(material=settings),
         **OPTIONS,
     )
-    expected = degree_for(lowest_roughness(scene, settings))
+    expected = required_degree(lowest_roughness(scene, settings))
     assert scene.basis == Harmonics(max(6, expected))
     assert ("can reach gloss of roughness" in told) == (expected > 6)
 
 
 def test_a_matte_object_attacked_in_its_material_has_the_gloss_that_the_attack_begins_with():
-    assert scene_of(MATTE, attack=augment.AttackSettings(material=EVERYWHERE))[0].basis == Harmonics(degree_for(0.2))
-    hue = MaterialSettings(roughness=0, metallic=0, strength=0, hue=30)
+    assert scene_of(MATTE, attack=augment.AttackSettings(material=EVERYWHERE))[
+        0
+    ].basis == Harmonics(required_degree(0.2))
+    hue = MaterialSettings(roughness=0, metallic=0, specular_factor=0, hue=30)
     light = augment.AttackSettings(lighting=augment.StepSettings())
     for attack in (augment.AttackSettings(material=hue), light):
         scene, told = scene_of(MATTE, attack=attack)
@@ -77,13 +81,13 @@ def test_a_matte_object_attacked_in_its_material_has_the_gloss_that_the_attack_b
 
 
 def test_the_degree_shows_every_varnish_that_is_drawn():
-    varied = VariationSettings(gloss=VarnishSettings([0.22, 0.6], [0.0, 1.0]))
+    varied = VariationSettings(gloss=SpecularLayerSettings([0.22, 0.6], [0.0, 1.0]))
     scene, told = scene_of(MATTE, vary=varied)
     draws = [vary(scene, varied, torch.Generator().manual_seed(seed)) for seed in range(20)]
     roughness = [smoothest(drawn.objects[0].mesh) for drawn in draws]
-    assert 0.22 <= min(roughness) < 0.3 and scene.basis == Harmonics(degree_for(0.22))
+    assert 0.22 <= min(roughness) < 0.3 and scene.basis == Harmonics(required_degree(0.22))
     assert "can reach gloss of roughness 0.22" in told
-    settings, attack = VarnishSettings([0.5, 0.6], [0.0, 1.0]), MaterialSettings(radius=0.5)
+    settings, attack = SpecularLayerSettings([0.5, 0.6], [0.0, 1.0]), MaterialSettings(radius=0.5)
     reached = reached_gloss(scene.objects, attack, settings)
     assert reached.roughness == pytest.approx(0.5 - 0.5 * 0.3, abs=1e-6)
 
@@ -91,15 +95,21 @@ def test_the_degree_shows_every_varnish_that_is_drawn():
 def test_gloss_of_props_of_single_faces_and_of_other_objects_counts():
     mug = PropSettings("solid:cup", at=[0.9, 0.6], gloss=[0.25])
     among = ObjectSettings("solid:pear", "pear", props=[mug])
-    assert scene_of(among)[0].basis == Harmonics(degree_for(0.25))
+    assert scene_of(among)[0].basis == Harmonics(required_degree(0.25))
     mesh = solid("pear")
     roughness, strength = torch.full((2, len(mesh.faces)), 0.5)
     roughness[3], roughness[5], strength[5] = 0.25, 0.2, 0.0  # the last is matte
-    single = Gloss(roughness, strength=strength).on(mesh), "pear"
+    single = Gloss(roughness, specular_factor=strength).on(mesh), "pear"
     scene, _ = quietly(build_scene, [MATTE, single], 8, **OPTIONS)
-    assert scene.basis == Harmonics(degree_for(0.25))
-    scene, _ = quietly(build_scene, [MATTE, single], 8, attack=augment.AttackSettings(material=EVERYWHERE), **OPTIONS)
-    assert scene.basis == Harmonics(degree_for(0.2))
+    assert scene.basis == Harmonics(required_degree(0.25))
+    scene, _ = quietly(
+        build_scene,
+        [MATTE, single],
+        8,
+        attack=augment.AttackSettings(material=EVERYWHERE),
+        **OPTIONS,
+    )
+    assert scene.basis == Harmonics(required_degree(0.2))
 
 
 def classifier() -> augment.Classifier:
@@ -123,7 +133,10 @@ def test_an_attack_in_python_lights_the_scene_by_the_degree_that_it_needs(tmp_pa
     name, settings = str(tmp_path / "map.exr"), MaterialSettings(radius=0.64)
     plain, _ = scene_of(MATTE, light=name, exposure=0.7)
     now, told = attacked(plain, settings)
-    assert plain.basis == Harmonics(6) and now.basis == Harmonics(degree_for(0.5 - 0.64 * 0.3)) != plain.basis
+    assert (
+        plain.basis == Harmonics(6)
+        and now.basis == Harmonics(required_degree(0.5 - 0.64 * 0.3)) != plain.basis
+    )
     expected = 0.7 * load_light(name, now.basis.degree)
     torch.testing.assert_close(now.lights[0], harmonics_of(now.basis).project_nonnegative(expected))
     assert "can reach gloss of roughness" in told
@@ -132,7 +145,9 @@ def test_an_attack_in_python_lights_the_scene_by_the_degree_that_it_needs(tmp_pa
     assert kept.basis == Harmonics(6) and "degree=6" in told
     other = augment.build_scene([MATTE], 8, light=0.9 * load_light(name), **OPTIONS)
     assert attacked(other, settings)[0].basis == Harmonics(6)
-    exact, told = attacked(scene_of(MATTE, degree=6)[0], settings)  # of the probes, no band above the second is known
+    exact, told = attacked(
+        scene_of(MATTE, degree=6)[0], settings
+    )  # of the probes, no band above the second is known
     assert exact.basis == Harmonics(6) and "rings" not in told
 
 

@@ -31,7 +31,9 @@ MAPS = {"city": 0.1, "forest": 0.1, "night": 0.1, "studio": 0.25}
 GLOSSES = {"varnish": 0.0, "metal": 1.0}  # metallic
 
 
-def brdf(normals: np.ndarray, view: np.ndarray, light: np.ndarray, roughness: float, metallic: float) -> np.ndarray:
+def brdf(
+    normals: np.ndarray, view: np.ndarray, light: np.ndarray, roughness: float, metallic: float
+) -> np.ndarray:
     """π f (S, N) of glTF for a gray surface; the diffuse part below a varnish is that of Kulla and Conty (2017)."""
     alpha = roughness**2
     half = light + view
@@ -44,10 +46,17 @@ def brdf(normals: np.ndarray, view: np.ndarray, light: np.ndarray, roughness: fl
     if metallic:
         return value * (ALBEDO + (1 - ALBEDO) * (1 - vh) ** 5)
     inside = np.sqrt(1 - (1 - vh**2) / 2.25)
-    amplitudes = (vh - 1.5 * inside) / (vh + 1.5 * inside), (1.5 * vh - inside) / (1.5 * vh + inside)
+    amplitudes = (
+        (vh - 1.5 * inside) / (vh + 1.5 * inside),
+        (1.5 * vh - inside) / (1.5 * vh + inside),
+    )
     cosines, reflected = coat(roughness)
     mean = np.trapezoid(2 * reflected * cosines, cosines)
-    diffuse = (1 - np.interp(nl, cosines, reflected)) * (1 - np.interp(nv, cosines, reflected)) / (1 - mean)
+    diffuse = (
+        (1 - np.interp(nl, cosines, reflected))
+        * (1 - np.interp(nv, cosines, reflected))
+        / (1 - mean)
+    )
     return value * np.square(amplitudes).mean(0) + ALBEDO * diffuse
 
 
@@ -56,7 +65,9 @@ def coat(roughness: float) -> tuple[np.ndarray, np.ndarray]:
     """Cosines, and the fraction of beams that a varnish reflects: Monte Carlo over half vectors, stratified."""
     cosines, alpha, count = np.linspace(0, 1, 101) ** 2, roughness**2, 200
     cosines[0] = 1e-6
-    fraction, azimuth = np.meshgrid((np.arange(count) + 0.5) / count, 2 * np.pi * (np.arange(count) + 0.5) / count)
+    fraction, azimuth = np.meshgrid(
+        (np.arange(count) + 0.5) / count, 2 * np.pi * (np.arange(count) + 0.5) / count
+    )
     height = np.sqrt((1 - fraction) / (1 + (alpha**2 - 1) * fraction))
     reflected = []
     for cosine in cosines:
@@ -93,7 +104,9 @@ def of_full_maps(
     paths: Sequence[Path], mesh: Mesh, camera: Camera, roughness: float, metallic: float
 ) -> list[np.ndarray]:
     """Radiance (P, 3) of the pear's pixels, by quadrature over all texels of each map; maps are of one size."""
-    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], ImageSettings(SIZE, 2), choose("numpy"))
+    [view] = build_fragments(
+        mesh.vertices, mesh.faces, [camera], ImageSettings(SIZE, 2), choose("numpy")
+    )
     surface = Surface(mesh, view, ImageSettings(SIZE, 2))
     normals, toward = surface.normals.numpy(), surface.toward[0].numpy()
     arriving = []
@@ -102,23 +115,32 @@ def of_full_maps(
         directions, solid_angles = equirectangular(*radiance.shape[:2])
         power = radiance * solid_angles[..., None]
         mean = power.sum((0, 1))[None] / math.sqrt(4 * math.pi)
-        arriving.append(power.flatten(0, 1).numpy() * mean_luminance(probe("grace")) / mean_luminance(mean))
+        arriving.append(
+            power.flatten(0, 1).numpy() * mean_luminance(probe("grace")) / mean_luminance(mean)
+        )
     light, seen = directions.flatten(0, 1).numpy(), []
     for some in np.array_split(normals, -(-len(normals) // AT_ONCE)):
         cosine = (some @ light.T).clip(0)
-        seen.append((brdf(some, toward, light, roughness, metallic) * cosine) @ np.concatenate(arriving, axis=1))
+        seen.append(
+            (brdf(some, toward, light, roughness, metallic) * cosine)
+            @ np.concatenate(arriving, axis=1)
+        )
     pixels = np.zeros((len(view.pixels), 3 * len(paths)))
     np.add.at(pixels, view.pixel.numpy(), np.concatenate(seen) / 4)
     return np.split(pixels, len(paths), axis=1)
 
 
-def require_close(paths: Sequence[Path], most: Sequence[float], roughness: float, metallic: float) -> None:
+def require_close(
+    paths: Sequence[Path], most: Sequence[float], roughness: float, metallic: float
+) -> None:
     mesh = mesh_of(roughness, metallic)
     shown = [ours(path, mesh) for path in paths]
     expected = of_full_maps(paths, mesh, shown[0][1], roughness, metallic)
     for path, limit, (image, _), theirs in zip(paths, most, shown, expected, strict=True):
         error = float(np.sqrt(np.square(image - theirs).mean() / np.square(theirs).mean()))
-        print(f"{path.stem} {roughness} {metallic}: {error:.3f}, least {(image / theirs).min():.2f}")
+        print(
+            f"{path.stem} {roughness} {metallic}: {error:.3f}, least {(image / theirs).min():.2f}"
+        )
         assert error <= limit and (image > 0)[theirs > 0].all()
 
 

@@ -130,7 +130,7 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
         geometry=StepSettings("linf", 0.02, "sign", 0.01),
         albedo=StepSettings("linf", 0.1, "sign", 0.05),
         max_steps=3,
-        shorten=True,
+        backtracking=True,
     )
     shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=request.param))
     done = augment.attack(by_mean_color(), shown, settings=settings, force=True)

@@ -19,8 +19,8 @@ from augment.parameter_settings import SkylightSettings, StepSettings
 from augment.scene import relighting
 from augment.scene.build import build_scene, load_backgrounds
 from augment.scene.conditions import Conditions, Example
+from augment.scene.direct_rendering import NEAR
 from augment.scene.objects import load_object
-from augment.scene.reshading import NEAR
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings, count_views
 from renderer.camera import orbit_cameras
@@ -29,7 +29,7 @@ from renderer.geometry.mesh import Mesh
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Harmonics
 from renderer.light.environment import to_map, write_map
-from renderer.light.highlights import degree_for
+from renderer.light.highlights import required_degree
 from renderer.light.presets import ambient, probe
 from renderer.settings import ImageSettings
 from renderer.transport.operators import build_operators
@@ -197,7 +197,7 @@ def test_light_has_the_degree_of_the_smoothest_part_of_a_gloss_texture():
 
 
 def test_a_scene_has_the_degree_of_its_smoothest_object(glossy, map_options):
-    assert glossy.basis == Harmonics(degree_for(0.35)) == Harmonics(12)
+    assert glossy.basis == Harmonics(required_degree(0.35)) == Harmonics(12)
     assert build_scene([MATTE], 16, **map_options).basis == Harmonics(6)
 
 

@@ -24,8 +24,8 @@ from augment.settings import (
     ObjectSettings,
     ProjectorSettings,
     PropSettings,
+    SpecularLayerSettings,
     VariationSettings,
-    VarnishSettings,
 )
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
@@ -171,8 +171,8 @@ def test_each_object_is_turned_about_an_axis_of_its_own_and_its_props_stay_on_th
     assert 20 < max(angles) <= 40
 
 
-VARNISH = VarnishSettings(roughness=[0.4, 0.6], strength=[0.5, 1.0])
-VARNISHED = {"gloss": VARNISH, "rotation": 90.0, "instances": True}
+SPECULAR_LAYER = SpecularLayerSettings(roughness=[0.4, 0.6], specular_factor=[0.5, 1.0])
+VARNISHED = {"gloss": SPECULAR_LAYER, "rotation": 90.0, "instances": True}
 
 
 @pytest.fixture(scope="module")
@@ -218,11 +218,11 @@ def test_gloss_of_views_that_are_shown_once_looks_the_same(pears):
 
 @pytest.mark.parametrize(
     ("name", "limits"),
-    [("roughness", [0.1, 0.5]), ("strength", [0.5, 1.5]), ("strength", [1.0])],
+    [("roughness", [0.1, 0.5]), ("specular_factor", [0.5, 1.5]), ("specular_factor", [1.0])],
 )
 def test_gloss_out_of_range_is_refused(name, limits):
     with pytest.raises(InputError, match=f"^{name}"):
-        VarnishSettings(**{name: limits})
+        SpecularLayerSettings(**{name: limits})
 
 
 def test_instances_are_drawn_of_solids_without_a_seed_only():

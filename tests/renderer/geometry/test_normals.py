@@ -37,7 +37,9 @@ def torus() -> trimesh.Trimesh:
 def test_derivatives_on_a_mesh_are_central_differences(function, shape):
     vertices, faces = dented(shape())
     vertices.requires_grad_()
-    assert torch.autograd.gradcheck(lambda values: function(values, faces), vertices, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda values: function(values, faces), vertices, fast_mode=True
+    )
 
 
 def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:

@@ -17,9 +17,9 @@ import renderer
 from renderer.errors import InputError
 from renderer.io.files import (
     TEMPORARY,
+    atomic_write,
     remove_unfinished,
     replacing,
-    write_whole,
 )
 from renderer.io.images import write_image, write_numbers
 from renderer.light.environment import write_map
@@ -86,7 +86,7 @@ def test_a_new_file_that_cannot_be_written_is_not_there(tmp_path, name):
 
 def test_an_interrupted_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.json"
-    write_whole(path, "old")
+    atomic_write(path, "old")
     with pytest.raises(KeyboardInterrupt), replacing(path) as temporary:
         temporary.write_text("half of the n")
         raise KeyboardInterrupt
@@ -94,16 +94,16 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
 
 
 def test_a_new_file_has_the_permissions_of_any_new_file(tmp_path):
-    write_whole(tmp_path / "a.json", "new")
+    atomic_write(tmp_path / "a.json", "new")
     (tmp_path / "plain").touch()
     assert permissions(tmp_path / "a.json") == permissions(tmp_path / "plain")
 
 
 def test_a_replaced_file_keeps_its_permissions(tmp_path):
     path = tmp_path / "a.json"
-    write_whole(path, "old")
+    atomic_write(path, "old")
     path.chmod(0o640)
-    write_whole(path, "new")
+    atomic_write(path, "new")
     assert path.read_text() == "new"
     assert permissions(path) == 0o640
 
@@ -111,9 +111,9 @@ def test_a_replaced_file_keeps_its_permissions(tmp_path):
 def test_a_write_through_a_link_replaces_its_target(tmp_path):
     target = tmp_path / "a.json"
     link = tmp_path / "link.json"
-    write_whole(target, "old")
+    atomic_write(target, "old")
     link.symlink_to("a.json")
-    write_whole(link, "new")
+    atomic_write(link, "new")
     assert link.is_symlink()
     assert target.read_text() == "new"
 
@@ -121,10 +121,10 @@ def test_a_write_through_a_link_replaces_its_target(tmp_path):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write to every file")
 def test_a_file_without_permission_to_write_is_not_replaced(tmp_path):
     path = tmp_path / "a.json"
-    write_whole(path, "old")
+    atomic_write(path, "old")
     path.chmod(0o440)
     with pytest.raises(PermissionError, match=r"a\.json"):
-        write_whole(path, "new")
+        atomic_write(path, "new")
     assert contents(tmp_path) == {"a.json": b"old"}
 
 
@@ -133,7 +133,7 @@ def test_folders_and_pipes_are_not_replaced(tmp_path, make):
     path = tmp_path / "a.json"
     make(path)
     with pytest.raises(OSError, match=r"a\.json"):
-        write_whole(path, "new")
+        atomic_write(path, "new")
     assert not path.is_file()
     assert list(tmp_path.iterdir()) == [path]
 

@@ -67,7 +67,9 @@ def chromaticity(rows: list[list[float]], sun_zenith: float, t: float) -> float:
     return squared * t**2 + linear * t + constant
 
 
-def published_sky(directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float) -> np.ndarray:
+def published_sky(
+    directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float
+) -> np.ndarray:
     """Evaluate the formulas of Preetham et al., appendix A.2, as they are printed, in angles.
 
     Args:

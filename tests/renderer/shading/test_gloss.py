@@ -32,7 +32,7 @@ from renderer.light.basis import (
     SplitLight,
 )
 from renderer.light.harmonics import bands, basis, lambertian_factors
-from renderer.light.highlights import AMPLITUDE, degree_for, highlight_window
+from renderer.light.highlights import AMPLITUDE, highlight_window, required_degree
 from renderer.light.lamps import Lamps
 from renderer.light.presets import load_light
 from renderer.light.projector import Projector
@@ -53,7 +53,7 @@ from renderer.visibility.rasterizers import choose
 DOUBLE = torch.float64
 UP = torch.tensor([[0.0, 0, 1]], dtype=DOUBLE)
 REFRACTIVE_INDEX = 1.5
-# Metallic and strength of surfaces: two dielectrics, a metal, and a mixture.
+# Metallic and specular_factor of surfaces: two dielectrics, a metal, and a mixture.
 GLOSSES = [(0.0, 1.0), (0.0, 0.4), (1.0, 1.0), (0.5, 0.7)]
 
 
@@ -242,7 +242,7 @@ def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(
 ):
     amplitudes = zonal_amplitudes(roughness, 45, rings=120)
     relative = amplitudes / amplitudes[0]
-    degree = degree_for(roughness)
+    degree = required_degree(roughness)
     assert degree <= 40
     assert relative[degree] > AMPLITUDE
     assert (relative[degree + 1 :] <= AMPLITUDE).all()
@@ -251,7 +251,7 @@ def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(
 @pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.25, 0.5])
 def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
     """The lobe is seen head-on, and has 0.7 of the squared roughness of the window's design."""
-    degree = degree_for(roughness)
+    degree = required_degree(roughness)
     first_of_band = torch.arange(degree + 1) ** 2
     window = highlight_window(degree, roughness, 0.7)[first_of_band].numpy()
     amplitudes = zonal_amplitudes(roughness * math.sqrt(0.7), degree, rings=120)
@@ -266,7 +266,7 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
 
 
 def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
-    """This is a white furnace, seen from every side, for all roughness, metallic and strength."""
+    """This is a white furnace, seen from every side, for all roughness, metallic and specular_factor."""
     grid = torch.meshgrid(
         torch.linspace(0, 1, 21, dtype=DOUBLE),
         torch.linspace(MIN_ROUGHNESS, 1, 9, dtype=DOUBLE),
@@ -274,8 +274,8 @@ def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_
         torch.linspace(0, 1, 2, dtype=DOUBLE),
         indexing="ij",
     )
-    cosine, roughness, metallic, strength = (values.flatten() for values in grid)
-    gloss = SampleGloss(roughness, metallic, strength)
+    cosine, roughness, metallic, specular_factor = (values.flatten() for values in grid)
+    gloss = SampleGloss(roughness, metallic, specular_factor)
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
     normals = UP.expand_as(views)
     colored, white, _ = gloss.transfer(normals, views, 0)
@@ -302,11 +302,11 @@ class WhiteSurface:
 
     roughness: float
     metallic: float
-    strength: float
+    specular_factor: float
 
     def transmitted(self, cosine: float) -> float:
         """Return the fraction of a beam that passes the specular layer."""
-        return 1 - self.strength * coat_albedo_by_quadrature(cosine, self.roughness)
+        return 1 - self.specular_factor * coat_albedo_by_quadrature(cosine, self.roughness)
 
     def mean_transmitted(self) -> float:
         """Return the fraction of diffuse light that passes the specular layer."""
@@ -320,7 +320,7 @@ class WhiteSurface:
         heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
         entering = np.array([self.transmitted(height) for height in heights])[ring_of_light]
         diffuse = self.transmitted(cosine) * entering / self.mean_transmitted()
-        coat = self.strength * Lobe(self.roughness).reflectance(cosine, light)
+        coat = self.specular_factor * Lobe(self.roughness).reflectance(cosine, light)
         metal = Lobe(self.roughness, 1.0).reflectance(cosine, light)
         return self.metallic * metal + (1 - self.metallic) * (coat + diffuse)
 
@@ -378,10 +378,12 @@ FLOOR_VIEWS = [
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
-@pytest.mark.parametrize(("metallic", "strength"), GLOSSES)
-def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(roughness, metallic, strength):
-    gloss = Gloss(roughness, metallic, strength)
-    surface = WhiteSurface(roughness, metallic, strength)
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_lamps_and_projectors_are_reflected_as_by_kulla_and_conty(
+    roughness, metallic, specular_factor
+):
+    gloss = Gloss(roughness, metallic, specular_factor)
+    surface = WhiteSurface(roughness, metallic, specular_factor)
     for view in FLOOR_VIEWS:
         # The reference looks from -x, and the camera from +x.
         light = unit_vector(view.lit, view.azimuth + math.pi)
@@ -421,8 +423,8 @@ def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
 @pytest.mark.parametrize("polar", [0.0, 1.2, 1.5, 1.55])
 def test_a_beam_is_reflected_with_no_more_than_its_energy_and_by_varnish_with_all(roughness, polar):
     beam = unit_vector(polar, math.pi)
-    for metallic, strength in GLOSSES:
-        gloss = SampleGloss(double(roughness), double(metallic), double(strength))
+    for metallic, specular_factor in GLOSSES:
+        gloss = SampleGloss(double(roughness), double(metallic), double(specular_factor))
         fraction = reflected_fraction(beam, gloss)
         assert fraction <= 1 + 1e-4
         if metallic == 0:
@@ -443,7 +445,9 @@ class FloorUnderSky:
     def __init__(self, gloss: Gloss) -> None:
         node, weight = legendre.leggauss(24)
         cosines = torch.from_numpy((node + 1) / 2)
-        cameras = [OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines]
+        cameras = [
+            OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines
+        ]
         operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
         rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
         self.transfer = torch.stack(rows)
@@ -454,19 +458,21 @@ class FloorUnderSky:
 
 
 @pytest.mark.parametrize("roughness", [0.2, 1.0])
-@pytest.mark.parametrize(("metallic", "strength"), GLOSSES)
-def test_environment_light_is_reflected_reciprocally(roughness, metallic, strength):
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_environment_light_is_reflected_reciprocally(roughness, metallic, specular_factor):
     """The transfer of all views, projected onto harmonics, is a symmetric matrix."""
-    floor = FloorUnderSky(Gloss(roughness, metallic, strength))
+    floor = FloorUnderSky(Gloss(roughness, metallic, specular_factor))
     matrix = (floor.harmonics * floor.measure[:, None]).T @ floor.transfer
     torch.testing.assert_close(matrix, matrix.T, rtol=0, atol=4e-3)
 
 
 @pytest.mark.parametrize("roughness", [0.2, 1.0])
-@pytest.mark.parametrize(("metallic", "strength"), GLOSSES)
-def test_environment_light_is_reflected_with_no_more_than_its_energy(roughness, metallic, strength):
+@pytest.mark.parametrize(("metallic", "specular_factor"), GLOSSES)
+def test_environment_light_is_reflected_with_no_more_than_its_energy(
+    roughness, metallic, specular_factor
+):
     """Varnish reflects all of the irradiance, which is A_l Y_l0 in closed form."""
-    floor = FloorUnderSky(Gloss(roughness, metallic, strength))
+    floor = FloorUnderSky(Gloss(roughness, metallic, specular_factor))
     reflected = floor.measure @ floor.transfer
     irradiance = (basis(UP, 6) * lambertian_factors(6))[0, floor.ZONAL]
     assert reflected[0] <= irradiance[0] * (1 + 1e-4)
@@ -474,9 +480,9 @@ def test_environment_light_is_reflected_with_no_more_than_its_energy(roughness, 
         torch.testing.assert_close(reflected, irradiance, rtol=0, atol=2e-3)
 
 
-@pytest.mark.parametrize("strength", [0.5, 1.0])
+@pytest.mark.parametrize("specular_factor", [0.5, 1.0])
 def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
-    strength,
+    specular_factor,
 ):
     """At the foot of a very high wall, half of an even sky is hidden."""
     wall = Mesh.plain(
@@ -487,13 +493,13 @@ def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(
     corner = concatenate([FLOOR, wall])
     camera = OrthographicCamera(40.1, 180.0, 1e-3)
     settings = ImageSettings(1, 1, shadows=True)
-    gloss = Gloss(1.0, 0.0, strength)
+    gloss = Gloss(1.0, 0.0, specular_factor)
     [operator] = operators_of(corner, [camera], settings, Harmonics(6), gloss)
     even_sky = load_light("uniform", 6).double() * math.pi
     found = float(operator.radiance(even_sky)[0, 0])
 
     light, solid_angles = hemisphere(24)
-    surface = WhiteSurface(1.0, 0.0, strength)
+    surface = WhiteSurface(1.0, 0.0, specular_factor)
     radiance = surface.reflectance(math.cos(math.radians(40.1)), light) * light[:, 2] * solid_angles
     is_visible = light[:, 0] < 0
     assert found == pytest.approx(radiance[is_visible].sum(), rel=0.02)
@@ -629,7 +635,7 @@ def test_metals_need_no_more_bands_than_the_degree_for_their_roughness(
     gloss = Gloss(roughness, metallic=1.0)
     expected = mitsuba_radiance(mesh, light, rough_mirror(roughness), 144)
     assert relative_error(our_radiance(mesh, light, gloss), expected) < largest_error
-    truncated_light = light[: (degree_for(roughness) + 1) ** 2]
+    truncated_light = light[: (required_degree(roughness) + 1) ** 2]
     truncated = our_radiance(mesh, truncated_light, gloss)
     assert relative_error(truncated, expected) < largest_truncation_error
 
@@ -714,9 +720,12 @@ class GlossyView:
             "albedo": (sample_count, 3),
             "roughness": (face_count,),
             "metallic": (face_count,),
-            "strength": (face_count,),
+            "specular_factor": (face_count,),
         }
-        uniform = {name: 0.3 + 0.5 * draw_uniform(*size, seed=seed) for seed, (name, size) in enumerate(shapes.items())}
+        uniform = {
+            name: 0.3 + 0.5 * draw_uniform(*size, seed=seed)
+            for seed, (name, size) in enumerate(shapes.items())
+        }
         vertices = torch.from_numpy(self.mesh.vertices)
         return {
             "environment": positive_light(6),
@@ -734,7 +743,7 @@ class GlossyView:
             values["albedo"],
             SplitLight(values["environment"], [(self.LAMP, values["lamp"])]),
             self.rays,
-            gloss=Gloss(values["roughness"], values["metallic"], values["strength"]),
+            gloss=Gloss(values["roughness"], values["metallic"], values["specular_factor"]),
         )
         return (view.radiance() * self.upstream).sum()
 
@@ -760,7 +769,9 @@ def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-13), name
 
 
-@pytest.mark.parametrize("options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str
+)
 def test_an_operator_gives_the_images_of_render(options):
     mesh = normalize(solid("cup"))
     light = positive_light(6).float()
@@ -788,7 +799,7 @@ def test_a_roughness_below_the_minimum_is_raised_to_it_with_a_warning():
         (Gloss(1.5), "roughness"),
         (Gloss(math.nan), "roughness"),
         (Gloss(0.5, -0.1), "metallic"),
-        (Gloss(0.5, strength=torch.ones(3)), "strength"),
+        (Gloss(0.5, specular_factor=torch.ones(3)), "specular_factor"),
     ],
 )
 def test_gloss_out_of_range_is_refused(gloss, argument):
@@ -801,7 +812,9 @@ def test_the_parts_of_a_joined_mesh_keep_their_gloss():
     pear = Gloss(0.3).on(solid("pear"))
     gloss = concatenate([pear, solid("table")]).gloss
     pear_gloss, table_gloss = np.split(gloss, [len(pear.faces)])
-    np.testing.assert_array_equal(pear_gloss, np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1)))
+    np.testing.assert_array_equal(
+        pear_gloss, np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1))
+    )
     np.testing.assert_array_equal(table_gloss, np.tile([1, 0, 0], (len(table_gloss), 1)))
 
 

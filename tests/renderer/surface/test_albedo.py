@@ -14,7 +14,7 @@ from renderer.geometry.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import (
     face_albedo,
-    painted_albedo,
+    paint_faces,
     surface_albedo,
 )
 from renderer.surface.texture_bake import with_added_albedo
@@ -85,7 +85,9 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
     # Row and column in units of texels, whose centers are whole numbers in SciPy.
     position = np.stack([(1 - v) * height - 0.5, u * width - 0.5])
     channels = np.moveaxis(decoded(texture / 255, encoding), 2, 0)
-    expected = [map_coordinates(channel, position, order=1, mode="grid-wrap") for channel in channels]
+    expected = [
+        map_coordinates(channel, position, order=1, mode="grid-wrap") for channel in channels
+    ]
     albedo = surface_albedo(mesh, fragments, encoding)
     np.testing.assert_allclose(albedo, np.stack(expected, axis=1), atol=64 * EPS)
 
@@ -155,7 +157,7 @@ def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped
     added = 0.1 * (draw_uniform(len(mesh.faces), 3) - 0.5)
     scaled = surface_albedo(mesh, fragments, "linear") * albedo_scale
     expected = scaled + face_albedo(added, fragments)
-    painted = painted_albedo(mesh, fragments, "linear", albedo_scale, added)
+    painted = paint_faces(mesh, fragments, "linear", albedo_scale, added)
     torch.testing.assert_close(painted, expected, rtol=0, atol=8 * EPS)
 
 
@@ -166,9 +168,9 @@ def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(
     mesh = patchwork_sphere()
     fragments = view(mesh, 16, 2)
     large = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
-    darkest = painted_albedo(mesh, fragments, "srgb", albedo_scale, -large)
+    darkest = paint_faces(mesh, fragments, "srgb", albedo_scale, -large)
     assert (darkest == 0).all()
-    brightest = painted_albedo(mesh, fragments, "srgb", albedo_scale, large)
+    brightest = paint_faces(mesh, fragments, "srgb", albedo_scale, large)
     assert brightest.min() >= 1 - 4 * EPS
     assert brightest.max() <= albedo_scale * (1 + 4 * EPS)
 
@@ -180,7 +182,7 @@ def test_the_derivative_by_the_added_albedo_is_that_of_finite_differences():
     added = (0.3 * (draw_uniform(len(mesh.faces), 3) - 0.5)).requires_grad_()
 
     def albedo(values: torch.Tensor) -> torch.Tensor:
-        return painted_albedo(mesh, fragments, "srgb", 1.5, values)
+        return paint_faces(mesh, fragments, "srgb", 1.5, values)
 
     assert torch.autograd.gradcheck(albedo, [added])
 
@@ -208,7 +210,7 @@ def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle
     assert 1 <= new_albedo_scale <= max(1, albedo_scale)
 
     fragments = view(mesh, 24, 2, OrthographicCamera(angle, angle, 2.0))
-    expected = painted_albedo(mesh, fragments, encoding, albedo_scale, added)
+    expected = paint_faces(mesh, fragments, encoding, albedo_scale, added)
     found = surface_albedo(painted, fragments, encoding) * new_albedo_scale
     error = (found - expected).abs().amax(1)
     is_untextured = torch.from_numpy(mesh.texture_ids < 0)[fragments.faces][fragments.face]
@@ -245,7 +247,7 @@ def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads
         torch.set_num_threads(threads)
         hue = torch.tensor([0.2, -0.3], requires_grad=True)
         added = torch.tensor([[0.1, 0.0, -0.1], [0.0, 0.05, 0.02]], requires_grad=True)
-        albedo = painted_albedo(mesh, fragments, "srgb", 1.0, added, hue)
+        albedo = paint_faces(mesh, fragments, "srgb", 1.0, added, hue)
         weights = torch.linspace(-1, 1, albedo.numel()).view_as(albedo)
         return list(torch.autograd.grad((weights * albedo).sum(), [hue, added]))
 

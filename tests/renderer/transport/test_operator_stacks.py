@@ -121,7 +121,9 @@ def test_all_views_in_one_call_are_the_single_views(scene, call):
     expected = torch.stack(
         [
             operator.image(light, behind)
-            for operator, light, behind in zip(operators, light_of_view, background_of_view, strict=True)
+            for operator, light, behind in zip(
+                operators, light_of_view, background_of_view, strict=True
+            )
         ]
     )
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)

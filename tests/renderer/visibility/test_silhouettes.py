@@ -40,7 +40,7 @@ def rendered(
     return image
 
 
-def even_light(radiance: float) -> Tensor:
+def soft_front_light(radiance: float) -> Tensor:
     """Return light under which a white surface has a radiance, in float64."""
     return ambient(torch.full((3,), radiance / math.pi).double())
 
@@ -230,7 +230,7 @@ def test_a_growing_square_gains_its_perimeter_times_the_jump_of_radiance(meshes,
         FROM_ABOVE,
         32,
         8,
-        light=even_light(0.6),
+        light=soft_front_light(0.6),
         vertices=vertices,
         background=0.1,
         albedo_scale=1.0,
@@ -293,7 +293,7 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
     # The background has a radiance of 0.3 in three channels.
     total = ((albedo.sum(1) - 3 * 0.3) * areas).sum() * pixels_per_area
     (expected,) = torch.autograd.grad(total, vertices)
-    options = {"light": even_light(1.0), "albedo": albedo, "albedo_scale": 1.0}
+    options = {"light": soft_front_light(1.0), "albedo": albedo, "albedo_scale": 1.0}
     for samples, bound in bounds.items():
         image = rendered(mesh, FROM_ABOVE, size, samples, vertices=vertices, **options)
         (found,) = torch.autograd.grad(image.sum(), vertices)

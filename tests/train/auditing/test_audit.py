@@ -19,7 +19,7 @@ from renderer.light.basis import parts_of
 from train.auditing import audit, lights
 from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
-from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfers
+from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
 from train.command_settings import AuditSettings
 from train.evaluation.laboratory import lab_patterns as patterns
 
@@ -80,7 +80,7 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
 def lamps_alone(monkeypatch) -> None:
     """Attack only lamps, with one radius and few steps."""
     monkeypatch.setattr(lights, "STEPS", 3)
-    monkeypatch.setattr(lights, "FURTHER", 5)
+    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 5)
     for kind in ("skylight", "projector", "lighting"):
         monkeypatch.delitem(KINDS, kind)
     monkeypatch.setitem(KINDS, "lamps", KINDS["lamps"]._replace(radii=(10.0,)))
@@ -96,7 +96,7 @@ def test_adversaries_that_were_kept_transfer_as_the_attack_itself_finds(
     other = darker_than(0.515, size=12)
     success_by_light(attacked, views, "lamps", tmp_path)
 
-    counts = transfers(attacked, other, views, tmp_path)["lamps"]
+    counts = transfer_success(attacked, other, views, tmp_path)["lamps"]
 
     assert counts == {"first": [1, 2, 1], "further": [2, 2, 2]}
     for name, is_further in (("first", False), ("further", True)):
@@ -130,7 +130,7 @@ CLASSIFIERS = {
 @pytest.fixture
 def given(monkeypatch, tmp_path) -> dict[str, Any]:
     """Return settings of an audit that takes seconds."""
-    monkeypatch.setattr(lights, "FURTHER", 2)
+    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 2)
     monkeypatch.setattr(lights, "STEPS", 2)
     for kind in ("skylight", "projector", "lamps"):
         monkeypatch.delitem(KINDS, kind)
@@ -320,7 +320,7 @@ def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
 ):
     write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
     text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
-    assert text.startswith(f"Is dark safe in strange light? {answer}")
+    assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):

@@ -83,7 +83,7 @@ def test_an_attacked_local_light_is_added_to_the_scene(light):
 def test_a_class_whose_name_is_a_number_is_a_target():
     classifier = by_color(("orange", "7", "8"))
     result = attacked("target=7", "attack.max_steps=1", classifier=classifier)
-    assert result.goal.target.tolist() == [[1]]
+    assert result.criterion.target.tolist() == [[1]]
 
 
 class TestAClassifierThatKnowsOrangesBeforeLightGrayAlone:

@@ -97,10 +97,18 @@ def irradiance(mesh: Mesh, camera: Camera, light: Tensor) -> Tensor:
     return renderer.render(white, camera, dim * light.double(), 96, 0.0)[0].flatten(1) / dim
 
 
-def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, encoding: str, determined: bool):
+def check_fit(
+    call, capsys, here, name: str, camera: Camera, radiance: Tensor, encoding: str, determined: bool
+):
     mesh = load_object(ObjectSettings(name, label="orange")).mesh
     side = MARGIN * photograph(here, mesh, camera, radiance, encoding)
-    arguments = [f"mesh={name}", "photograph=photo.png", "mask=mask.png", "out=fitted", f"encoding={encoding}"]
+    arguments = [
+        f"mesh={name}",
+        "photograph=photo.png",
+        "mask=mask.png",
+        "out=fitted",
+        f"encoding={encoding}",
+    ]
     if isinstance(camera, PerspectiveCamera):
         angle = 2 * math.degrees(math.atan(math.tan(math.radians(camera.angle) / 2) * side))
         arguments.append(f"fov={angle}")
@@ -109,7 +117,17 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
     output = capsys.readouterr().out
     printed = float(re.search(r"the object's pixels differ by ([0-9.]+)%", output)[1]) / 100
     command = shlex.split(output.splitlines()[-1])
-    assert call("attack", *command[1:], "attack.force=true", "attack.max_steps=1", "attack.checks=false", "out=a") == 0
+    assert (
+        call(
+            "attack",
+            *command[1:],
+            "attack.force=true",
+            "attack.max_steps=1",
+            "attack.checks=false",
+            "out=a",
+        )
+        == 0
+    )
     [file] = (here / "a").glob("**/before.npy")
     shown = torch.from_numpy(np.load(file))[0].double()
     background = read_image(here / "fitted" / "background.png", shown.shape[-1]).double()
@@ -120,7 +138,10 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
     assert real < 0.05
     light = load_light(str(here / "fitted" / "light.json"), None)
     assert float(to_map(light, 256).min()) >= 0
-    found, true = irradiance(mesh, camera, light), irradiance(mesh, camera, project(radiance.double(), 20))
+    found, true = (
+        irradiance(mesh, camera, light),
+        irradiance(mesh, camera, project(radiance.double(), 20)),
+    )
     assert float(((found - true).norm(dim=1) / true.norm(dim=1)).max()) < 0.07
     scene = attack_command.read(command[1:]).scene
     if determined:
@@ -132,12 +153,23 @@ def check_fit(call, capsys, here, name: str, camera: Camera, radiance: Tensor, e
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["srgb", "linear"])
-def test_camera_and_light_of_a_path_traced_textured_solid_are_found(call, tmp_path, capsys, encoding):
+def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
+    call, tmp_path, capsys, encoding
+):
     pytest.importorskip("mitsuba")
     mesh = tmp_path / "pear.glb"
     export_mesh(renderer.normalize(textured("pear")), mesh)
     camera = PerspectiveCamera(68.8, 40.1, 3.0, 0.2, -0.1, distance=5.0)
-    check_fit(call, capsys, tmp_path, str(mesh), camera, unclipped(generated_map()), encoding, determined=True)
+    check_fit(
+        call,
+        capsys,
+        tmp_path,
+        str(mesh),
+        camera,
+        unclipped(generated_map()),
+        encoding,
+        determined=True,
+    )
 
 
 @pytest.mark.slow
@@ -148,12 +180,18 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(call, tmp_pa
     [
         ("banana.glb", "city", True),
         ("apple_scan.glb", "forest", True),
-        pytest.param("golf_ball.glb", "night", False, marks=missed("no descent begins near the ball's label")),
+        pytest.param(
+            "golf_ball.glb", "night", False, marks=missed("no descent begins near the ball's label")
+        ),
     ],
 )
-def test_camera_and_light_of_a_path_traced_scan_are_found(call, tmp_path, capsys, name, light, determined):
+def test_camera_and_light_of_a_path_traced_scan_are_found(
+    call, tmp_path, capsys, name, light, determined
+):
     """The shape of a golf ball does not determine the camera."""
     pytest.importorskip("mitsuba")
     camera = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
     radiance = unclipped(read_panorama(DATA / "hdri" / f"{light}.npy"))
-    check_fit(call, capsys, tmp_path, str(DATA / "meshes" / name), camera, radiance, "srgb", determined)
+    check_fit(
+        call, capsys, tmp_path, str(DATA / "meshes" / name), camera, radiance, "srgb", determined
+    )

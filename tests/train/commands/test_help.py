@@ -16,7 +16,18 @@ from train.runs.run_config import given_command
 from train.settings import dotted
 
 ROOT = Path(__file__).parents[3]
-NAMES = ("train", "attack", "audit", "compare", "evaluate", "fit", "lab", "light", "publish", "report")
+NAMES = (
+    "train",
+    "attack",
+    "audit",
+    "compare",
+    "evaluate",
+    "fit",
+    "lab",
+    "light",
+    "publish",
+    "report",
+)
 
 
 def help_of(name: str, *arguments: str) -> str:
@@ -77,7 +88,9 @@ def test_every_setting_has_an_explanation(name):
     ],
     ids=["installed"],
 )
-def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(tmp_path, program, path, word, completed):
+def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(
+    tmp_path, program, path, word, completed
+):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "pnb-train").write_text("from train.__main__ import main\nmain()")
     (tmp_path / "train.py").write_text("raise SystemExit('not this')")

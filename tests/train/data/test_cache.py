@@ -20,7 +20,9 @@ TENSORS = {
 
 def test_any_change_of_the_sources_is_another_key(tmp_path):
     package = tmp_path / "package"
-    shutil.copytree(Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
     assert source_key(package) == source_key(Path(renderer.__file__).parent)
     module, keys = package / "camera.py", {source_key(package)}
     for change in (
@@ -92,20 +94,28 @@ def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeyp
     cache = TensorCache(tmp_path)
     for _ in range(3):
         cache.write(KEY, TENSORS)
-    assert caplog.text.count("No space left on device") == len(tries) == 1 and not list(tmp_path.iterdir())
+    assert caplog.text.count("No space left on device") == len(tries) == 1 and not list(
+        tmp_path.iterdir()
+    )
 
 
 @pytest.mark.parametrize(
     ("choice", "environment", "folder"),
     [
-        ("auto", {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, "/caches/parametric-norm-balls"),
+        (
+            "auto",
+            {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"},
+            "/caches/parametric-norm-balls",
+        ),
         ("auto", {"HOME": "/home/user"}, "/home/user/.cache/parametric-norm-balls"),
         ("auto", {"XDG_CACHE_HOME": "relative", "HOME": "/home/user"}, None),
         ("~/here", {"HOME": "/home/user"}, "/home/user/here"),
         (None, {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, None),
     ],
 )
-def test_the_folder_is_the_users_cache_folder_unless_chosen(choice, environment, folder, monkeypatch):
+def test_the_folder_is_the_users_cache_folder_unless_chosen(
+    choice, environment, folder, monkeypatch
+):
     monkeypatch.delenv("XDG_CACHE_HOME")
     for name, value in environment.items():
         monkeypatch.setenv(name, value)

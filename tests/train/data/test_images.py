@@ -32,7 +32,9 @@ def files(tmp_path) -> ImageFiles:
     Image.fromarray(np.full((80, 100), 40_000, np.uint16)).save(tmp_path / "e.png")
     image.save(tmp_path / "f.gif", save_all=True, append_images=[ramp(90, 120).rotate(90)])
     ramp(1500, 1200).save(tmp_path / "g.jpg")
-    return ImageFiles(tmp_path, tuple(item.path for item in find_unlabeled(tmp_path)), SIZE, workers=0, skip=False)
+    return ImageFiles(
+        tmp_path, tuple(item.path for item in find_unlabeled(tmp_path)), SIZE, workers=0, skip=False
+    )
 
 
 def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files):
@@ -40,23 +42,37 @@ def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files)
     squares = torch.cat(list(files.squares(torch.arange(len(files)).split(3))))
     assert squares.shape == files.shape
     torch.testing.assert_close(squares[:-1], expected[:-1], rtol=0, atol=0)
-    assert (squares[-1].int() - expected[-1].int()).abs().max() <= 3  # decoded at another fraction of its size
+    assert (
+        squares[-1].int() - expected[-1].int()
+    ).abs().max() <= 3  # decoded at another fraction of its size
 
 
 def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_processes(files):
     rows, seeds = torch.zeros(200, dtype=torch.int64), torch.arange(200)
     (crops,) = files.crops([rows], [seeds])
-    halves = ImageFiles(files.folder, files.paths, SIZE, workers=2, skip=False).crops(rows.split(100), seeds.split(100))
+    halves = ImageFiles(files.folder, files.paths, SIZE, workers=2, skip=False).crops(
+        rows.split(100), seeds.split(100)
+    )
     assert torch.equal(crops, torch.cat(list(halves)))
     places = crops[:, :2].float() / 255
-    spans = [(places[:, 0, 36, -1] - places[:, 0, 36, 0]), places[:, 1, -1, 36] - places[:, 1, 0, 36]]
+    spans = [
+        (places[:, 0, 36, -1] - places[:, 0, 36, 0]),
+        places[:, 1, -1, 36] - places[:, 1, 0, 36],
+    ]
     areas = (spans[0] * spans[1]).abs()
     assert MINIMUM_AREA - 0.04 < areas.min() < 0.45 and 0.9 < areas.max() <= 1
-    assert 70 < (spans[0] < 0).sum() < 130 and (spans[1] > 0).all()  # half are flipped, none is upside down
+    assert (
+        70 < (spans[0] < 0).sum() < 130 and (spans[1] > 0).all()
+    )  # half are flipped, none is upside down
 
 
 def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, caplog):
-    for name, color in {"lemon/a": "yellow", "lemon/b": "yellow", "orange/a": "red", "orange/b": "red"}.items():
+    for name, color in {
+        "lemon/a": "yellow",
+        "lemon/b": "yellow",
+        "orange/a": "red",
+        "orange/b": "red",
+    }.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         Image.new("RGB", (80, 80), color).save(tmp_path / f"{name}.png")
     whole = (tmp_path / "lemon" / "b.png").read_bytes()
@@ -65,14 +81,20 @@ def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, cap
     with pytest.raises(InputError, match=r"lemon/b\.png cannot be read .*skip_unreadable"):
         list(load_files(tmp_path, skip=False).squares(rows))
     (images,) = load_files(tmp_path, skip=True).squares(rows)
-    assert images[:, 1, 0, 0].tolist() == [255, 255, 0, 0] and "1 images cannot be read" in caplog.text
+    assert (
+        images[:, 1, 0, 0].tolist() == [255, 255, 0, 0] and "1 images cannot be read" in caplog.text
+    )
 
 
 def load_files(folder: Path, skip: bool) -> ImageFiles:
-    return ImageFiles(folder, tuple(item.path for item in find_unlabeled(folder)), SIZE, workers=0, skip=skip)
+    return ImageFiles(
+        folder, tuple(item.path for item in find_unlabeled(folder)), SIZE, workers=0, skip=skip
+    )
 
 
-def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_where_they_stopped(tmp_path):
+def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_where_they_stopped(
+    tmp_path,
+):
     for name, color in {"a": (10, 0, 0), "b": (20, 0, 0), "c": (30, 0, 0)}.items():
         (tmp_path / name).mkdir()
         for number in range(4):
@@ -87,12 +109,20 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
     assert len(batches) == 3
     for pixels, labels, rendered in batches:
         value = pixels[:, 0, 40, 40].long()
-        assert torch.equal(labels, torch.where(rendered, -2, value // 10 - 1)) and torch.equal(rendered, value == 200)
+        assert torch.equal(labels, torch.where(rendered, -2, value // 10 - 1)) and torch.equal(
+            rendered, value == 200
+        )
     rest = list(training_batches(images, 4, 0, every, first=1))
-    assert all(torch.equal(*pair) for batch in zip(batches[1:], rest, strict=True) for pair in zip(*batch, strict=True))
+    assert all(
+        torch.equal(*pair)
+        for batch in zip(batches[1:], rest, strict=True)
+        for pair in zip(*batch, strict=True)
+    )
 
 
-def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(tmp_path, monkeypatch):
+def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(
+    tmp_path, monkeypatch
+):
     (tmp_path / "a.png").write_bytes(b"no image")
     for number in range(9):
         (tmp_path / f"{number}.png").symlink_to("a.png")

@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from train.data.photographs import Photograph, find_photographs, left_out, load_photographs
+from train.data.photographs import Photograph, find_photographs, load_photographs, unsupported_files
 
 CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
@@ -31,7 +31,9 @@ def touch(folder: Path, *names: str) -> Path:
 
 def load_one(path: Path) -> np.ndarray:
     """The image as (32, 32, 3) integers."""
-    _, images, _ = load_photographs(path.parent, [Photograph(PurePosixPath(path.name), "orange", None)])
+    _, images, _ = load_photographs(
+        path.parent, [Photograph(PurePosixPath(path.name), "orange", None)]
+    )
     return images[0].permute(1, 2, 0).numpy().astype(int)
 
 
@@ -46,12 +48,23 @@ def find(folder: Path, label: str = "orange") -> list[tuple[str, str]]:
     [
         pytest.param(
             ("pear/b.PNG", "orange/2026/may/c.jpeg", "other_tomato/d.TIF"),
-            [("orange/2026/may/c.jpeg", "orange"), ("other_tomato/d.TIF", "other_tomato"), ("pear/b.PNG", "pear")],
+            [
+                ("orange/2026/may/c.jpeg", "orange"),
+                ("other_tomato/d.TIF", "other_tomato"),
+                ("pear/b.PNG", "pear"),
+            ],
             id="class folders at any depth",
         ),
         pytest.param(("b.jpg", "a.gif"), [("a.gif", "orange"), ("b.jpg", "orange")], id="flat"),
         pytest.param(
-            ("orange/a.JFIF", "orange/._a.jpg", "orange/.cache/b.jpg", ".git/c.jpg", "__MACOSX/a.jpg", "x.txt"),
+            (
+                "orange/a.JFIF",
+                "orange/._a.jpg",
+                "orange/.cache/b.jpg",
+                ".git/c.jpg",
+                "__MACOSX/a.jpg",
+                "x.txt",
+            ),
             [("orange/a.JFIF", "orange")],
             id="hidden files",
         ),
@@ -66,17 +79,38 @@ def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
     photos = tmp_path / "photos"
     (photos / "orange").symlink_to(tmp_path / "elsewhere")
     (photos / "pear" / "d.jpg").symlink_to(tmp_path / "elsewhere" / "b.jpg")
-    for circle, target in [("pear/all", photos), ("pear/self", photos / "pear"), ("pear/root", tmp_path)]:
+    for circle, target in [
+        ("pear/all", photos),
+        ("pear/self", photos / "pear"),
+        ("pear/root", tmp_path),
+    ]:
         (photos / circle).symlink_to(target)
-    assert [path for path, _ in find(photos)] == ["orange/b.jpg", "orange/deep/a.jpg", "pear/c.jpg", "pear/d.jpg"]
+    assert [path for path, _ in find(photos)] == [
+        "orange/b.jpg",
+        "orange/deep/a.jpg",
+        "pear/c.jpg",
+        "pear/d.jpg",
+    ]
 
 
 def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
-    touch(tmp_path, "orange/a.jpg", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "notes.txt", "lab.json")
+    touch(
+        tmp_path,
+        "orange/a.jpg",
+        "orange/b.HEIC",
+        "orange/c.avif",
+        "orange/.d.heic",
+        "notes.txt",
+        "lab.json",
+    )
     (tmp_path / "orange" / "folder.jpg").mkdir()
     (tmp_path / "photos.csv").write_text("path,source_tag\n")
     assert find(tmp_path) == [("orange/a.jpg", "orange")]
-    assert [*map(str, left_out(tmp_path))] == ["notes.txt", "orange/b.HEIC", "orange/c.avif"]
+    assert [*map(str, unsupported_files(tmp_path))] == [
+        "notes.txt",
+        "orange/b.HEIC",
+        "orange/c.avif",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -85,11 +119,21 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
         (("a.jpg",), "a.jpg", "orange", r"a\.jpg is not a folder"),
         (("orange/notes.txt",), ".", "orange", "holds no photographs"),
         (("Oranges/a.jpg",), ".", "orange", "Oranges is not .*such as orange, .* other_Oranges"),
-        (("pear/a.jpg", "blood_oranges/b.jpg"), ".", "orange", "blood_oranges is not .* other_blood_oranges if"),
+        (
+            ("pear/a.jpg", "blood_oranges/b.jpg"),
+            ".",
+            "orange",
+            "blood_oranges is not .* other_blood_oranges if",
+        ),
         (("lion/a.jpg", "bee/b.jpg"), ".", "orange", "bee is not named after a class"),
         (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
         (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
-        (("a.jpg",), ".", ["orange", "pear"], "has no class folders, and label names several classes"),
+        (
+            ("a.jpg",),
+            ".",
+            ["orange", "pear"],
+            "has no class folders, and label names several classes",
+        ),
     ],
 )
 def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, message):
@@ -100,7 +144,11 @@ def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, m
 
 def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tmp_path, caplog):
     found = find(touch(tmp_path, "orange/a.jpg", "lion/b.jpg", "other_bee/c.jpg"))
-    assert found == [("lion/b.jpg", "lion"), ("orange/a.jpg", "orange"), ("other_bee/c.jpg", "other_bee")]
+    assert found == [
+        ("lion/b.jpg", "lion"),
+        ("orange/a.jpg", "orange"),
+        ("other_bee/c.jpg", "other_bee"),
+    ]
     assert "1 of 3 folders" in caplog.text and "count as other things: lion" in caplog.text
 
 
@@ -121,8 +169,14 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        (b"path;source_tag\na.jpg;web\n", "make it UTF-8 with the columns path and source_tag, separated by commas"),
-        (b"path,source_tag\nb/a.jpg,web\n", "1 of 1 rows for no file of the folder, .*; give paths such as a.jpg$"),
+        (
+            b"path;source_tag\na.jpg;web\n",
+            "make it UTF-8 with the columns path and source_tag, separated by commas",
+        ),
+        (
+            b"path,source_tag\nb/a.jpg,web\n",
+            "1 of 1 rows for no file of the folder, .*; give paths such as a.jpg$",
+        ),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "two different rows for a.jpg"),
         (
             b"path,source_tag,hard_negatives\na.jpg,web,lib\n",
@@ -159,7 +213,10 @@ def test_every_exif_orientation_is_undone(tmp_path, orientation):
 
 
 def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_path):
-    thirds = [np.broadcast_to(np.uint8(color), (32, 32, 3)) for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
+    thirds = [
+        np.broadcast_to(np.uint8(color), (32, 32, 3))
+        for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))
+    ]
     for axis in (0, 1):
         path = save(tmp_path / "thirds.png", np.concatenate(thirds, axis=axis))
         np.testing.assert_array_equal(load_one(path), thirds[1])
@@ -167,7 +224,9 @@ def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_p
 
 def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
     coarse = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8))
-    path = save(tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90)
+    path = save(
+        tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90
+    )
     with Image.open(path) as image:
         whole = save(tmp_path / "a.bmp", image.convert("RGB"))
     difference = np.abs(load_one(path) - load_one(whole))
@@ -192,7 +251,9 @@ def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expecte
 
 
 def test_unreadable_images_are_named_or_skipped(tmp_path):
-    cut = save(tmp_path / "cut.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8))
+    cut = save(
+        tmp_path / "cut.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    )
     cut.write_bytes(cut.read_bytes()[:2000])
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
     (tmp_path / "text.png").write_text("not an image")
@@ -208,4 +269,6 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
         load_photographs(tmp_path, found)
     loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
     assert [str(photograph.path) for photograph in loaded] == ["good.png"]
-    assert (images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])).all() and unreadable == broken
+    assert (
+        images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])
+    ).all() and unreadable == broken

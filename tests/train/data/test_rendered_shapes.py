@@ -42,10 +42,18 @@ def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_sh
     assert len(data.train.images.unique(dim=0)) == 63 and len(set(instances)) == len(instances)
 
 
-def test_images_are_rendered_again_for_other_settings_or_other_code_alone(tmp_path, instances, monkeypatch):
+def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
+    tmp_path, instances, monkeypatch
+):
     def load(**settings):
         before = len(instances)
-        arguments = {"train": 1, "test": 2, "size": SIZE, "seed": 0, "cache": TensorCache(tmp_path)} | settings
+        arguments = {
+            "train": 1,
+            "test": 2,
+            "size": SIZE,
+            "seed": 0,
+            "cache": TensorCache(tmp_path),
+        } | settings
         return load_shapes(**arguments), len(instances) - before
 
     first, rendered = load()

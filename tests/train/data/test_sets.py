@@ -8,7 +8,14 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from train.data.sets import Split, channel_statistics, held_out_rows, load_cifar100, load_folder, load_npz
+from train.data.sets import (
+    Split,
+    channel_statistics,
+    held_out_rows,
+    load_cifar100,
+    load_folder,
+    load_npz,
+)
 
 
 def arrays(**changes) -> dict[str, np.ndarray]:
@@ -50,9 +57,15 @@ def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     "changes, fault",
     [
         ({"test_labels": None}, "test_labels is not a file in the archive"),
-        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"images are uint8 of shape \(5, 8, 8, 3\)"),
+        (
+            {"train_images": np.zeros((5, 8, 8, 3), np.uint8)},
+            r"images are uint8 of shape \(5, 8, 8, 3\)",
+        ),
         ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
-        ({"train_labels": np.zeros(4, int)}, r"labels are int64 of shape \(4,\); they must be integers \(5,\)"),
+        (
+            {"train_labels": np.zeros(4, int)},
+            r"labels are int64 of shape \(4,\); they must be integers \(5,\)",
+        ),
         ({"test_labels": np.array([0, 2])}, "labels must be 0 to 1"),
         ({"test_labels": np.array([0, 2**64 - 1], np.uint64)}, "labels must be 0 to 1"),
         ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
@@ -69,7 +82,9 @@ def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):
 def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
     for label, name in enumerate(["lime", "fig"]):
         for number in range(10):
-            save_image(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
+            save_image(
+                tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30)
+            )
     (tmp_path / ".thumbnails").mkdir()
     data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
     assert data.classes == ("fig", "lime")
@@ -79,7 +94,9 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
         for image, label in zip(split.images, split.labels, strict=True):
             assert len(image.unique()) == 1
             shown[int(image[0, 0, 0])] = data.classes[label]
-    assert shown == {100 * label + n: name for label, name in enumerate(["lime", "fig"]) for n in range(10)}
+    assert shown == {
+        100 * label + n: name for label, name in enumerate(["lime", "fig"]) for n in range(10)
+    }
 
 
 def test_train_and_test_folders_are_the_splits(tmp_path):
@@ -95,8 +112,14 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
     [
         ([], "is not a folder"),
         (["fig/a.png"], "holds 1 class folders: it needs two or more"),
-        (["fig/a.png", "lime/.a.png"], "data/lime holds no image: put some there or remove the folder"),
-        (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], "holds test, train, val: divide it"),
+        (
+            ["fig/a.png", "lime/.a.png"],
+            "data/lime holds no image: put some there or remove the folder",
+        ),
+        (
+            ["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"],
+            "holds test, train, val: divide it",
+        ),
         (["fig/a.png", "lime/a.png"], "^test_fraction=0.1 of class 0, 1 images, is all or nothing"),
     ],
 )
@@ -107,7 +130,9 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
         load_folder(str(tmp_path / "data"), 8, 0.1)
 
 
-def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(tmp_path, caplog):
+def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(
+    tmp_path, caplog
+):
     for number in range(4):
         save_image(tmp_path / "fig" / f"{number}.png", 0)
         save_image(tmp_path / "lime" / f"{number}.png", 0)

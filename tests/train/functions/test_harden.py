@@ -60,7 +60,9 @@ def photographs(tmp_path) -> Path:
 
 
 def harden(network: nn.Module, photographs: Path, **options) -> nn.Module:
-    options = {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
+    options = (
+        {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
+    )
     return nb.harden(network, ["solid:orange:0"], photographs, **options)
 
 
@@ -74,7 +76,9 @@ def test_the_result_loads_where_the_network_was_loaded(network, photographs):
     assert torch.equal(fresh[2].weight, network[2].weight)
 
 
-def test_the_network_and_the_state_of_torch_stay_as_they_were(network, photographs, tmp_path, monkeypatch):
+def test_the_network_and_the_state_of_torch_stay_as_they_were(
+    network, photographs, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     weights = deepcopy(network.state_dict())
     random_state = torch.get_rng_state()

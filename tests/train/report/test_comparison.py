@@ -29,10 +29,10 @@ STUDIO_AND_WEB: Scores = {
 def prediction(index: int, label: str, source: str | None, score: float) -> Prediction:
     """Make the prediction of a network that predicts orange if the score is positive."""
     is_predicted_orange = score > 0
-    is_right = is_predicted_orange == (label == "orange")
+    is_correct = is_predicted_orange == (label == "orange")
     true_rank = None
     if label == "orange":
-        true_rank = 1 if is_right else 2
+        true_rank = 1 if is_correct else 2
     return Prediction(
         photograph=Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source),
         label="orange",
@@ -61,13 +61,13 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
     # No test looks at a figure.
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)
 
-    def make(arm: str, scores: Scores, *overrides: str, name: str = "photographs") -> Path:
+    def make(method: str, scores: Scores, *overrides: str, name: str = "photographs") -> Path:
         predictions = predictions_of(scores)
         summary = pool(predictions).metrics.to_summary()
         summary["images"] = str([item.photograph for item in predictions])
         summary["label"] = "orange"
         run_count = len(list(tmp_path.iterdir()))
-        folder = made_up_run(tmp_path / str(run_count), arm, {name: summary}, *overrides)
+        folder = made_up_run(tmp_path / str(run_count), method, {name: summary}, *overrides)
         write_predictions(folder / name / "predictions.csv", predictions)
         return folder
 
@@ -121,7 +121,7 @@ def test_a_comparison_shows_the_mean_seconds_of_the_phases_of_an_epoch(compared_
 class TestAnotherFolderOfPhotographs:
     @pytest.fixture
     def folders(self, scored_run) -> list[Path]:
-        return [scored_run(arm, STUDIO_AND_WEB, name="lab") for arm in ("none", "random")]
+        return [scored_run(method, STUDIO_AND_WEB, name="lab") for method in ("none", "random")]
 
     def test_is_compared_by_its_name_alone(self, folders):
         title = "random minus none (1 and 1 seeds, paired)"
@@ -139,7 +139,7 @@ class TestAnotherFolderOfPhotographs:
 
 @pytest.fixture
 def runs_on_two_sets(scored_run) -> list[Path]:
-    """Make two arms scored on the same four images, and a third one scored on two others."""
+    """Make two methods scored on the same four images, and a third one scored on two others."""
     return [
         scored_run("none", {"web": ([1, -1], [0, 2])}),
         scored_run("random", {"web": ([1, -1], [0, -2])}),
@@ -158,11 +158,11 @@ def test_only_scores_on_the_same_images_share_a_plot(runs_on_two_sets, tmp_path)
 
 def test_only_scores_on_the_same_images_share_a_table(runs_on_two_sets):
     text = format_table([summarize(folder) for folder in runs_on_two_sets])
-    arms = []
+    methods = []
     for title, (_, *rows) in read_markdown(text).items():
         if title.startswith("photographs"):
-            arms.append([row[0] for row in rows])
-    assert arms == [["none", "random"], ["adversarial"]]
+            methods.append([row[0] for row in rows])
+    assert methods == [["none", "random"], ["adversarial"]]
 
 
 class TestAHardenedNetwork:
@@ -176,8 +176,8 @@ class TestAHardenedNetwork:
         """Make two runs that start from the network, with its scores before training."""
         oranges = {"random": [1, 1, -1, -1], "adversarial": [1, 1, 1, 1]}
         folders = []
-        for arm, scores in oranges.items():
-            folder = scored_run(arm, {"web": (scores, [0, 2])}, "train.init_from=base")
+        for method, scores in oranges.items():
+            folder = scored_run(method, {"web": (scores, [0, 2])}, "train.init_from=base")
             copytree(initial, folder / "before" / "photographs")
             log = folder / "metrics.jsonl"
             before = '"test/accuracy_before": 0.5, "test/epoch"'
@@ -227,12 +227,12 @@ def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run):
 
 @dataclass
 class TwoArms:
-    """Runs of two arms with three seeds each, scored on 60 oranges and 40 other things.
+    """Runs of two methods with three seeds each, scored on 60 oranges and 40 other things.
 
     Attributes:
-        folders: Run folders, all seeds of the first arm first.
-        oranges: Scores by arm, seed and orange, shape (2, 3, 60).
-        others: Scores by arm, seed and other thing, shape (2, 3, 40).
+        folders: Run folders, all seeds of the first method first.
+        oranges: Scores by method, seed and orange, shape (2, 3, 60).
+        others: Scores by method, seed and other thing, shape (2, 3, 40).
     """
 
     folders: list[Path]
@@ -241,20 +241,20 @@ class TwoArms:
 
 
 @pytest.fixture
-def arms(scored_run) -> TwoArms:
-    """Score two arms, of which the second one is better, on images of unlike difficulty."""
+def methods(scored_run) -> TwoArms:
+    """Score two methods, of which the second one is better, on images of unlike difficulty."""
     generator = np.random.default_rng(0)
     easy_oranges = generator.normal(1, 1, (1, 1, 60))
     easy_others = generator.normal(0, 1, (1, 1, 40))
-    arm_shift = np.array([0.0, 0.5])[:, None, None]
-    shift = arm_shift + generator.normal(0, 0.2, (1, 3, 1))  # Each seed has its own shift.
+    method_shift = np.array([0.0, 0.5])[:, None, None]
+    shift = method_shift + generator.normal(0, 0.2, (1, 3, 1))  # Each seed has its own shift.
     oranges = easy_oranges + shift + generator.normal(0, 0.3, (2, 3, 60))
     others = easy_others + shift + generator.normal(0, 0.3, (2, 3, 40))
     folders = []
-    for row, arm in enumerate(("none", "random")):
+    for row, method in enumerate(("none", "random")):
         for seed in range(3):
             scores = {"web": (oranges[row, seed], others[row, seed])}
-            folders.append(scored_run(arm, scores, f"seed={seed}"))
+            folders.append(scored_run(method, scores, f"seed={seed}"))
     return TwoArms(folders, oranges, others)
 
 
@@ -269,13 +269,13 @@ def mean_auc(oranges: np.ndarray, others: np.ndarray) -> float:
 
 
 def differences(oranges: np.ndarray, others: np.ndarray) -> list[float]:
-    """Subtract the mean recall and the mean AUC of the first arm from those of the second."""
+    """Subtract the mean recall and the mean AUC of the first method from those of the second."""
     recall = (oranges > 0).mean(axis=(1, 2))
-    auc = [mean_auc(oranges[arm], others[arm]) for arm in (0, 1)]
+    auc = [mean_auc(oranges[method], others[method]) for method in (0, 1)]
     return [recall[1] - recall[0], auc[1] - auc[0]]
 
 
-def bootstrap(arms: TwoArms, replicate_count: int) -> np.ndarray:
+def bootstrap(methods: TwoArms, replicate_count: int) -> np.ndarray:
     """Return 95 % intervals of the differences in recall and in AUC, shape (2, 2).
 
     The loop draws seeds and images one replicate at a time.
@@ -286,8 +286,8 @@ def bootstrap(arms: TwoArms, replicate_count: int) -> np.ndarray:
         seeds = generator.integers(3, size=3)
         orange_rows = generator.integers(60, size=60)
         other_rows = generator.integers(40, size=40)
-        oranges = arms.oranges[:, seeds][:, :, orange_rows]
-        others = arms.others[:, seeds][:, :, other_rows]
+        oranges = methods.oranges[:, seeds][:, :, orange_rows]
+        others = methods.others[:, seeds][:, :, other_rows]
         replicates.append(differences(oranges, others))
     return np.quantile(replicates, (0.025, 0.975), axis=0).T
 
@@ -299,15 +299,15 @@ def read_interval(cell: str) -> tuple[float, float, float]:
     return float(difference), float(low), float(high)
 
 
-def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(arms):
-    tables = compare(arms.folders)
+def test_a_difference_has_the_interval_of_a_bootstrap_over_seeds_and_images(methods):
+    tables = compare(methods.folders)
     header, total, web = tables["random minus none (3 and 3 seeds, paired)"]
     assert header[:4] == ["source", "recall", "FPR", "AUC"]
     assert web[0] == "web"
     assert total == ["all", *web[1:]]
 
-    values = differences(arms.oranges, arms.others)
-    intervals = bootstrap(arms, 1000)
+    values = differences(methods.oranges, methods.others)
+    intervals = bootstrap(methods, 1000)
     for cell, value, interval in zip((web[1], web[3]), values, intervals, strict=True):
         difference, low, high = read_interval(cell)
         assert difference == pytest.approx(value, abs=5.1e-4)  # The table has three digits.

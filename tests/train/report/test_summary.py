@@ -62,5 +62,5 @@ def test_a_table_has_no_column_without_a_known_value(tables):
 
 
 def test_a_table_shows_the_settings_in_which_runs_differ(tables):
-    _, *rows = tables["settings in which the arms differ"]
+    _, *rows = tables["settings in which the methods differ"]
     assert rows == [["random, epochs=3", "3"], ["random, epochs=9", "9"]]

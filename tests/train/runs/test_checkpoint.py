@@ -24,7 +24,9 @@ class Harmful:
 
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
-def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(tmp_path, monkeypatch, function):
+def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(
+    tmp_path, monkeypatch, function
+):
     save(tmp_path / LAST, STATE)
     before = (tmp_path / LAST).read_bytes()
 
@@ -49,11 +51,18 @@ def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new
         pytest.param(lambda path: path.write_bytes(path.read_bytes()[:2000]), id="truncated"),
         pytest.param(lambda path: torch.save(Harmful(), path), id="code"),
         pytest.param(lambda path: save(path, {"model": {}}), id="no architecture"),
-        pytest.param(lambda path: save(path, STATE | {"model": {"weight": torch.tensor(torch.nan)}}), id="NaN"),
-        pytest.param(lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"),
+        pytest.param(
+            lambda path: save(path, STATE | {"model": {"weight": torch.tensor(torch.nan)}}),
+            id="NaN",
+        ),
+        pytest.param(
+            lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"
+        ),
     ],
 )
-def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, spoil):
+def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(
+    tmp_path, monkeypatch, spoil
+):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / BEST
     save(path, STATE)
@@ -75,7 +84,9 @@ def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(tmp
 def test_different_contents_have_different_hashes_whatever_their_layout_in_memory(other):
     assert content_hash(other) != content_hash({"a": [1, 2], "b": torch.zeros(3)})
     images = torch.rand(2, 3, 4, 4)
-    assert content_hash(images) == content_hash(images.contiguous(memory_format=torch.channels_last))
+    assert content_hash(images) == content_hash(
+        images.contiguous(memory_format=torch.channels_last)
+    )
 
 
 def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_reported(tmp_path):

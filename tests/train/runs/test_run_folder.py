@@ -18,7 +18,14 @@ from augment.service import AttackExamples
 from renderer.errors import InputError
 from renderer.light.basis import HARMONICS
 from train.command import read_settings
-from train.runs.run_config import CONFIG, decisive_settings, read_config, require_same, require_same_run, write_config
+from train.runs.run_config import (
+    CONFIG,
+    decisive_settings,
+    read_config,
+    require_same,
+    require_same_run,
+    write_config,
+)
 from train.runs.run_log import METRICS, RunLog, read_metrics
 from train.settings import ExperimentSettings
 
@@ -29,11 +36,15 @@ def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny,
     config = read_config(tmp_path / CONFIG)
     assert "command" not in config  # which would be refused, as every interpolation is
     assert config.pop("precision") == "bfloat16" and config.pop("working_folder") == os.getcwd()
-    assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {settings.data.path}
+    assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {
+        settings.data.path
+    }
     assert read_settings(ExperimentSettings, config) == settings
 
 
-BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]\n" for n in range(9))
+BOMB = "a0: &a0 [x, x]\n" + "".join(
+    f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]\n" for n in range(9)
+)
 
 
 @pytest.mark.parametrize(
@@ -57,9 +68,16 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     here, there = (
         decisive_settings(tiny("evaluate.photos=${run}/images", *overrides))
-        for overrides in (["run=here"], ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"])
+        for overrides in (
+            ["run=here"],
+            ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"],
+        )
     )
-    assert here == there and here["evaluate.photos"] == "<run>/images" and here["augment.attack.max_steps"] == 3
+    assert (
+        here == there
+        and here["evaluate.photos"] == "<run>/images"
+        and here["augment.attack.max_steps"] == 3
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,15 +103,23 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     write_config(folder, settings)
     require_same_run(folder, settings)
     file.write_bytes(b"another")
-    with pytest.raises(InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"):
+    with pytest.raises(
+        InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"
+    ):
         require_same_run(folder, settings)
 
 
-def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(tiny, tmp_path, monkeypatch):
+def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(
+    tiny, tmp_path, monkeypatch
+):
     file, reads = tmp_path / "data.npz", []
     file.write_bytes(b"data")
     settings, digest = tiny(f"data.path={file}"), hashlib.file_digest
-    monkeypatch.setattr(hashlib, "file_digest", lambda opened, name: reads.append(opened.name) or digest(opened, name))
+    monkeypatch.setattr(
+        hashlib,
+        "file_digest",
+        lambda opened, name: reads.append(opened.name) or digest(opened, name),
+    )
     write_config(tmp_path / "run", settings)
     require_same_run(tmp_path / "run", settings)
     require_same_run(tmp_path / "run", settings)
@@ -113,9 +139,13 @@ def write_epochs(folder: Path, epochs: range, history=()) -> None:
 
 
 @pytest.mark.parametrize("done", [0, 2, 3])
-def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(tmp_path, done, monkeypatch):
+def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
+    tmp_path, done, monkeypatch
+):
     """Later lines are written again, final scores too; a line cut short and lines that were lost come back."""
-    monkeypatch.setattr(time, "time", itertools.count(1e9).__next__)  # TensorBoard orders the files by their seconds
+    monkeypatch.setattr(
+        time, "time", itertools.count(1e9).__next__
+    )  # TensorBoard orders the files by their seconds
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)
     (tmp_path / METRICS).write_text('{"epoch": 3, "train/lo')
@@ -137,7 +167,9 @@ def test_tensorboard_shows_the_renders(tmp_path):
     (image,) = EventAccumulator(str(tmp_path)).Reload().Images("renders")
     with Image.open(tmp_path / "renders" / "epoch_002.png") as grid:
         pixels = np.asarray(grid)
-    assert image.step == 2 and np.array_equal(Image.open(io.BytesIO(image.encoded_image_string)), pixels)
+    assert image.step == 2 and np.array_equal(
+        Image.open(io.BytesIO(image.encoded_image_string)), pixels
+    )
     assert pixels.shape == (18, 5 * 17 + 1, 3)
     for number, render in enumerate(renders):
         tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
@@ -154,7 +186,11 @@ def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_
     sheet = np.asarray(Image.open(tmp_path / "renders" / "attacks_002.png")).astype(int)
     for image in images.flatten(0, 1):
         shown = image.numpy().transpose(1, 2, 0)
-        shown = shown.reshape(128, 4, 128, 4, 3).mean((1, 3)) if side > 128 else shown.repeat(8, 0).repeat(8, 1)
+        shown = (
+            shown.reshape(128, 4, 128, 4, 3).mean((1, 3))
+            if side > 128
+            else shown.repeat(8, 0).repeat(8, 1)
+        )
         corners = np.argwhere((abs(sheet - 255 * shown[0, 0]) < 1).all(2))
         windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
         windows = [window for window in windows if window.shape == shown.shape]
@@ -175,5 +211,7 @@ def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes
     with pytest.raises(InputError, match="was made with photos=None, not photos: give its setting"):
         require_same(tmp_path, settings, "out=", lambda *change: False)
     mesh.write_text("v 0 0 1")
-    with pytest.raises(InputError, match=r"a\.obj has changed since .* began: .* another folder with out="):
+    with pytest.raises(
+        InputError, match=r"a\.obj has changed since .* began: .* another folder with out="
+    ):
         require_same(tmp_path, Settings(meshes=[str(mesh)]), "out=", lambda *change: False)

@@ -32,8 +32,12 @@ def test_a_device_that_is_not_there_is_one_error(name):
         choose_device(name)
 
 
-@pytest.mark.parametrize("quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)])
-def test_threads_are_no_more_than_the_containers_quota_of_cores(tmp_path, monkeypatch, quota, cores):
+@pytest.mark.parametrize(
+    "quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)]
+)
+def test_threads_are_no_more_than_the_containers_quota_of_cores(
+    tmp_path, monkeypatch, quota, cores
+):
     if quota:
         (tmp_path / "cpu.max").write_text(quota)
     monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
@@ -71,7 +75,9 @@ def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkey
         (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported"),
     ],
 )
-def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, caplog, where, machine, rule, supported):
+def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
+    monkeypatch, caplog, where, machine, rule, supported
+):
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     monkeypatch.setattr(rule, lambda **options: supported)
     expected = "bfloat16" if supported else "float32" if where.type == "cpu" else "float16"
@@ -81,14 +87,18 @@ def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, caplog,
     assert bool(caplog.records) == (where.type == "cpu" and not supported)
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
     assert choose_precision("auto", where, grouped) == expected
-    assert choose_precision("auto", where, depthwise) == ("float32" if where.type == "cpu" else expected)
+    assert choose_precision("auto", where, depthwise) == (
+        "float32" if where.type == "cpu" else expected
+    )
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     images = torch.rand(4, 3, 16, 16, requires_grad=True)
     exact = network(images)
     inside = []
-    network.stem.register_forward_hook(lambda module, arguments, result: inside.append(result.dtype))
+    network.stem.register_forward_hook(
+        lambda module, arguments, result: inside.append(result.dtype)
+    )
     logits = MixedPrecision(network, "bfloat16")(images)
     logits.sum().backward()
     assert inside == [torch.bfloat16]
@@ -96,7 +106,9 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
     assert not torch.equal(logits, exact)
     assert (logits - exact).norm() / exact.norm() < 0.05  # bfloat16 has 8 bits, over a dozen layers
-    assert (torch.rand(8, 8) @ torch.rand(8, 8)).dtype == torch.float32  # autocast ends with the forward pass
+    assert (
+        torch.rand(8, 8) @ torch.rand(8, 8)
+    ).dtype == torch.float32  # autocast ends with the forward pass
 
 
 @pytest.mark.parametrize("works", [True, False])
@@ -104,7 +116,9 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
     def no_compiler(images):
         raise RuntimeError("Failed to find C compiler.")
 
-    monkeypatch.setattr(device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler)
+    monkeypatch.setattr(
+        device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler
+    )
     monkeypatch.setattr(device.torch, "zeros", lambda size, device: None)
     compiles.cache_clear()
     assert [compiles("auto", GPU), compiles("auto", GPU)] == [works, works]
@@ -116,7 +130,9 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
     compiles.cache_clear()
 
 
-@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # the compiler looks at it
+@pytest.mark.filterwarnings(
+    "ignore:The .grad attribute of a Tensor that is not a leaf"
+)  # the compiler looks at it
 def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_and_gradient():
     sizes = []
 
@@ -124,15 +140,25 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
         sizes.append(next(len(x) for x in inputs if x.shape[1:] == (3, 8, 8)))
         return module.forward
 
-    linear = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3)).double().requires_grad_(False)
+    linear = (
+        torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3))
+        .double()
+        .requires_grad_(False)
+    )
     graphed = GraphedModel(linear, compiler).eval()
     for count in (1, 7, 16, 17, 30, 32, 33):
         images = torch.rand(count, 3, 8, 8, dtype=torch.float64, requires_grad=True)
         logits, expected = graphed(images), linear(images)
         torch.testing.assert_close(logits, expected)
         weights = torch.rand_like(logits)
-        gradient, exact = (torch.autograd.grad((x * weights).sum(), images)[0] for x in (logits, expected))
+        gradient, exact = (
+            torch.autograd.grad((x * weights).sum(), images)[0] for x in (logits, expected)
+        )
         torch.testing.assert_close(gradient, exact)
     graphed.train()(images)
     graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
-    assert sizes == [16, 32, 64]  # in training mode, and for larger batches, the model is used as it is
+    assert sizes == [
+        16,
+        32,
+        64,
+    ]  # in training mode, and for larger batches, the model is used as it is

@@ -21,7 +21,9 @@ def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
     """At a learning rate so low that rounding does not grow; without dropout, whose draws differ."""
     overrides = ("train.learning_rate=0.001", "model.dropout=0.0", "train.epochs=2")
     expected = weights_of(tiny(*overrides), tmp_path / "cpu")
-    found = weights_of(tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu")
+    found = weights_of(
+        tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu"
+    )
     torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3)  # convolutions in TF32
     lines = [read_metrics(tmp_path / name) for name in ("cpu", "gpu")]
     assert lines[1][0]["augment/steps"] == pytest.approx(lines[0][0]["augment/steps"], abs=0.5)
@@ -33,7 +35,10 @@ def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, 
     again = weights_of(tiny(*overrides), tmp_path / "parts")
     (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
     parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
-    assert all(torch.equal(value, again[name]) and torch.equal(value, parts[name]) for name, value in whole.items())
+    assert all(
+        torch.equal(value, again[name]) and torch.equal(value, parts[name])
+        for name, value in whole.items()
+    )
 
 
 @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
@@ -42,7 +47,9 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
     step = Trainer._step
 
     def asynchronous(self, *batch):
-        torch.cuda.set_sync_debug_mode("error" if self._under_way.step > 3 else "default")  # after what is compiled
+        torch.cuda.set_sync_debug_mode(
+            "error" if self._under_way.step > 3 else "default"
+        )  # after what is compiled
         try:
             return step(self, *batch)
         finally:

@@ -23,7 +23,7 @@ from train.command import read_settings
 from train.runs import checkpoint
 from train.runs.run_log import read_metrics
 from train.settings import ExperimentSettings
-from train.system.processes import Interrupted, Interruption, process_group
+from train.system.processes import Interrupted, SignalHandler, process_group
 from train.training import loop
 
 ROOT = Path(__file__).parents[3]
@@ -42,8 +42,8 @@ def one_of_two(index: int, port: int, folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch, process_group():
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "two")
-        random_arm(folder / f"random_{index}.pt")
-        folder_arm(folder / f"folder_{index}.pt")
+        random_method(folder / f"random_{index}.pt")
+        folder_method(folder / f"folder_{index}.pt")
         run_until_a_signal(folder / "config.yaml", folder / "mixed")
 
 
@@ -52,24 +52,32 @@ def run_from_file(config: Path, folder: Path) -> None:
     completed_run(settings, folder)
 
 
-def random_arm(file: Path) -> None:
+def random_method(file: Path) -> None:
     """Write the images, the diagnostics and how many images this process renders beside those that it shows."""
     meshes, count = [("solid:table", 0), ("solid:plate", 1)], []
     with pytest.MonkeyPatch.context() as patch:
         render = Scene.render
-        patch.setattr(Scene, "render", lambda self, *args: (count.append(len(args[1])), render(self, *args))[1])
-        settings = AugmentationSettings(arm="random")
-        service = AugmentationService.from_meshes(meshes, 8, settings, views=3, samples=1, rasterizer="numpy")
+        patch.setattr(
+            Scene,
+            "render",
+            lambda self, *args: (count.append(len(args[1])), render(self, *args))[1],
+        )
+        settings = AugmentationSettings(method="random")
+        service = AugmentationService.from_meshes(
+            meshes, 8, settings, views=3, samples=1, rasterizer="numpy"
+        )
         service.rank, service.world_size = distributed.rank(), distributed.world_size()
         torch.manual_seed(0)
-        made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0)
+        made = service.regenerate(
+            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0
+        )
     torch.save((made.images, made.diagnostics, count[0]), file)
 
 
-def folder_arm(file: Path) -> None:
+def folder_method(file: Path) -> None:
     torch.manual_seed(0)
     images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
-    settings = AugmentationSettings(arm="folder", folder="unread", examples=5)
+    settings = AugmentationSettings(method="folder", folder="unread", examples=5)
     process = (), distributed.rank(), distributed.world_size()
     service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
     made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
@@ -121,8 +129,13 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
     torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32
     torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
     for epoch in range(1, EPOCHS + 1):
-        grids = [np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png")) for folder in ("one", name)]
-        np.testing.assert_allclose(*(grid.astype(int) for grid in grids), atol=1)  # of 255, where rounding decides
+        grids = [
+            np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png"))
+            for folder in ("one", name)
+        ]
+        np.testing.assert_allclose(
+            *(grid.astype(int) for grid in grids), atol=1
+        )  # of 255, where rounding decides
     expected, lines = (read_metrics(runs / folder) for folder in ("one", name))
     assert [line.get("epoch") for line in lines] == [*range(1, EPOCHS + 1), None]
     for one, line in zip(expected, lines, strict=True):
@@ -130,21 +143,24 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
             assert line[key] == pytest.approx(one[key], rel=1e-3), key
     assert all(line["augment/light_change"] > 0 for line in expected[:-1])
     files = [
-        {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name} for folder in ("one", name)
+        {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name}
+        for folder in ("one", name)
     ]
     assert files[0] == files[1]
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
 
 
-def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one_as_of_a_folder(runs):
-    random_arm(runs / "random.pt")
+def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one_as_of_a_folder(
+    runs,
+):
+    random_method(runs / "random.pt")
     images, diagnostics, count = torch.load(runs / "random.pt")
     assert count == len(images) == 30
     for index in range(2):
         shared, described, part = torch.load(runs / f"random_{index}.pt")
         torch.testing.assert_close(shared, images, rtol=0, atol=1e-6)
         assert part == 15 and described == pytest.approx(diagnostics, rel=1e-5)
-    folder_arm(runs / "folder.pt")
+    folder_method(runs / "folder.pt")
     whole = torch.load(runs / "folder.pt")
     for index in range(2):
         assert all(map(torch.equal, torch.load(runs / f"folder_{index}.pt"), whole))
@@ -153,9 +169,21 @@ def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of
 @pytest.mark.slow
 def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
     """The command of the README; the second call goes on where SIGTERM stopped the first."""
-    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]
+    small = [
+        "model.depth=10",
+        "model.width=1",
+        "train.batch_size=16",
+        "renderer.samples=2",
+        "augment.examples=10",
+    ]
     data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
-    overrides = [*small, *data, "train.device=cpu", "train.epochs=20", "train.checkpoint_every=1000"]
+    overrides = [
+        *small,
+        *data,
+        "train.device=cpu",
+        "train.epochs=20",
+        "train.checkpoint_every=1000",
+    ]
     start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
@@ -178,12 +206,13 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
 
 
 @pytest.mark.parametrize(
-    "ended, expected", [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)]
+    "ended, expected",
+    [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)],
 )
 def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
     """It ends the run where it is asked for, or else where the block ends; the handlers are those of before."""
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
-    with pytest.raises(expected) as stopped, Interruption() as interruption:
+    with pytest.raises(expected) as stopped, SignalHandler() as interruption:
         assert not interruption.requested()
         signal.raise_signal(signal.SIGINT)
         if ended == "by an error":
@@ -199,7 +228,7 @@ def test_a_signal_that_is_ignored_stays_so():
     """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with Interruption() as interruption:
+        with SignalHandler() as interruption:
             signal.raise_signal(signal.SIGINT)
             assert not interruption.requested()
     finally:

@@ -34,7 +34,7 @@ SETTINGS = [
     "train.batch_size=8",
     "train.images_per_epoch=16",
     "train.learning_rate=0.001",
-    "train.distillation=1",
+    "train.distillation_weight=1",
 ]
 # With this learning rate, the weights hardly move.
 ALMOST_FIXED = "train.learning_rate=1e-12"
@@ -156,8 +156,8 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
     classifier = load_classifier(f"torchvision:{NAME}", weights)
     class_of_label = torch.tensor([classifier.label("lemon"), classifier.label("orange")])
     predicted = classifier.function(test.images / 255.0).argmax(1)
-    is_right = predicted == class_of_label[test.labels]
-    assert scores["test/accuracy_before"] == pytest.approx(is_right.float().mean().item())
+    is_correct = predicted == class_of_label[test.labels]
+    assert scores["test/accuracy_before"] == pytest.approx(is_correct.float().mean().item())
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_labeled_folders_are_scored_in_the_classes_of_the_network_before_and_aft
         ("train.init_from=pretrained/none", "weights=.*train.init_from=pretrained/none"),
         ("model.name=torchvision:resnet18", "^model.name=torchvision:resnet18"),
         ("data.path=absent", "absent is not a folder"),
-        ("train.distillation=0", "set train.init_from and train.distillation"),
+        ("train.distillation_weight=0", "set train.init_from and train.distillation_weight"),
     ],
 )
 def test_settings_that_do_not_fit_the_network_are_refused_in_one_sentence(tuned, change, message):

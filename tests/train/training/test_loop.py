@@ -62,7 +62,9 @@ def color_network() -> nn.Sequential:
     return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 3))
 
 
-def make_trainer(folder: Path, network: nn.Module | None = None, precision: str = "float32", **settings) -> Trainer:
+def make_trainer(
+    folder: Path, network: nn.Module | None = None, precision: str = "float32", **settings
+) -> Trainer:
     """Make a trainer without renders."""
     torch.manual_seed(0)
     network = network or WideResNet(3, 10, 1, dropout=0.0)
@@ -70,7 +72,9 @@ def make_trainer(folder: Path, network: nn.Module | None = None, precision: str 
     defaults = {"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"}
     recipe = TrainSettings(**defaults | settings)
     no_labels = torch.zeros(0, dtype=torch.int64)
-    no_renders = AugmentationService(AugmentationSettings(arm="none"), None, no_labels, 0, Phases())
+    no_renders = AugmentationService(
+        AugmentationSettings(method="none"), None, no_labels, 0, Phases()
+    )
     return Trainer(recipe, model, ARCHITECTURE, no_renders, folder)
 
 
@@ -144,7 +148,9 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
 def test_the_schedule_goes_on_within_an_epoch(tmp_path):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=4, schedule="cosine")
     rates = []
-    trainer.optimizer.register_step_post_hook(lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]))
+    trainer.optimizer.register_step_post_hook(
+        lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"])
+    )
     fit(trainer, single_colors(12), single_colors(3))
     expected = [0.05 * SCHEDULE_FACTORS["cosine"](step / 3) for step in range(3)]
     assert rates == pytest.approx(expected)
@@ -188,7 +194,7 @@ PLAIN_SGD = {"momentum": 0.0, "weight_decay": 0.0, "learning_rate": 1.0}
 @pytest.mark.parametrize("precision, tolerance", [("float32", 1e-6), ("float16", 2e-3)])
 def test_a_step_in_parts_follows_the_clipped_gradient_of_the_batch(tmp_path, precision, tolerance):
     """In float16 the gradient is clipped after the scale of the loss is divided out."""
-    step = Step(tmp_path, precision=precision, accumulate=4, clip_gradient=0.1, **PLAIN_SGD)
+    step = Step(tmp_path, precision=precision, accumulation_steps=4, clip_gradient=0.1, **PLAIN_SGD)
     length = torch.cat([part.flatten() for part in step.gradients]).norm()
     assert length > 0.2
     for before, after, gradient in zip(step.before, step.after, step.gradients, strict=True):
@@ -197,7 +203,7 @@ def test_a_step_in_parts_follows_the_clipped_gradient_of_the_batch(tmp_path, pre
 
 
 def test_a_step_in_parts_is_that_of_the_mean_over_the_whole_batch(tmp_path):
-    step = Step(tmp_path, accumulate=4, **PLAIN_SGD)
+    step = Step(tmp_path, accumulation_steps=4, **PLAIN_SGD)
     for before, after, gradient in zip(step.before, step.after, step.gradients, strict=True):
         torch.testing.assert_close(before - after, gradient, rtol=0, atol=1e-6)
 
@@ -253,7 +259,9 @@ def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trai
     before = {name: value.clone() for name, value in network.named_parameters()}
     freeze(network, stage)
     fit_noise(make_trainer(tmp_path, network, epochs=1))
-    changed = {name for name, value in network.named_parameters() if not torch.equal(value, before[name])}
+    changed = {
+        name for name, value in network.named_parameters() if not torch.equal(value, before[name])
+    }
     assert changed == {name for name in before if name.startswith(trained)}
 
 
@@ -263,7 +271,9 @@ def test_a_stage_that_the_network_lacks_is_refused():
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
+def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(
+    monkeypatch, training
+):
     monkeypatch.setattr(loop, "EVALUATION_BATCH", 7)
     torch.manual_seed(0)
     model = WideResNet(3, 10, 1, dropout=0.5).train(training)

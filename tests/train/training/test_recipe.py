@@ -49,7 +49,9 @@ def kl_divergence(targets: Tensor, logits: Tensor) -> Tensor:
     return (q * (q / p).log()).sum()
 
 
-@pytest.mark.parametrize("name, value", [("learning_rate", math.nan), ("distillation", 1.0), ("ema_decay", -0.1)])
+@pytest.mark.parametrize(
+    "name, value", [("learning_rate", math.nan), ("distillation_weight", 1.0), ("ema_decay", -0.1)]
+)
 def test_a_setting_out_of_range_is_named(name, value):
     with pytest.raises(InputError, match=rf"\b{name}\b"):
         TrainSettings(**{name: value})
@@ -92,20 +94,20 @@ def test_the_loss_is_the_smoothed_cross_entropy(model, images, smoothing):
     assert hits == (logits.argmax(1) == LABELS).sum()
 
 
-@pytest.mark.parametrize("studied", [(), (1,), (1, 3)])
-def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images, studied):
-    """All classes of data count, and on renders those that are not studied."""
+@pytest.mark.parametrize("positive_classes", [(), (1,), (1, 3)])
+def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images, positive_classes):
+    """All classes of data count, and on renders those that are not positive_classes."""
     is_render = torch.arange(6) < 2
-    settings = TrainSettings(init_from="base", distillation=4.0)
+    settings = TrainSettings(init_from="base", distillation_weight=4.0)
     batch = (images, LABELS, is_render)
-    alone, _ = TrainingLoss(model.eval(), TrainSettings(), studied, None).compute(*batch)
-    loss, _ = TrainingLoss(model, settings, studied, teacher).compute(*batch)
+    alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
+    loss, _ = TrainingLoss(model, settings, positive_classes, teacher).compute(*batch)
 
     logits = model(images / 255)
     targets = teacher(images / 255)
     divergence = kl_divergence(targets[2:], logits[2:])
-    if studied:
-        others = [label for label in range(4) if label not in studied]
+    if positive_classes:
+        others = [label for label in range(4) if label not in positive_classes]
         divergence = divergence + kl_divergence(targets[:2, others], logits[:2, others])
     torch.testing.assert_close(loss, alone + 4 * divergence / 6)
 
@@ -113,32 +115,36 @@ def test_distillation_adds_the_divergence_from_a_teacher(model, teacher, images,
 def test_unlabeled_images_have_the_teachers_answers_but_no_cross_entropy(model, teacher, images):
     """The ranking loss and the hits use the answers as labels."""
     is_render = torch.arange(6) < 2
-    settings = TrainSettings(init_from="base", distillation=4.0, ranking=2.0)
+    settings = TrainSettings(init_from="base", distillation_weight=4.0, ranking_weight=2.0)
     answers = torch.where(is_render, LABELS, teacher(images / 255).argmax(1))
-    studied = (int(answers[-1]),)
-    with_labels = TrainingLoss(model.eval(), settings, studied, teacher)
+    positive_classes = (int(answers[-1]),)
+    with_labels = TrainingLoss(model.eval(), settings, positive_classes, teacher)
     labeled, hits = with_labels.compute(images, answers, is_render)
     logits = model(images / 255)
     cross_entropy = F.cross_entropy(logits[2:], answers[2:], reduction="sum") / 6
-    without_labels = TrainingLoss(model, settings, studied, teacher, labeled=False)
+    without_labels = TrainingLoss(model, settings, positive_classes, teacher, labeled=False)
     unlabeled = without_labels.compute(images, LABELS * is_render, is_render)
     torch.testing.assert_close(unlabeled, (labeled - cross_entropy, hits))
 
 
-@pytest.mark.parametrize("studied", [(1,), (1, 3)])
-def test_the_mean_ranking_of_the_studied_classes_is_added_by_its_weight(model, images, studied):
+@pytest.mark.parametrize("positive_classes", [(1,), (1, 3)])
+def test_the_mean_ranking_of_the_positive_classes_is_added_by_its_weight(
+    model, images, positive_classes
+):
     # Two images show anything but class 0.
     labels = LABELS - 1
     batch = (images, labels, labels == 0)
-    alone, _ = TrainingLoss(model.eval(), TrainSettings(), studied, None).compute(*batch)
-    both, _ = TrainingLoss(model, TrainSettings(ranking=4.0), studied, None).compute(*batch)
+    alone, _ = TrainingLoss(model.eval(), TrainSettings(), positive_classes, None).compute(*batch)
+    both, _ = TrainingLoss(
+        model, TrainSettings(ranking_weight=4.0), positive_classes, None
+    ).compute(*batch)
     logits = model(images / 255)
-    rankings = [ranking_loss(logits, labels, label) for label in studied]
+    rankings = [ranking_loss(logits, labels, label) for label in positive_classes]
     torch.testing.assert_close(both, alone + 4 * torch.stack(rankings).mean())
 
 
-def test_a_hard_negative_shows_none_of_several_studied_classes(model, images):
-    """The last image has the complementary label of class 1. Class 3 is studied, too."""
+def test_a_hard_negative_shows_none_of_several_positive_classes(model, images):
+    """The last image has the complementary label of class 1. Class 3 is positive_classes, too."""
     labels = torch.tensor([1, 3, 0, 2, 1, -2])
     loss_of_both = TrainingLoss(model.eval(), TrainSettings(), (1, 3), None)
     loss, hits = loss_of_both.compute(images, labels, torch.arange(6) > 1)
@@ -174,7 +180,9 @@ def test_an_augmentation_leaves_model_and_random_state_alone(name, images, model
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)
-def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(name, images, model, monkeypatch):
+def test_draws_of_an_image_do_not_depend_on_the_number_of_processes(
+    name, images, model, monkeypatch
+):
     same = images[:1].expand(6, -1, -1, -1)
     whole = Baseline(name, model, 0).apply(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1

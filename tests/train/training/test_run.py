@@ -31,7 +31,7 @@ from train.runs.run_log import read_metrics
 from train.runs.saved_networks import load_run
 from train.system.hashing import content_hash
 from train.system.processes import Interrupted
-from train.system.user_errors import one_sentence
+from train.system.user_errors import user_message
 from train.training import loop
 from train.training.data import load_data
 from train.training.initial import choose_validation, load_initial
@@ -168,10 +168,10 @@ class TestASignalDuringTraining:
     ):
         settings = tiny(
             "train.epochs=2",
-            "augment.every=16",
+            "augment.regenerate_every=16",
             "train.images_per_epoch=40",
             "train.resume=true",
-            "train.distillation=2",
+            "train.distillation_weight=2",
             f"train.init_from={finished}",
             average,
         )
@@ -290,7 +290,7 @@ class TestThreads:
         torch.set_num_threads(before)
 
     def train(self, tiny, folder: Path, *overrides: str) -> None:
-        """Train while another arm has changed the number of threads."""
+        """Train while another method has changed the number of threads."""
         settings = tiny(*WITHOUT_RENDERS, "train.images_per_epoch=16", *overrides)
         run = loaded_run(settings, folder)
         torch.set_num_threads(1)
@@ -343,7 +343,7 @@ def test_a_full_disk_is_one_error_for_every_writer_and_the_run_can_be_resumed(
         patch.setattr(writer, Mock(side_effect=full_disk))
         with pytest.raises(OSError) as raised:
             completed_run(settings, tmp_path)
-    assert "(No space left on device)" in one_sentence(raised.value)
+    assert "(No space left on device)" in user_message(raised.value)
     completed_run(settings, tmp_path)
     assert len(read_metrics(tmp_path)) == 2
 
@@ -374,7 +374,7 @@ ANOTHER_CLASS = [
     "scene.hard_negatives=[{mesh: 'solid:apple', label: apple}]",
     "scene.views=2",
     "augment.examples=null",
-    "augment.every=30",
+    "augment.regenerate_every=30",
     "augment.warm_start=false",
 ]
 
@@ -440,7 +440,7 @@ def test_training_with_two_classes_raises_the_recall_of_both_and_shows_each(
         "augment=random",
         "augment.warm_start=false",
         "augment.examples=24",
-        "train.ranking=1",
+        "train.ranking_weight=1",
         "train.epochs=6",
         "train.resume=true",
         f"train.init_from={tmp_path / 'base'}",
@@ -487,7 +487,7 @@ class TestARunFolder:
         best = torch.load(finished / "best.pt", weights_only=True)
         assert last["epoch"] == 3
         assert last["seed"] == 7
-        assert last["arm"] == "adversarial"
+        assert last["mode"] == "adversarial"
         assert last["precision"] == "float32"
         assert last["model"].keys() == best["model"].keys()
         assert "optimizer" not in best
@@ -578,8 +578,8 @@ class TestTheSelectedNetwork:
         assert scores["test/epoch"] == best_epoch
 
         network = load_run(tmp_path)
-        is_right = network(data.test.images / 255).argmax(1) == data.test.labels
-        assert scores["test/accuracy"] == pytest.approx(is_right.double().mean().item())
+        is_correct = network(data.test.images / 255).argmax(1) == data.test.labels
+        assert scores["test/accuracy"] == pytest.approx(is_correct.double().mean().item())
         assert network.classes == ("apple", "orange", "pear")
         assert network.size == 16
 
@@ -606,10 +606,10 @@ class TestAFolderOfRenders:
             "augment=folder",
             f"augment.folder={tmp_path / 'lab'}",
             "augment.warm_start=false",
-            "augment.every=27",
+            "augment.regenerate_every=27",
             "augment.examples=4",
             "train.resume=true",
-            "train.ranking=1",
+            "train.ranking_weight=1",
             "train.epochs=2",
         )
 
@@ -810,7 +810,7 @@ def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, ti
     """A step takes 10 s and a checkpoint 3 s, so that one is saved in 150 s or more."""
     clock = FakeClock()
     save = checkpoint.save
-    requested = loop.Interruption.requested
+    requested = loop.SignalHandler.requested
 
     def slow_save(*arguments):
         clock.save_slowly()
@@ -822,8 +822,10 @@ def test_checkpoints_within_an_epoch_take_a_small_share_of_its_time(tmp_path, ti
 
     monkeypatch.setattr(loop.time, "perf_counter", clock.now)
     monkeypatch.setattr(checkpoint, "save", slow_save)
-    monkeypatch.setattr(loop.Interruption, "requested", slow_step)
-    completed_run(tiny(*WITHOUT_RENDERS, "train.batch_size=1", "train.accumulate=1"), tmp_path)
+    monkeypatch.setattr(loop.SignalHandler, "requested", slow_step)
+    completed_run(
+        tiny(*WITHOUT_RENDERS, "train.batch_size=1", "train.accumulation_steps=1"), tmp_path
+    )
     *within_epoch, _best, _last = clock.saving_times
     assert len(within_epoch) >= 3
     assert within_epoch[0] <= 75

@@ -191,7 +191,7 @@ def draw_pattern(
     second = torch.from_numpy(draw_color(rng))[:, None, None]
     second = second * rng.uniform() * (family in TWO_COLORED)
     angle = rng.uniform(0, 2 * math.pi)
-    centers = patterns.pixel_middles(RESOLUTION)[:, 0].double()
+    centers = patterns.pixel_centers(RESOLUTION)[:, 0].double()
     points = patterns.turned(centers, math.cos(angle), -math.sin(angle))
     if family == SLIDES:
         picture = slides[int(rng.integers(len(slides)))]

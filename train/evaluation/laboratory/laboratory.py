@@ -22,7 +22,7 @@ from renderer.geometry.mesh import Mesh
 from renderer.geometry.normals import corner_normals
 from renderer.geometry.shapes import HARD_NEGATIVES
 from renderer.image import decode, encode
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.images import read_image, write_image
 from renderer.io.mitsuba_entries import environment, look_at, projector, sensor
 from renderer.light.basis import HARMONICS
@@ -30,7 +30,7 @@ from renderer.light.environment import read_panorama, to_map
 from renderer.light.presets import PROBES, load_light
 from renderer.mitsuba_scene import Part, load, mitsuba, shape, split_parts
 from train.command_settings import LabSettings
-from train.data.photographs import DESCRIPTION, FOREIGN, TABLE
+from train.data.photographs import DESCRIPTION, OTHER_PREFIX, TABLE
 from train.evaluation.laboratory.lab_patterns import RESOLUTION
 from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
 from train.runs.run_lock import LOCK, sole_writer
@@ -239,11 +239,11 @@ def write_laboratory(settings: LabSettings) -> int:
                 rows.append((path, shot.family, number, subject.mesh, brightness))
         table = io.StringIO()
         csv.writer(table).writerows([COLUMNS, *sorted(rows)])
-        write_whole(out / TABLE, table.getvalue())
+        atomic_write(out / TABLE, table.getvalue())
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
         description = {**asdict(settings), "versions": versions}
-        write_whole(out / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+        atomic_write(out / DESCRIPTION, json.dumps(description, indent=2) + "\n")
         return len(rows)
 
 
@@ -316,7 +316,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     """Read an entry of `meshes`.
 
     A solid without a label gets its own name as its label. For a hard negative,
-    FOREIGN precedes the name.
+    OTHER_PREFIX precedes the name.
 
     Args:
         item: File of a mesh, name of a solid, or settings of an object.
@@ -333,9 +333,9 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     label = settings.label
     name = solid_name(settings.mesh)
     if not label and name:
-        label = FOREIGN + name if name in HARD_NEGATIVES else name
+        label = OTHER_PREFIX + name if name in HARD_NEGATIVES else name
     if not label:
-        advice = f"give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}"
+        advice = f"give {{mesh: {settings.mesh}, label: CLASS or {OTHER_PREFIX}NAME}}"
         raise InputError(f"meshes[{index}] has no label: {advice}")
     if Path(label).name != label or label == "..":
         fault = f"meshes[{index}]: the label {label!r} names the renders' folder"

@@ -14,9 +14,9 @@ from augment.classifiers.adapter import Label, NetworkCall, as_class_names
 from augment.losses import log_odds
 from augment.model_passes import eval_mode
 from augment.progress import progress
-from renderer.errors import InputError, in_one_line, require_range
+from renderer.errors import InputError, require_range, single_line
 from renderer.image import to_unit
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_folder, require_kind, require_whole
 from train.data.photographs import (
@@ -177,7 +177,7 @@ class Predictor:
             images=images,
             labels=labels,
             unreadable=unreadable,
-            left_out=[str(path) for path in left_out(folder)],
+            left_out=[str(path) for path in unsupported_files(folder)],
             images_hash=_hash(folder, photographs, labels),
         )
 
@@ -314,7 +314,7 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
     writer = csv.DictWriter(table, fieldnames=list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_whole(path, table.getvalue())
+    atomic_write(path, table.getvalue())
 
 
 def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
@@ -359,7 +359,7 @@ def read_predictions(path: Path, label: Label) -> list[Prediction]:
         return [_from_row(row, name) for name in label_names(label) for row in rows]
     except (OSError, LookupError, ValueError, TypeError, AttributeError, csv.Error) as error:
         advice = f"score the photographs again, with label={label}"
-        raise InputError(f"{path} cannot be used ({in_one_line(error)}): {advice}") from error
+        raise InputError(f"{path} cannot be used ({single_line(error)}): {advice}") from error
 
 
 def _from_row(row: Mapping[str, str], label: str) -> Prediction:

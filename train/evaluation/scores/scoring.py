@@ -18,7 +18,7 @@ import numpy as np
 from augment.classifiers.adapter import Label, OperatingPoint
 from augment.progress import progress
 from renderer.errors import InputError, require_choice
-from renderer.io.files import remove_unfinished, write_whole
+from renderer.io.files import atomic_write, remove_unfinished
 from renderer.io.images import write_image
 from renderer.validation import as_folder
 from train.data.photographs import TABLE, require_outside
@@ -279,7 +279,7 @@ def write(scores: Scores, out: Path) -> None:
     remove_unfinished(out)
     write_predictions(out / PREDICTIONS, answers.predictions)
     text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
-    write_whole(out / SUMMARY, text + "\n")
+    atomic_write(out / SUMMARY, text + "\n")
     write_image(out / CONTACT_SHEET, contact_sheet(answers.predictions, answers.images))
     pooled = scores.pooled
     groups = pooled.by_label if len(answers.labels) > 1 else pooled.by_source

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps
 
-from renderer.io.files import write_whole
+from renderer.io.files import atomic_write
 from renderer.io.tiles import PAPER, Tile, draw_grid
 from train.evaluation.scores.metrics import RATES, auc_and_recalls, roc_curve
 from train.evaluation.scores.predictions import Prediction, by_label
@@ -113,13 +113,13 @@ def _section_grid(label: str, section: _Section) -> Image.Image:
     if count > PER_SECTION:
         heading += f" ({PER_SECTION} shown, evenly by probability)"
     tiles = []
-    for prediction, image in evenly(section.shown, PER_SECTION):
+    for prediction, image in evenly_spaced(section.shown, PER_SECTION):
         tiles.append(_tile(prediction, image, section.color))
     rows = [tiles[first : first + COLUMNS] for first in range(0, len(tiles), COLUMNS)]
     return draw_grid(rows, heading=heading)
 
 
-def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
+def evenly_spaced(ordered: Sequence[Item], count: int) -> list[Item]:
     """Choose items at equal distances, the first and the last among them.
 
     Args:
@@ -178,7 +178,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
         writer.writerows(_curve_rows("", overall))
     for name, pair in known.items():
         writer.writerows(_curve_rows(name, pair))
-    write_whole(folder / ROC_TABLE, table.getvalue())
+    atomic_write(folder / ROC_TABLE, table.getvalue())
 
     figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
@@ -191,7 +191,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
         axes.legend(loc="lower right")
     image = io.BytesIO()
     figure.savefig(image)
-    write_whole(folder / ROC_FIGURE, image.getbuffer())
+    atomic_write(folder / ROC_FIGURE, image.getbuffer())
 
 
 def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:

@@ -15,8 +15,8 @@ from augment.attacks.attack import final_images
 from augment.attacks.attack_files import render_again
 from augment.attacks.parameters.material import Material
 from augment.attacks.problem import AttackProblem
-from augment.parameter_settings import MATERIAL
-from augment.scene.objects import SceneObject, on_ground
+from augment.parameter_settings import MATERIAL_PARTS
+from augment.scene.objects import SceneObject, add_table
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
@@ -28,7 +28,7 @@ from renderer.surface.albedo import changed_albedo
 FIRST = torch.zeros(1, dtype=torch.int64)  # index of the only example
 TABLE = [0.5, 0.4, 0.3]
 # What a value of 1 changes.
-UNITS = {"roughness": 0.3, "metallic": 0.2, "strength": 0.5, "hue": 40.0}
+UNITS = {"roughness": 0.3, "metallic": 0.2, "specular_factor": 0.5, "hue": 40.0}
 
 # The scenes keep to light of degree 6, which takes less time.
 pytestmark = pytest.mark.filterwarnings("ignore:.*takes light of degree")
@@ -62,7 +62,7 @@ def scene_of(*meshes: Mesh, ground: list[float] | None = None, **options) -> Sce
     """Return a scene with one example for each mesh, in float64."""
     choices = {"samples": 1, "width": 2.6, "rasterizer": "numpy", "degree": 6} | options
     scene = augment.build_scene([(meshes[0], "egg")], 16, **choices)
-    objects = [on_ground(SceneObject("egg", mesh), ground) for mesh in meshes]
+    objects = [add_table(SceneObject("egg", mesh), ground) for mesh in meshes]
     examples = [replace(scene.examples[0], object=index) for index in range(len(objects))]
     lights = 0.4 * scene.lights[0].double()
     return scene.changed(objects=objects, examples=examples, lights=lights)
@@ -124,7 +124,7 @@ def three_eggs(varied) -> Scene:
 def test_a_material_starts_as_the_scene_shows_it_and_a_matte_object_is_varnished(three_eggs):
     problem = problem_of(three_eggs)
     rows = torch.arange(3)
-    varnished_egg = on_ground(SceneObject("egg", Gloss().on(egg(None))), TABLE)
+    varnished_egg = add_table(SceneObject("egg", Gloss().on(egg(None))), TABLE)
     varnished = three_eggs.changed(objects=[varnished_egg, *three_eggs.objects[1:]])
     expected = varnished.render(three_eggs.conditions(rows), rows)
     rendered = problem.render(problem.start, rows)
@@ -233,12 +233,12 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
     Lamps make the highlights narrow. Descent reaches at least 98 % of the gain.
     """
     lamps = augment.LampsSettings([[1.5, 0.5, 2.0], [-1.0, 2.0, 1.5]], start=6.0)
-    steps = augment.MaterialSettings("linf", 1.0, "sign", 0.2, roughness=0.3, strength=1.0)
+    steps = augment.MaterialSettings("linf", 1.0, "sign", 0.2, roughness=0.3, specular_factor=1.0)
     result = attacked(
         {"material": steps},
         scene={"normals": "smooth", "lamps": lamps},
         max_steps=10,
-        shorten=True,
+        backtracking=True,
         margin=1000.0,
     )
     roughness = torch.linspace(0.2001, 0.8, 5) / 0.3
@@ -247,7 +247,7 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
     grid[:, [0, 2]] = torch.cartesian_prod(roughness, strength)
     rows = torch.zeros(25, dtype=torch.int64)
     logits = by_color(result.problem.render(grid, rows)[:, 0])
-    lowest = float(logits.log_softmax(1)[:, result.goal.source[0, 0]].min())
+    lowest = float(logits.log_softmax(1)[:, result.criterion.source[0, 0]].min())
     before = float(result.descent.cost_before[0])
     reached = float(result.descent.cost[0])
     assert 0 < 0.98 * (before - lowest) < before - reached
@@ -255,7 +255,7 @@ def test_descent_finds_a_material_as_good_as_those_of_a_grid(attacked, by_color)
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [(dict.fromkeys(MATERIAL, 0.0), "all 0"), ({"hue": 200}, "hue=200")],
+    [(dict.fromkeys(MATERIAL_PARTS, 0.0), "all 0"), ({"hue": 200}, "hue=200")],
 )
 def test_settings_without_parts_or_out_of_range_are_refused(settings, message):
     with pytest.raises(InputError, match=message):

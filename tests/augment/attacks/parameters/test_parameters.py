@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from augment.attack_settings import AttackSettings
 from augment.attacks import norm_ball
-from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.descent import Criterion, DescentResult, descend
 from augment.attacks.parameters import make_parameter, parameter_class
 from augment.attacks.parameters.local_light import LocalLight
 from augment.attacks.problem import AttackProblem
 from augment.parameter_settings import PARAMETER_NAMES, SkylightSettings, StepSettings
-from augment.scene import reshading
+from augment.scene import direct_rendering
 from augment.scene.conditions import Conditions
 from augment.scene.scene import Scene
 from renderer.camera import orbit_cameras
@@ -61,7 +61,7 @@ def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
 
 def split(problem: AttackProblem, values: Tensor) -> list[Tensor]:
     """Return the values of each parameter."""
-    return [part for _, part in problem.by_parameter(values)]
+    return [part for _, part in problem.split_by_parameter(values)]
 
 
 def problem_of(scene: Scene, **settings: StepSettings) -> AttackProblem:
@@ -81,19 +81,19 @@ def free(*names: str) -> dict[str, StepSettings]:
 def attack(
     model: nn.Module,
     problem: AttackProblem,
-    goal: Goal,
+    criterion: Criterion,
     steps: int,
 ) -> DescentResult:
     """Run the descent until the classifier errs, without a margin."""
-    return descend(model, problem, goal, AttackSettings(max_steps=steps, margin=0.0))
+    return descend(model, problem, criterion, AttackSettings(max_steps=steps, margin=0.0))
 
 
-def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
-    """Return the goal that class 0 of every image falls and the target, if any, rises."""
+def towards(problem: AttackProblem, target: int | None = 1) -> Criterion:
+    """Return the criterion that class 0 of every image falls and the target, if any, rises."""
     source = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
     if target is None:
-        return Goal(source, None)
-    return Goal(source, torch.full_like(source, target))
+        return Criterion(source, None)
+    return Criterion(source, torch.full_like(source, target))
 
 
 def float64_noise(*shape: int, draws: torch.Generator) -> Tensor:
@@ -179,7 +179,7 @@ def test_an_attack_on_the_sky_starts_at_the_sky_of_its_settings(make_scene, dtyp
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
     """Show each camera what it saw first, which is what the analytic gradient assumes."""
-    build = reshading.build_fragments
+    build = direct_rendering.build_fragments
     seen_by_camera = {}
 
     def build_once(vertices, faces, cameras, settings, rasterizer, closed=False):
@@ -189,7 +189,7 @@ def fixed_visibility(monkeypatch) -> None:
             seen_by_camera[camera] = fragments
         return seen_by_camera[camera]
 
-    monkeypatch.setattr(reshading, "build_fragments", build_once)
+    monkeypatch.setattr(direct_rendering, "build_fragments", build_once)
 
 
 MIXTURE = ["skylight", "geometry", "albedo", "pixels"]
@@ -297,7 +297,7 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     expected = (before + epsilon * gradient.sign().view_as(before)).clamp(0, 1)
 
     problem = problem_of(scene, pixels=StepSettings("linf", epsilon, "sign", epsilon))
-    images = attack(model, problem, Goal(labels.view(3, 2)), steps=1).images
+    images = attack(model, problem, Criterion(labels.view(3, 2)), steps=1).images
     assert torch.equal(images, expected)
     is_changed = (images - before).abs() > 0.99 * epsilon
     assert is_changed.double().mean() > 0.4
@@ -349,7 +349,7 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm, radi
     nearest = light.project(values, EVERY)
     offset = nearest - light.start
     assert (norms(offset, norm) <= radius * (1 + 1e-9)).all()
-    torch.testing.assert_close(light.domain(nearest), nearest, rtol=0, atol=TOLERANCE)
+    torch.testing.assert_close(light.project_feasible(nearest), nearest, rtol=0, atol=TOLERANCE)
 
     distance = (light.start - values).norm(dim=1)
     others = [light.sample(draws), light.sample(draws), light.start, light.start + offset / 2]
@@ -446,9 +446,9 @@ def test_in_a_cube_the_nearest_sky_is_that_of_each_axis(scenes_by_dtype, start, 
     if radius is not None:
         low = torch.maximum(low, sky.start[0] - radius)
         high = torch.minimum(high, sky.start[0] + radius)
-    anywhere = torch.tensor(values, dtype=torch.float64).expand(3, 3)
-    nearest = sky.project(anywhere, EVERY)
-    torch.testing.assert_close(nearest, anywhere.clamp(low, high), rtol=0, atol=0)
+    unconstrained = torch.tensor(values, dtype=torch.float64).expand(3, 3)
+    nearest = sky.project(unconstrained, EVERY)
+    torch.testing.assert_close(nearest, unconstrained.clamp(low, high), rtol=0, atol=0)
 
 
 # --------------------------------------------------------------- light and a linear classifier
@@ -549,17 +549,17 @@ TARGETS_OF_VIEWS = torch.tensor([[1, 2], [2, 1], [1, 1]])
 
 
 @pytest.fixture
-def illusion(make_scene, make_linear) -> tuple[nn.Module, AttackProblem, Goal]:
+def illusion(make_scene, make_linear) -> tuple[nn.Module, AttackProblem, Criterion]:
     """Return a model, a problem of two views per example, and a target for each view."""
     gray = torch.full((3, 3, 6, 6), 0.5)
     scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=gray)
-    goal = Goal(torch.zeros_like(TARGETS_OF_VIEWS), TARGETS_OF_VIEWS)
-    return make_linear(3, seed=6), problem_of(scene, lighting=StepSettings()), goal
+    criterion = Criterion(torch.zeros_like(TARGETS_OF_VIEWS), TARGETS_OF_VIEWS)
+    return make_linear(3, seed=6), problem_of(scene, lighting=StepSettings()), criterion
 
 
 def test_one_light_shows_each_view_as_another_class(illusion):
-    model, problem, goal = illusion
-    result = attack(model, problem, goal, steps=30)
+    model, problem, criterion = illusion
+    result = attack(model, problem, criterion, steps=30)
     assert result.success.all()
     assert not result.success_before.any()
     predicted = model(result.images.flatten(0, 1)).argmax(1).view(3, 2)
@@ -568,10 +568,10 @@ def test_one_light_shows_each_view_as_another_class(illusion):
 
 
 def test_an_attack_on_two_views_ends_only_when_both_have_their_class(illusion):
-    model, problem, goal = illusion
-    steps = attack(model, problem, goal, steps=30).steps
+    model, problem, criterion = illusion
+    steps = attack(model, problem, criterion, steps=30).steps
     slowest = steps.argmax()
-    before = attack(model, problem, goal, steps=int(steps[slowest]) - 1)
+    before = attack(model, problem, criterion, steps=int(steps[slowest]) - 1)
     assert not before.success[slowest]
     is_reached = before.predicted[slowest] == TARGETS_OF_VIEWS[slowest]
     assert is_reached.sum() < 2

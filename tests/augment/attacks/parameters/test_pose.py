@@ -14,12 +14,12 @@ import augment
 import renderer
 from augment.attacks.parameters.pose import Pose
 from augment.attacks.problem import AttackProblem
-from augment.parameter_settings import POSE
+from augment.parameter_settings import POSE_PARTS
 from augment.scene.scene import Scene
 from renderer.errors import InputError
 from renderer.geometry.mesh import Mesh
 
-ONLY = dict.fromkeys(POSE, 0.0)  # Add the parts that may change.
+ONLY = dict.fromkeys(POSE_PARTS, 0.0)  # Add the parts that may change.
 MESHES = Path(__file__).parents[5] / "shared" / "data" / "meshes"
 FIRST = torch.zeros(1, dtype=torch.int64)  # index of the only example
 GRAY = [0.5, 0.5, 0.5]
@@ -58,7 +58,7 @@ def costs(
     """Return the log-probability (N,) of the right class for poses (N, D)."""
     rows = torch.zeros(len(values), dtype=torch.int64)
     logits = classifier(result.problem.render(values, rows)[:, 0])
-    label = result.goal.source[0, 0]
+    label = result.criterion.source[0, 0]
     return logits.log_softmax(1)[:, label]
 
 
@@ -106,7 +106,7 @@ def test_an_object_that_grows_and_a_camera_that_comes_closer_do_not_meet():
     too_close = torch.tensor([[0.0] * 5 + [9, 0, 0, -9]], dtype=torch.float64)
     with pytest.raises(InputError, match="reaches the camera"):
         problem.render(too_close, FIRST)
-    problem.render(pose.domain(too_close), FIRST)
+    problem.render(pose.project_feasible(too_close), FIRST)
 
 
 @pytest.mark.parametrize("ground", [None, pytest.param(GRAY, marks=pytest.mark.slow)])
@@ -143,7 +143,7 @@ def result(attacked) -> augment.AttackResult:
     only_views = ONLY | {"view": 10.0, "shift": 0.1}
     steps = augment.PoseSettings("linf", 3.0, "sign", 0.5, **only_views)
     lit = {"silhouettes": True, "samples": 4, "normals": "smooth"}
-    return attacked({"pose": steps}, scene=lit, max_steps=20, shorten=True, margin=1000.0)
+    return attacked({"pose": steps}, scene=lit, max_steps=20, backtracking=True, margin=1000.0)
 
 
 def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, by_color):
@@ -224,7 +224,7 @@ def test_descent_by_the_joints_alone_beats_random_poses_and_is_read_back(arm, by
     options = {"silhouettes": True, "samples": 4, "rasterizer": "numpy", "width": 2.2}
     scene = augment.build_scene([(red, "orange")], 8, **options)
     pose = augment.PoseSettings("linf", 1.0, "sign", 0.2, **ONLY, joints=60.0)
-    settings = augment.AttackSettings(pose=pose, max_steps=12, margin=1000.0, shorten=True)
+    settings = augment.AttackSettings(pose=pose, max_steps=12, margin=1000.0, backtracking=True)
     result = augment.attack(by_color, scene, settings=settings, force=True)
     best_draw = costs(result, by_color, random_poses(result.problem, 12)).min()
     assert result.descent.cost[0] < best_draw < result.descent.cost_before[0]
@@ -316,7 +316,7 @@ def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and
 
     def fools(values: torch.Tensor) -> torch.Tensor:
         logits = result.preprocessed_model(result.problem.images(values)[:, 0])
-        return logits.argmax(1) != result.goal.source[:, 0]
+        return logits.argmax(1) != result.criterion.source[:, 0]
 
     draws = torch.Generator().manual_seed(0)
     at_random = torch.stack([fools(result.problem.sample(draws)) for _ in range(26)]).any(0)

@@ -24,7 +24,12 @@ from train.evaluation.laboratory.shots import FOV, Shot, draw_shots
 
 pytest.importorskip("mitsuba")
 
-MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "albedo_scale": 0.5}, "solid:lemon:7", "solid:pear:7"]
+MESHES = [
+    "solid:orange:7",
+    {"mesh": "solid:orange:8", "albedo_scale": 0.5},
+    "solid:lemon:7",
+    "solid:pear:7",
+]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -40,10 +45,21 @@ def settings(out: Path, **changes) -> LabSettings:
 
 
 def draw(
-    setups: int, families, brightness=(0.2, 2.5), seed: int = 0, environments=None, pictures=(), **changes
+    setups: int,
+    families,
+    brightness=(0.2, 2.5),
+    seed: int = 0,
+    environments=None,
+    pictures=(),
+    **changes,
 ) -> list[Shot]:
     maps = environments or {}
-    changes |= {"patterns": list(families), "environments": list(maps), "brightness": list(brightness), "seed": seed}
+    changes |= {
+        "patterns": list(families),
+        "environments": list(maps),
+        "brightness": list(brightness),
+        "seed": seed,
+    }
     return list(draw_shots(LabSettings("out", setups=setups, **changes), maps, pictures))
 
 
@@ -59,7 +75,9 @@ def laboratory(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source_and_its_settings(laboratory):
+def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source_and_its_settings(
+    laboratory,
+):
     """Each setup shows one object of the label and one other under the same light."""
     photographs = find_photographs(laboratory, sorted(SOLIDS), "orange")
     assert Counter((item.label, item.source) for item in photographs) == {
@@ -79,13 +97,19 @@ def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source_
         assert light[0] == source and 0.2 <= float(light[1]) <= 2.5
 
 
-def test_the_same_settings_write_the_same_bytes_and_another_seed_or_exposure_writes_others(laboratory, tmp_path):
+def test_the_same_settings_write_the_same_bytes_and_another_seed_or_exposure_writes_others(
+    laboratory, tmp_path
+):
     for name, changes in [("same", {}), ("seed", {"seed": 1}), ("exposure", {"exposure": 4.0})]:
         lab.write_laboratory(settings(tmp_path / name, **changes))
         for row in rows(laboratory):
-            first, again = ((folder / row["path"]).read_bytes() for folder in (laboratory, tmp_path / name))
+            first, again = (
+                (folder / row["path"]).read_bytes() for folder in (laboratory, tmp_path / name)
+            )
             assert (first == again) is (name == "same")
-    assert (tmp_path / "same" / "photos.csv").read_bytes() == (laboratory / "photos.csv").read_bytes()
+    assert (tmp_path / "same" / "photos.csv").read_bytes() == (
+        laboratory / "photos.csv"
+    ).read_bytes()
 
 
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
@@ -99,7 +123,9 @@ def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
 def test_each_setup_shows_an_object_of_each_of_several_classes_and_one_other(tmp_path):
     lab.write_laboratory(settings(tmp_path, label=["orange", "pear"], setups=2))
     for setup in ("0", "1"):
-        labels = sorted(Path(row["path"]).parent.name for row in rows(tmp_path) if row["setup"] == setup)
+        labels = sorted(
+            Path(row["path"]).parent.name for row in rows(tmp_path) if row["setup"] == setup
+        )
         assert labels == ["orange", "other_lemon", "pear"]
 
 
@@ -113,16 +139,30 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of another class"),
-        ({"label": ["orange", "apple"]}, "meshes: name at least one of label=apple and one of another class"),
-        ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, r"meshes\[0\]: the label '.*x' names the"),
-        ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\] has no label: give {mesh: fruit.glb, label: "),
+        (
+            {"meshes": ["solid:orange"]},
+            "meshes: name at least one of label=orange and one of another class",
+        ),
+        (
+            {"label": ["orange", "apple"]},
+            "meshes: name at least one of label=apple and one of another class",
+        ),
+        (
+            {"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]},
+            r"meshes\[0\]: the label '.*x' names the",
+        ),
+        (
+            {"meshes": ["solid:orange", "fruit.glb"]},
+            r"meshes\[1\] has no label: give {mesh: fruit.glb, label: ",
+        ),
         ({"setups": 5}, "setups=5 must be a multiple of the 2 patterns"),
         ({"patterns": ["stripes+slides"]}, "patterns has slides: name image files in slides="),
         ({"patterns": ["stripe"]}, "patterns=stripe: choose one of solid, gradient, stripes"),
     ],
 )
-def test_what_cannot_be_photographed_is_refused_before_anything_is_written(tmp_path, changes, message):
+def test_what_cannot_be_photographed_is_refused_before_anything_is_written(
+    tmp_path, changes, message
+):
     with pytest.raises(InputError, match=message):
         lab.write_laboratory(settings(tmp_path / "lab", **changes))
     assert not (tmp_path / "lab").exists()
@@ -148,9 +188,16 @@ def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_pattern_mixes_two_colors_one_of_which_is_darkness_in_some_families(family, seed):
-    image, again, other = (draw_pattern(family, np.random.default_rng(number)) for number in (seed, seed, seed + 100))
+    image, again, other = (
+        draw_pattern(family, np.random.default_rng(number)) for number in (seed, seed, seed + 100)
+    )
     np.testing.assert_array_equal(image, again)
-    assert image.shape == (64, 64, 3) and image.min() >= 0 and image.max() <= 1 and not np.array_equal(image, other)
+    assert (
+        image.shape == (64, 64, 3)
+        and image.min() >= 0
+        and image.max() <= 1
+        and not np.array_equal(image, other)
+    )
     colors = np.unique(image.reshape(-1, 3), axis=0)
     if family in ("colors", "text"):
         assert len(colors) > 100 if family == "colors" else colors.min(axis=0).max() == 0
@@ -172,10 +219,14 @@ def test_every_family_has_as_many_setups_from_dim_to_bright_that_differ_and_stay
     for shot in shots:
         back, towards = shot.camera - shot.aim, shot.projectors[0] - shot.center
         assert 18 <= np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) <= 60
-        assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FOV / 2)) <= 1.9  # the object fits the view
+        assert (
+            1.2 <= np.linalg.norm(back) * np.tan(np.radians(FOV / 2)) <= 1.9
+        )  # the object fits the view
         assert np.abs(shot.aim - shot.center).max() <= 0.25
         across = towards[:2] @ back[:2] / np.linalg.norm(towards[:2]) / np.linalg.norm(back[:2])
-        assert towards[2] > 0 and across >= np.cos(np.radians(70)) - 1e-9  # above, on the camera's side
+        assert (
+            towards[2] > 0 and across >= np.cos(np.radians(70)) - 1e-9
+        )  # above, on the camera's side
         np.testing.assert_allclose(shot.rotation @ shot.rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(shot.rotation) == pytest.approx(1)  # turned, not mirrored
         assert shot.rotation[2, 2] >= 0.5 - 1e-9  # tilted by at most 60 degrees
@@ -189,7 +240,10 @@ def test_wider_settings_leave_the_draws_that_they_do_not_name_as_they_were():
     for name in ("camera", "aim", "rotation", "table", "ambient", "patterns", "projectors"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     behind, camera = (other.wall - other.center)[:2], (other.camera - other.aim)[:2]
-    assert behind @ camera / np.linalg.norm(behind) / np.linalg.norm(camera) <= -np.cos(np.radians(30)) + 1e-9
+    assert (
+        behind @ camera / np.linalg.norm(behind) / np.linalg.norm(camera)
+        <= -np.cos(np.radians(30)) + 1e-9
+    )
     shots = draw(60, ["rings+text"], walls=1.0, azimuth=[-180, 180], elevation=[5, 85])
     assert {len(shot.projectors) for shot in shots} == {len(shot.patterns) for shot in shots} == {2}
     assert any(shot.wall is None for shot in shots) and any(shot.wall is not None for shot in shots)
@@ -197,14 +251,19 @@ def test_wider_settings_leave_the_draws_that_they_do_not_name_as_they_were():
         towards = np.array([position - shot.center for position in shot.projectors])
         above = np.degrees(np.arcsin(towards[:, 2] / np.linalg.norm(towards, axis=1)))
         assert (above >= 5).all() and (above <= 85).all()
-        assert shot.wall is None or (towards @ (shot.wall - shot.center) < np.sum((shot.wall - shot.center) ** 2)).all()
+        assert (
+            shot.wall is None
+            or (towards @ (shot.wall - shot.center) < np.sum((shot.wall - shot.center) ** 2)).all()
+        )
 
 
 def test_slides_project_a_picture_in_its_own_colors():
     picture = np.zeros((4, 4, 3), np.float32)
     picture[..., 0] = [[0.25], [0.5], [0.75], [1]]
     for shot in draw(3, ["slides"], slides=["a.png"], pictures=[picture]):
-        assert shot.patterns[0].shape == (64, 64, 3) and 0.25 <= shot.patterns[0][..., 0].min() < 0.5
+        assert (
+            shot.patterns[0].shape == (64, 64, 3) and 0.25 <= shot.patterns[0][..., 0].min() < 0.5
+        )
         assert shot.patterns[0][..., 0].max() <= 1 and not shot.patterns[0][..., 1:].any()
 
 
@@ -275,7 +334,9 @@ def test_two_projectors_share_the_brightness_and_a_wall_behind_is_lit_like_the_t
 
 def test_a_texture_lies_upright_on_its_faces():
     red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
-    texture = np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
+    texture = (
+        np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
+    )
     image = path_traced(lab_parts(card(texture), 1.0), frontal(), 16, 16, bounces=1, seed=0)
     strong = image > image.max() / 2
     for row, column, expected in [(5, 5, red), (5, 10, green), (10, 5, blue), (10, 10, white)]:
@@ -289,16 +350,22 @@ def test_a_card_reflects_its_linear_albedo_times_the_albedo_scale_and_the_bright
     for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
         image = path_traced(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
-        assert image[3:5, 3:5].mean() == pytest.approx((0.216 * albedo_scale + gloss) * brightness, rel=0.05)
+        assert image[3:5, 3:5].mean() == pytest.approx(
+            (0.216 * albedo_scale + gloss) * brightness, rel=0.05
+        )
 
 
 def test_an_object_stands_on_the_table():
     """A cube's front, lit by its surroundings, reaches from the table up to its height."""
     cube = trimesh.creation.box((2, 2, 2))
     shot = frontal(ambient=np.ones(3), brightness=1e-9)
-    image = path_traced(lab_parts(Mesh.plain(cube.vertices, cube.faces), 1), shot, 32, 64, bounces=1, seed=0)
+    image = path_traced(
+        lab_parts(Mesh.plain(cube.vertices, cube.faces), 1), shot, 32, 64, bounces=1, seed=0
+    )
     ray = directions(shot, 32)[:, 15]
-    height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
+    height = shot.camera[2] + ray[:, 2] * (
+        5 / ray[:, 1]
+    )  # where it meets the plane of the front, y = -1
     clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
     np.testing.assert_array_equal((image[:, 15] > 0.1).all(axis=1)[clear], (height > 0)[clear])
 
@@ -324,7 +391,9 @@ def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     mesh = Mesh.plain(vertices, faces)
     flat = mesh.face_normals()[:, None].repeat(3, axis=1)
-    np.testing.assert_array_equal(corner_normals(mesh.vertices, mesh.faces, "smooth", lab.MIN_SMOOTH_COSINE), flat)
+    np.testing.assert_array_equal(
+        corner_normals(mesh.vertices, mesh.faces, "smooth", lab.MIN_SMOOTH_COSINE), flat
+    )
     mesh = Mesh.plain(ball.vertices, ball.faces)
     smooth = corner_normals(mesh.vertices, mesh.faces, "smooth", lab.MIN_SMOOTH_COSINE)
     np.testing.assert_allclose(smooth, mesh.vertices[mesh.faces], atol=0.02)

@@ -29,19 +29,28 @@ def own_lights(scene: Scene, seed: int = 0) -> Tensor:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)])
+@pytest.mark.parametrize(
+    ("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)]
+)
 def test_images_equal_the_operators_of_each_view(make_scene, dtype, rounding, encoding):
     """In the dtype of the light. Unchanged vertices and albedo are shaded by code that operators do not use."""
     scene = make_scene(dtype=dtype, encoding=encoding, albedo_scale=1.2)
     lights, item = own_lights(scene), scene.objects[0]
-    still = {"vertices": scene.vertices.expand(3, -1, -1)}, {"albedo": torch.zeros(3, 20, 3, dtype=dtype)}
+    still = (
+        {"vertices": scene.vertices.expand(3, -1, -1)},
+        {"albedo": torch.zeros(3, 20, 3, dtype=dtype)},
+    )
     for change in ({}, *still):
         images = scene.render(Conditions(lights, **change), EVERY)
         assert images.shape == (3, 2, 3, 6, 6) and images.dtype == dtype
         assert images.min() > 0 and images.max() < 1  # nothing clamps here
-        for shown, light, cameras, behind in zip(images, lights, scene.cameras, scene.backgrounds, strict=True):
+        for shown, light, cameras, behind in zip(
+            images, lights, scene.cameras, scene.backgrounds, strict=True
+        ):
             scale_and_dtype = {"albedo_scale": item.albedo_scale, "dtype": dtype}
-            operators = build_operators(item.mesh, cameras, scene.settings, RASTERIZER, **scale_and_dtype)
+            operators = build_operators(
+                item.mesh, cameras, scene.settings, RASTERIZER, **scale_and_dtype
+            )
             expected = torch.stack([operator.image(light, behind) for operator in operators])
             torch.testing.assert_close(shown, expected, rtol=0, atol=rounding)
 
@@ -50,15 +59,23 @@ def test_images_equal_the_operators_of_each_view(make_scene, dtype, rounding, en
 def test_examples_in_any_order_have_the_same_images(make_scene, part):
     scene, draws = make_scene(), torch.Generator().manual_seed(1)
     shape = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
-    change = {} if part == "light" else {part: 0.05 * torch.randn(3, *shape[part], generator=draws).double()}
+    change = (
+        {}
+        if part == "light"
+        else {part: 0.05 * torch.randn(3, *shape[part], generator=draws).double()}
+    )
     if part == "vertices":
         change[part] += scene.vertices
     conditions = Conditions(own_lights(scene), **change)
     everything = scene.render(conditions, EVERY)
     for examples in ([1], [2, 0], [0, 2, 2, 1, 0]):
         chosen = torch.tensor(examples)
-        some = Conditions(conditions.light[chosen], **{name: value[chosen] for name, value in change.items()})
-        torch.testing.assert_close(scene.render(some, chosen), everything[chosen], rtol=0, atol=ROUNDING)
+        some = Conditions(
+            conditions.light[chosen], **{name: value[chosen] for name, value in change.items()}
+        )
+        torch.testing.assert_close(
+            scene.render(some, chosen), everything[chosen], rtol=0, atol=ROUNDING
+        )
 
 
 def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
@@ -70,7 +87,9 @@ def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
         other = make_scene(mesh=replace(stone, vertices=moved[row]))
         expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
         torch.testing.assert_close(images[row], expected, rtol=0, atol=ROUNDING)
-    assert ((images - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3).double().mean() > 0.3
+    assert (
+        (images - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3
+    ).double().mean() > 0.3
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -83,7 +102,9 @@ def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, enc
     assert ((own + offset[:, :, None]) < 0).any()
     for row in range(3):
         color = encode((own + offset[row][:, None]).clamp(0, 1), encoding)
-        other = make_scene(mesh=replace(stone, corner_colors=color.float().numpy()), encoding=encoding)
+        other = make_scene(
+            mesh=replace(stone, corner_colors=color.float().numpy()), encoding=encoding
+        )
         expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
         # The color is stored in float32.
         torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
@@ -96,8 +117,14 @@ def test_pixel_changes_are_added_last_and_clamped_and_keep_their_gradient(make_s
     scene = make_scene(backgrounds=backgrounds)
     change = 2 * torch.rand(3, 2, 3, 6, 6, generator=torch.Generator().manual_seed(0)).double() - 1
     pixels = torch.zeros_like(change, requires_grad=True)
-    images, changed = (scene.render(Conditions(scene.lights, pixels=added), EVERY) for added in (pixels, change))
-    assert torch.equal(changed, (images + change).clamp(0, 1)) and (images == 0).any() and (images == 1).any()
+    images, changed = (
+        scene.render(Conditions(scene.lights, pixels=added), EVERY) for added in (pixels, change)
+    )
+    assert (
+        torch.equal(changed, (images + change).clamp(0, 1))
+        and (images == 0).any()
+        and (images == 1).any()
+    )
     assert torch.equal(torch.autograd.grad(images.sum(), pixels)[0], torch.ones_like(pixels))
 
 
@@ -130,10 +157,18 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
 def test_frozen_shadows_darken_with_the_color():
     """A cup shades itself inside. Painted half as bright, it looks like a cup of that color."""
     cup, images = solid("cup"), []
-    options = {"encoding": "linear", "normals": "flat", "rasterizer": "numpy", "width": 2.4, "polar": 35.0}
+    options = {
+        "encoding": "linear",
+        "normals": "flat",
+        "rasterizer": "numpy",
+        "width": 2.4,
+        "polar": 35.0,
+    }
     for gray, added, shadows in ((0.6, -0.3, True), (0.3, 0.0, True), (0.3, 0.0, False)):
         mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
-        scene = augment.build_scene([(mesh, "cup")], 24, 1, **options, shadows=shadows, backgrounds=[0.0])
+        scene = augment.build_scene(
+            [(mesh, "cup")], 24, 1, **options, shadows=shadows, backgrounds=[0.0]
+        )
         albedo = torch.full((1, len(mesh.faces), 3), added)
         images.append(scene.render(Conditions(scene.lights, albedo=albedo), torch.arange(1)))
     painted, expected, without_shadows = images

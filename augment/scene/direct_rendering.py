@@ -24,7 +24,7 @@ from renderer.light.basis import Basis, split_light
 from renderer.settings import ImageSettings
 from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.shading.gloss import Gloss
-from renderer.surface.albedo import painted_albedo, surface_albedo
+from renderer.surface.albedo import paint_faces, surface_albedo
 from renderer.transport.lamp_paths import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
@@ -101,7 +101,9 @@ class FrozenTransport:
         canvas[..., surface.fragments.pixels] = change
         self.views[camera] = FrozenView(canvas.to(albedo), _sum_by_pixel(fragments, albedo))
 
-    def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
+    def radiance(
+        self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor
+    ) -> Tensor:
         """Compute the added radiance of a view, differentiable in albedo and light.
 
         Args:
@@ -134,7 +136,7 @@ def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 
 
 @dataclass(eq=False, repr=False)
-class Reshading:
+class DirectRenderer:
     """Renders views of objects without transfer operators of these views.
 
     Attributes:
@@ -242,7 +244,7 @@ class Reshading:
             fragments, albedo = self._rasterize(number, fixed_camera, positions)
         if changed.albedo is not None:
             painted = (item.mesh, fragments, self.settings.encoding, item.albedo_scale)
-            albedo = painted_albedo(*painted, changed.albedo, changed.hue)
+            albedo = paint_faces(*painted, changed.albedo, changed.hue)
         gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
@@ -258,7 +260,9 @@ class Reshading:
         if self.settings.global_illumination:
             # A camera that is being attacked changes in every call.
             is_kept = camera is fixed_camera
-            indirect = _IndirectLight(self, example, number, fixed_camera, fragments, positions, is_kept).radiance
+            indirect = _IndirectLight(
+                self, example, number, fixed_camera, fragments, positions, is_kept
+            ).radiance
         shares_normals = not is_moved and self.settings.normals == "smooth"
         shown = ShadedView(
             mesh=item.mesh,
@@ -287,7 +291,9 @@ class Reshading:
         """Return the normals (V, 3) of an unmoved object, which all its views share."""
         return torch.from_numpy(self.objects[number].mesh.vertex_normals).to(self.like.device)
 
-    def transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
+    def transport_near(
+        self, example: int, number: int, camera: Camera, vertices: np.ndarray
+    ) -> FrozenTransport:
         """Find shadows and bounces of a shape near the one of an example, or compute them.
 
         Args:
@@ -318,7 +324,9 @@ class Reshading:
         """Compute the shadows and bounces of an object's mesh, whose vertices may be moved."""
         return FrozenTransport(mesh, self.settings, self.objects[number].albedo_scale, self.basis)
 
-    def _rasterize(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
+    def _rasterize(
+        self, number: int, camera: Camera, vertices: np.ndarray
+    ) -> tuple[Fragments, Tensor]:
         """Return the samples of an object with these vertices, and their albedo (S, 3)."""
         item = self.objects[number]
         [fragments] = build_fragments(
@@ -339,7 +347,7 @@ class _IndirectLight:
     """Shadows and bounces in one view of a shape, taken from a shape nearby.
 
     Attributes:
-        reshading: Keeps the transport of shapes.
+        direct_rendering: Keeps the transport of shapes.
         example: Index of the example.
         number: Index of the object.
         camera: The camera.
@@ -348,7 +356,7 @@ class _IndirectLight:
         is_kept: Whether the view is kept for further calls.
     """
 
-    reshading: Reshading
+    direct_rendering: DirectRenderer
     example: int
     number: int
     camera: Camera
@@ -358,7 +366,9 @@ class _IndirectLight:
 
     def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
         """Return the added radiance (3, P), with albedo (S, 3), in light (K, 3)."""
-        frozen = self.reshading.transport_near(self.example, self.number, self.camera, self.positions)
+        frozen = self.direct_rendering.transport_near(
+            self.example, self.number, self.camera, self.positions
+        )
         added = frozen.radiance(self.camera, self.fragments, albedo, light)
         if not self.is_kept:
             del frozen.views[self.camera]

@@ -151,7 +151,9 @@ def irradiance(
     seen = _surfaces(camera, coarse, room, normals)
     radiance_of_sky = radiance @ sky * (math.pi / DIRECTIONS)
     blocked = _blocked_sky(room, seen, normals, directions @ turn, radiance_of_sky)
-    blocked_image = F.interpolate(blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear")[0]
+    blocked_image = F.interpolate(
+        blocked.T.unflatten(1, (coarse.size, -1))[None], image.size, mode="bilinear"
+    )[0]
     return (lit.T.unflatten(1, (image.size, -1)) - blocked_image).clamp(min=0)
 
 
@@ -193,7 +195,9 @@ def _from_local_lights(
     return arriving.unflatten(0, (len(seen.points), -1))
 
 
-def _blocked_sky(room: Room, seen: _SeenPoints, normals: Tensor, directions: Tensor, radiance: Tensor) -> Tensor:
+def _blocked_sky(
+    room: Room, seen: _SeenPoints, normals: Tensor, directions: Tensor, radiance: Tensor
+) -> Tensor:
     """Return the irradiance that the object takes from the seen points, shape (P, 3).
 
     The points have one sample per pixel. The directions (2, D, 3) are those of table and wall,
@@ -212,7 +216,9 @@ def _blocked_sky(room: Room, seen: _SeenPoints, normals: Tensor, directions: Ten
     return blocked
 
 
-def across_light(room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Tensor) -> Tensor:
+def project_along_light(
+    room: Room, mesh: Mesh, camera: Camera, image: ImageSettings, towards: Tensor
+) -> Tensor:
     """Compute where light from a direction meets what a camera sees.
 
     The camera sees the mesh, the table or the wall in the middle of each pixel.
@@ -305,7 +311,9 @@ def _surfaces(camera: Camera, image: ImageSettings, room: Room, normals: Tensor)
     count = image.size * image.samples
     middles = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
     up, right = torch.meshgrid(-middles - camera.up, middles - camera.right, indexing="ij")
-    by_pixel = torch.stack([right, up]).view(2, image.size, image.samples, image.size, image.samples)
+    by_pixel = torch.stack([right, up]).view(
+        2, image.size, image.samples, image.size, image.samples
+    )
     right, up = by_pixel.permute(0, 2, 4, 1, 3).reshape(2, image.samples**2, -1, 1)
     axes = torch.from_numpy(camera.axes())
     ends = right * axes[0] + up * axes[1]
