@@ -201,14 +201,15 @@ RUNS = {
 experiment=paper compare=[none] model.dropout=0.0 train.schedule=one_cycle augment.examples=4
 augment.attack.max_steps=3 augment.attack.step_size=0.3""",
     "best": """
-experiment=best augment.examples=null scene.views=1 scene.meshes=['solid:orange',solid:orange:1] augment.regenerate_every=30
-train.images_per_epoch=60 train.ema_decay=0.8 train.distillation_weight=1.0 augment.random_light.radius=1.0""",
+experiment=best augment.examples=null scene.views=1 scene.meshes=['solid:orange',solid:orange:1]
+augment.regenerate_every=30 train.images_per_epoch=60 train.ema_decay=0.8
+train.distillation_weight=1.0 augment.random_light.radius=1.0""",
     "harden": """
-experiment=harden augment=adversarial augment.examples=6 augment.regenerate_every=30 augment.init=random augment.warm_start=true
-+attack@augment.attack=[lighting,albedo] augment.attack.max_steps=3 augment.vary.shift=0.1
+experiment=harden augment=adversarial augment.examples=6 augment.regenerate_every=30 augment.init=random
+augment.warm_start=true +attack@augment.attack=[lighting,albedo] augment.attack.max_steps=3 augment.vary.shift=0.1
 augment.vary.exposure=[0.5,1.5] augment.vary.camera.noise=0.02 model.dropout=0.3 train.epochs=3
-train.images_per_epoch=60 train.augmentation=augmix train.ranking_weight=0.5 train.label_smoothing=0.1 train.ema_decay=0.8
-train.flips=alternating scene.views=1 scene.meshes=[solid:orange:0,solid:orange:1]
+train.images_per_epoch=60 train.augmentation=augmix train.ranking_weight=0.5 train.label_smoothing=0.1
+train.ema_decay=0.8 train.flips=alternating scene.views=1 scene.meshes=[solid:orange:0,solid:orange:1]
 scene.hard_negatives=[{mesh:'solid:ball:0',label:apple}]""",
 }
 FOLDERS: dict[str, Path] = {}  # of the runs that were made

@@ -559,7 +559,7 @@ def fooled_in_views(
         return fooled
     images_of_rows = images[rows.to(images.device)]
     examples_of_rows = examples.to(rows.device)[rows]
-    goal_of_rows = criterion.select(rows)
+    criterion_of_rows = criterion.select(rows)
     noisy_versions = stored(
         images_of_rows,
         settings.sensor_noise,
@@ -570,7 +570,7 @@ def fooled_in_views(
     for noisy_images in noisy_versions:
         logits = logits_of(model, noisy_images, settings.batch_size)
         noisy_predicted = logits.argmax(2).to(fooled.device)
-        fooled[rows] &= goal_of_rows.reached_in_views(noisy_predicted)
+        fooled[rows] &= criterion_of_rows.reached_in_views(noisy_predicted)
     return fooled
 
 

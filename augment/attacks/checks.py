@@ -490,7 +490,7 @@ class _Adversaries:
     def shown_to(self, classifier: Classifier) -> dict[str, Any]:
         """Return what a classifier predicts for the adversaries; see `transfer`."""
         settings = self.result.settings
-        criterion = self._goal(classifier)
+        criterion = self._criterion_in(classifier)
         logits_before = self._logits(self._rendered(self.before, classifier), classifier)
         images = self._rendered(self.after, classifier)
         logits = self._logits(images, classifier)
@@ -513,7 +513,7 @@ class _Adversaries:
             **predictions(logits, classifier.classes),
         }
 
-    def _goal(self, classifier: Classifier) -> Criterion:
+    def _criterion_in(self, classifier: Classifier) -> Criterion:
         """Return the criterion of the adversaries in the classes of a classifier."""
         view_count = self.result.problem.scene.views
         sources = [[adversary.shown.label] * view_count for adversary in self.after]

@@ -291,8 +291,8 @@ class Descent:
             failed_rows = torch.nonzero(~result.success).squeeze(1)
             if not len(failed_rows):
                 break
-            failed_goal = criterion.select(failed_rows)
-            restarted = self.run(failed_goal, examples[failed_rows], restart[failed_rows])
+            failed_criterion = criterion.select(failed_rows)
+            restarted = self.run(failed_criterion, examples[failed_rows], restart[failed_rows])
             result.add_restart(failed_rows, restarted)
         return result
 

@@ -195,7 +195,7 @@ def perturb(
     """Draw random lights around a light.
 
     Every coefficient is changed by a uniform random number, as in the paper's
-    random arm, whose amplitude is 0.5.
+    random mode, whose amplitude is 0.5.
 
     Args:
         light: SH coefficients, shape (K, 3) with K = (degree + 1)².

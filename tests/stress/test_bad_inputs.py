@@ -30,12 +30,12 @@ from train.data.sets import load_folder, load_npz
 from train.runs import checkpoint
 from train.system.hashing import content_hash
 
-from .conftest import PATIENCE, RENDERER, TRAINING, run_here
+from .conftest import MAX_SECONDS, RENDERER, TRAINING, run_here
 
 CODE_RAN = (
     "code_ran"  # a file that appears in the working folder where a reader runs code from its input
 )
-SECONDS = 60  # for a reader; a command has `PATIENCE`
+SECONDS = 60  # for a reader; a command has `MAX_SECONDS`
 MEMORY = (
     12 * 2**30
 )  # bytes of address space beyond today's: what asks for more fails here, and not the machine
@@ -245,7 +245,7 @@ def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]]
         signal.signal(
             signal.SIGALRM, lambda *_: pytest.fail(f"{file} was read for minutes")
         )  # no handler catches it
-        signal.alarm(SECONDS if file in READERS else PATIENCE)
+        signal.alarm(SECONDS if file in READERS else MAX_SECONDS)
         try:
             sentence = by_library(file, folder) if file in READERS else by_command(file)
         finally:

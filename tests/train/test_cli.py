@@ -188,7 +188,7 @@ class TestAStoppedRun:
             assert content_hash(resumed_state["model"]) == content_hash(whole_state["model"])
             assert (stopped / method / "photographs" / "summary.json").is_file()
 
-    def test_is_resumed_arm_by_arm(self, call, stopped):
+    def test_is_resumed_method_by_method(self, call, stopped):
         assert call("train", f"run={stopped / 'none'}", "train.resume=true") == 0
         assert not (stopped / "none" / "none").exists()
 

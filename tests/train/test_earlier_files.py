@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 import augment
 import renderer
 from augment.attacks.adversary import write_adversary
 from renderer.light.light_files import read_light
 from renderer.light.projector import Projector
+from train.__main__ import main
+from train.runs.run_config import read_config
 from train.runs.saved_networks import load_run
 
 EARLIER = Path(__file__).with_name("earlier_files")
@@ -137,3 +140,32 @@ def test_a_new_run_starts_from_an_earlier_network_whose_settings_were_other_ones
     ]
     initial = f"train.init_from={earlier}/run"
     assert call("train", *small, initial, f"run={earlier}/new") == 0
+
+
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ("augment.arm=none", "augment.mode=none"),
+        ("augment.every=60", "augment.regenerate_every=60"),
+        ("augment.attack.shorten=true", "augment.attack.backtracking=true"),
+        ("augment.attack.rounded=true", "augment.attack.quantized=true"),
+        ("augment.vary.gloss.strength=[0.1,0.2]", "augment.vary.gloss.specular_factor=[0.1,0.2]"),
+        ("train.accumulate=2", "train.accumulation_steps=2"),
+        ("train.ranking=1.0", "train.ranking_weight=1.0"),
+        ("train.distillation=1.0", "train.distillation_weight=1.0"),
+    ],
+)
+def test_a_former_key_on_the_command_line_sets_the_present_setting(former, present):
+    others = ["run=somewhere", "train.init_from=run:another"]
+    assert main.read([*others, former]) == main.read([*others, present])
+    assert main.read([*others, former]) != main.read(others)
+
+
+def test_the_settings_of_an_earlier_run_are_read_under_their_present_names():
+    written = yaml.safe_load((EARLIER / "run" / "config.yaml").read_text())
+    config = read_config(EARLIER / "run" / "config.yaml")
+    assert config.augment.mode == written["augment"]["arm"]
+    assert config.augment.regenerate_every == written["augment"]["every"]
+    assert config.augment.attack.quantized == written["augment"]["attack"]["rounded"]
+    assert config.train.accumulation_steps == written["train"]["accumulate"]
+    assert "arm" not in config.augment

@@ -80,7 +80,7 @@ def write_audit_page(
         counts=counts,
         correct=correct,
         pictures=_attack_pictures(paths, counts),
-        transfers=transfer_success,
+        transfers=transfers,
         answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},

@@ -71,7 +71,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
     settings = read_settings(ExperimentSettings, config)
-    methods = _list_arms(settings, folder)
+    methods = _list_methods(settings, folder)
     for path, method_settings in methods.items():
         if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, method_settings)
@@ -87,7 +87,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
             raise
 
 
-def _list_arms(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
+def _list_methods(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
     """Return the settings of the baselines and, at the end, of the main run, by folder."""
     methods = {}
     for method in settings.compare:

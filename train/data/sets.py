@@ -20,8 +20,8 @@ from train.data.photographs import (
     find_photographs,
     find_unlabeled,
     folder_names,
-    left_out,
     load_photographs,
+    unsupported_files,
 )
 from train.system.hashing import content_hash
 

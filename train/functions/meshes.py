@@ -14,7 +14,10 @@ from train.settings import solid_name
 # What a caller names a mesh by: a file or solid:NAME, a pair of it and its
 # class, or settings.
 MeshItem = str | Path | tuple[str | Path, str | int] | ObjectSettings
-EXPECTED = "a list of files or solids such as 'solid:orange', of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
+EXPECTED = (
+    "a list of files or solids such as 'solid:orange', "
+    "of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
+)
 
 
 def as_mappings(

@@ -103,29 +103,29 @@ def curves(
     Returns:
         The plot. None if no line has two points that differ.
     """
-    lines_of_arm: dict[str, list[list[tuple[float, float]]]] = {}
+    lines_of_method: dict[str, list[list[tuple[float, float]]]] = {}
     for method, seeds in methods.items():
-        lines_of_arm[method] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
-    all_lines = [line for lines in lines_of_arm.values() for line in lines]
+        lines_of_method[method] = [[(x, y) for x, y in seed if y is not None] for seed in seeds]
+    all_lines = [line for lines in lines_of_method.values() for line in lines]
     if not any(len({y for _, y in line}) > 1 for line in all_lines):
         return None
 
     means = []
-    for method, lines in lines_of_arm.items():
+    for method, lines in lines_of_method.items():
         ends = [line[-1][1] for line in lines if line]
         if ends:
             means.append(f"{method} {np.mean(ends):.2f}")
     alt = f"{title} by {x_title}, at the end: {', '.join(means)}"
-    return _plot(lambda axes: _draw_curves(axes, lines_of_arm, x_title), title, alt)
+    return _plot(lambda axes: _draw_curves(axes, lines_of_method, x_title), title, alt)
 
 
 def _draw_curves(
     axes: "Axes",
-    lines_of_arm: Mapping[str, list[list[tuple[float, float]]]],
+    lines_of_method: Mapping[str, list[list[tuple[float, float]]]],
     x_title: str,
 ) -> None:
     """Draw the lines of each method in its color; the first one is named in the legend."""
-    for index, (method, lines) in enumerate(lines_of_arm.items()):
+    for index, (method, lines) in enumerate(lines_of_method.items()):
         name: str | None = method
         for line in lines:
             if len(line) < 2:

@@ -233,7 +233,7 @@ class TestAnAuditWithoutMitsuba:
         monkeypatch.setattr(audit, "mitsuba", missing)
         monkeypatch.setattr(audit, "recognized", lambda *arguments: recognized)
         monkeypatch.setattr(audit, "success_by_light", lambda *arguments: counts)
-        monkeypatch.setattr(audit, "transfers", lambda *arguments: transferred)
+        monkeypatch.setattr(audit, "transfer_success", lambda *arguments: transferred)
 
     def test_leaves_the_laboratory_out_and_says_so(self, given, tmp_path):
         report = run_audit(AuditSettings(**given))

@@ -23,9 +23,9 @@ from train.data.photographs import (
     SEPARATOR,
     Photograph,
     find_photographs,
-    left_out,
     load_photographs,
     split_sources,
+    unsupported_files,
 )
 from train.settings import label_names
 
