@@ -289,7 +289,7 @@ class TrainSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
-            needed = "distillation, soup and eval_mode need a network to begin with"
+            needed = "distillation_weight, soup and eval_mode need a network to begin with"
             raise InputError(f"{needed}: set init_from")
 
 

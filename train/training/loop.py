@@ -141,7 +141,7 @@ class Trainer:
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
             needed = "name some in the scene, or give a folder of images of other things"
-            raise InputError(f"ranking ranks hard negatives: {needed}", "ranking_weight")
+            raise InputError(f"ranking_weight ranks hard negatives: {needed}", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service

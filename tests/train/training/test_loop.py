@@ -73,7 +73,7 @@ def make_trainer(
     recipe = TrainSettings(**defaults | settings)
     no_labels = torch.zeros(0, dtype=torch.int64)
     no_renders = AugmentationService(
-        AugmentationSettings(method="none"), None, no_labels, 0, Phases()
+        AugmentationSettings(mode="none"), None, no_labels, 0, Phases()
     )
     return Trainer(recipe, model, ARCHITECTURE, no_renders, folder)
 
