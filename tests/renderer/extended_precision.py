@@ -1,8 +1,11 @@
-"""A second implementation of the renderer's formulas: slow, explicit sums, no torch, numbers wider than float64.
+"""Second implementation of the formulas of the renderer, for tests of its accuracy.
 
-Arrays hold long doubles (`extended`: 64 bits of mantissa on x86) or mpmath's 256-bit numbers (`exact`), real or
-complex; every function takes either. Derivatives are complex steps, Im f(x + ih) / h, which lose no digits (Squire and
-Trapp 1998).
+It is slow, with explicit sums, without torch, and with numbers wider than
+float64. Arrays hold long doubles (`extended`: 64 bits of mantissa on x86) or
+256-bit numbers of mpmath (`exact`), real or complex. All functions take both.
+
+Derivatives are complex steps, Im f(x + ih) / h, which lose no digits (Squire and
+Trapp 1998). Vectors are columns: N vectors have the shape (3, N).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,33 +21,64 @@ from numpy.typing import ArrayLike
 
 MP = mpmath.mp.clone()
 MP.prec = 256
-STEP = "1e-60"  # its square is lost beside any number here
+# Length of a complex step. Its square is too small to change any number here.
+STEP = "1e-60"
+# Unit vectors, each of shape (3, 1).
 AXES = np.eye(3, dtype=int)[:, :, None]
+# Digits that a long double needs at most.
+LONG_DOUBLE_DIGITS = 25
 
 
 def extended(values: ArrayLike) -> np.ndarray:
-    """As long doubles."""
+    """Convert values to long doubles."""
     return np.asarray(values, dtype=np.longdouble)
 
 
-exact = np.frompyfunc(MP.mpf, 1, 1)  # as 256-bit numbers, in an array of objects
-_sqrt, _imag = np.frompyfunc(MP.sqrt, 1, 1), np.frompyfunc(lambda number: number.imag, 1, 1)
+def exact(values: ArrayLike) -> np.ndarray:
+    """Convert values to 256-bit numbers, in an array of objects."""
+    return _to_exact(values)
+
+
+_to_exact = np.frompyfunc(MP.mpf, 1, 1)
+_exact_sqrt = np.frompyfunc(MP.sqrt, 1, 1)
+_exact_imaginary_part = np.frompyfunc(lambda number: number.imag, 1, 1)
+
+
+def is_exact(values: np.ndarray) -> bool:
+    """Return whether an array holds 256-bit numbers."""
+    return values.dtype == object
+
+
+# ---------------------------------------------------------------------------- images
 
 
 @dataclass(frozen=True)
 class View:
-    """S samples of P pixels that see G faces: the edges (3, G) from a face's first corner to the others, the side ±1
-    (G,) that is seen, the albedo (G, 3), and where each sample is. Edges are `extended` or `exact`."""
+    """Samples of the covered pixels of an image, and the faces that they show.
+
+    S is the number of samples, P that of covered pixels and G that of faces seen.
+
+    Attributes:
+        first: Edge from the first to the second corner of each face, shape (3, G).
+        second: Edge from the first to the third corner of each face, shape (3, G).
+        side: Side of each face that is seen, 1 (counter-clockwise) or -1, shape (G,).
+        albedo: Albedo of each face, shape (G, 3).
+        corners: Vertex indices of each face, shape (G, 3).
+        pixel: Index of each sample's pixel among the covered ones, shape (S,).
+        face: Index of each sample's face among those seen, shape (S,).
+        pixels: Row-major indices of the covered pixels in the image, shape (P,).
+        samples: Samples of a pixel, covered or not.
+    """
 
     first: np.ndarray
     second: np.ndarray
     side: np.ndarray
     albedo: np.ndarray
-    corners: np.ndarray  # (G, 3) vertices
-    pixel: np.ndarray  # (S,) indices into the covered pixels
-    face: np.ndarray  # (S,) indices into the faces seen
-    pixels: np.ndarray  # (P,) row-major
-    samples: int  # per pixel
+    corners: np.ndarray
+    pixel: np.ndarray
+    face: np.ndarray
+    pixels: np.ndarray
+    samples: int
 
 
 def view(
@@ -57,38 +91,63 @@ def view(
     towards: np.ndarray,
     lift: Callable[[np.ndarray], np.ndarray],
 ) -> View:
-    """Read a view off the ids (R, R) of an image with samples² samples per pixel.
+    """Create a view from a rasterized image.
 
-    placed: vertices (V, 3) as the camera sees them. vertices: as they are shaded. towards: (3,) the camera's direction.
+    Args:
+        ids: Index of the face at each sample, or a negative number, shape (R, R).
+        samples: Samples per row of a pixel.
+        placed: Vertices as the camera sees them, shape (V, 3).
+        vertices: Vertices as they are shaded, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        albedo: Albedo of the faces, shape (F, 3).
+        towards: Direction to the camera, shape (3,).
+        lift: `extended` or `exact`.
+
+    Returns:
+        The view, whose edges have the numbers of `lift`.
     """
+    size = len(ids) // samples
     row, column = np.nonzero(ids >= 0)
-    place = row // samples * (len(ids) // samples) + column // samples
-    order = np.argsort(place, kind="stable")  # the samples of a pixel together
+    pixel_in_image = row // samples * size + column // samples
+    # The samples of a pixel follow each other.
+    order = np.argsort(pixel_in_image, kind="stable")
+    pixels, pixel = np.unique(pixel_in_image[order], return_inverse=True)
     seen, face = np.unique(ids[row, column][order], return_inverse=True)
-    pixels, pixel = np.unique(place[order], return_inverse=True)
+
     corners = faces[seen]
-    facing = (cross(*_edges(lift(placed), corners)) * lift(towards)[:, None]).sum(axis=0)
-    side = np.where(facing < 0, -1, 1)
+    placed_normals = cross(*_edges(lift(placed), corners))
+    cosines = (placed_normals * lift(towards)[:, None]).sum(axis=0)
+    first, second = _edges(lift(vertices), corners)
     return View(
-        *_edges(lift(vertices), corners),
-        side,
-        albedo[seen],
-        corners,
-        pixel,
-        face,
-        pixels,
-        samples**2,
+        first=first,
+        second=second,
+        side=np.where(cosines < 0, -1, 1),
+        albedo=albedo[seen],
+        corners=corners,
+        pixel=pixel,
+        face=face,
+        pixels=pixels,
+        samples=samples**2,
     )
 
 
 def image(view: View, light: np.ndarray) -> np.ndarray:
-    """(P, 3) radiance under a light ((degree + 1)², 3)."""
+    """Compute the radiance (P, 3) of the covered pixels under a light ((degree + 1)², 3)."""
     radiance = irradiance(normals_of(view), light) * view.albedo
     return added(len(view.pixels), view.pixel, radiance[view.face]) / view.samples
 
 
 def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
-    """((degree + 1)², 3) of Σ upstream (P, 3) × image."""
+    """Compute the gradient of Σ upstream × image by the light.
+
+    Args:
+        view: The view.
+        upstream: Factors of the image's values, shape (P, 3).
+        degree: Degree of the light.
+
+    Returns:
+        The gradient, shape ((degree + 1)², 3).
+    """
     weight = _face_weight(view, upstream)
     gradient = np.zeros(((degree + 1) ** 2, 3), dtype=weight.dtype)
     for index, value in reflected(normals_of(view), degree).items():
@@ -97,190 +156,287 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
 
 
 def vertex_gradient(
-    view: View, upstream: np.ndarray, light: np.ndarray, vertices: int
+    view: View,
+    upstream: np.ndarray,
+    light: np.ndarray,
+    vertex_count: int,
 ) -> np.ndarray:
-    """(V, 3) of Σ upstream (P, 3) × image. Zero for a face without area."""
+    """Compute the gradient of Σ upstream × image by the shaded vertices.
+
+    Faces without area do not contribute.
+
+    Args:
+        view: The view.
+        upstream: Factors of the image's values, shape (P, 3).
+        light: Coefficients of the light, shape ((degree + 1)², 3).
+        vertex_count: Number V of vertices.
+
+    Returns:
+        The gradient, shape (V, 3).
+    """
     weight = _face_weight(view, upstream)
+    by_first = []
+    by_second = []
+    for axis in AXES:
+        first_moves = _weighted_irradiance(view, weight, light, first=stepped(view.first, axis))
+        second_moves = _weighted_irradiance(view, weight, light, second=stepped(view.second, axis))
+        by_first.append(derivative(first_moves))
+        by_second.append(derivative(second_moves))
+    # Shape (G, 3). The first corner moves both edges backward.
+    second_corner = np.stack(by_first, axis=1)
+    third_corner = np.stack(by_second, axis=1)
+    first_corner = -second_corner - third_corner
+    by_corner = np.stack([first_corner, second_corner, third_corner], axis=1)
+    squared_area = (cross(view.first, view.second) ** 2).sum(axis=0)
+    by_corner = by_corner * (squared_area != 0)[:, None, None]
+    return added(vertex_count, view.corners.ravel(), by_corner.reshape(-1, 3))
 
-    def loss(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return (irradiance(unit(cross(first, second)) * view.side, light) * weight).sum(axis=1)
 
-    area = (cross(view.first, view.second) ** 2).sum(axis=0)
-    by_first = np.stack(
-        [derivative(loss(stepped(view.first, axis), view.second)) for axis in AXES], axis=1
-    )
-    by_second = np.stack(
-        [derivative(loss(view.first, stepped(view.second, axis))) for axis in AXES], axis=1
-    )
-    by_corner = (
-        np.stack([-by_first - by_second, by_first, by_second], axis=1) * (area != 0)[:, None, None]
-    )
-    return added(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
+def _weighted_irradiance(
+    view: View,
+    weight: np.ndarray,
+    light: np.ndarray,
+    first: np.ndarray | None = None,
+    second: np.ndarray | None = None,
+) -> np.ndarray:
+    """Compute the weighted sum (G,) of the colors of each face's irradiance, for other edges."""
+    first = view.first if first is None else first
+    second = view.second if second is None else second
+    normals = unit(cross(first, second)) * view.side
+    return (irradiance(normals, light) * weight).sum(axis=1)
+
+
+def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
+    """Compute Σ upstream × image per unit of each face's irradiance, shape (G, 3)."""
+    by_face = added(len(view.corners), view.face, upstream[view.pixel])
+    return by_face / view.samples * view.albedo
+
+
+def normals_of(view: View) -> np.ndarray:
+    """Compute the unit normals (3, G) on the side that is seen."""
+    return unit(cross(view.first, view.second)) * view.side
+
+
+def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the edges (3, F) from the first corner of each face to the others."""
+    first, second, third = vertices[faces].transpose(1, 2, 0)
+    return second - first, third - first
+
+
+# ---------------------------------------------------------------------------- harmonics
 
 
 def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """(N, 3) on surfaces with unit normals (3, N)."""
+    """Compute the irradiance (N, 3) on surfaces with unit normals (3, N)."""
     degree = round(len(light) ** 0.5) - 1
-    return sum(value[:, None] * light[index] for index, value in reflected(normals, degree).items())
+    terms = reflected(normals, degree)
+    return sum(value[:, None] * light[index] for index, value in terms.items())
 
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(N, (degree + 1)²) harmonics of directions (3, N) of any length."""
+    """Compute the harmonics (N, (degree + 1)²) of directions (3, N) of any length."""
     values = harmonics(unit(directions), range(degree + 1))
     return np.stack([values[index] for index in range(len(values))], axis=1)
 
 
 def basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
-    """(N, (degree + 1)², 3) derivatives of `basis`."""
-    scale = abs(directions).max(
-        axis=0
-    )  # the step is relative to the length, which may be a denormal's
-    slopes = [derivative(basis(stepped(directions, axis * scale), degree)) for axis in AXES]
-    return np.stack(slopes, axis=-1) / np.where(scale == 0, 1, scale)[:, None, None]
+    """Compute the derivatives (N, (degree + 1)², 3) of `basis` by the directions."""
+    # The step is relative to the length of a direction, which may be denormal.
+    scale = abs(directions).max(axis=0)
+    slopes = []
+    for axis in AXES:
+        moved = stepped(directions, axis * scale)
+        slopes.append(derivative(basis(moved, degree)))
+    divisor = np.where(scale == 0, 1, scale)
+    return np.stack(slopes, axis=-1) / divisor[:, None, None]
 
 
 def harmonics(directions: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndarray]:
-    """{l² + l + m: (N,)} at unit vectors (3, N): √(…) dᵐP_l/dzᵐ × Re or Im of (x + iy)ᵐ, no Condon-Shortley sign."""
+    """Compute harmonics at unit vectors as √(…) dᵐP_l/dzᵐ times Re or Im of (x + iy)ᵐ.
+
+    There is no Condon-Shortley sign.
+
+    Args:
+        directions: Unit vectors, shape (3, N).
+        bands: The bands l.
+
+    Returns:
+        The values (N,) of each harmonic by its index l² + l + m.
+    """
     x, y, z = directions
-    powers, cosine, sine = [1 + 0 * z], [1 + 0 * z], [0 * z]
+    one = 1 + 0 * z
+    powers_of_z = [one]
+    # Re and Im of (x + iy)ᵐ.
+    cosines = [one]
+    sines = [0 * z]
     for _ in range(max(bands)):
-        powers.append(powers[-1] * z)
-        cosine, sine = (
-            [*cosine, x * cosine[-1] - y * sine[-1]],
-            [*sine, x * sine[-1] + y * cosine[-1]],
-        )
+        powers_of_z.append(powers_of_z[-1] * z)
+        cosine = x * cosines[-1] - y * sines[-1]
+        sine = x * sines[-1] + y * cosines[-1]
+        cosines.append(cosine)
+        sines.append(sine)
     values = {}
     for l in bands:
+        center = l * l + l
         for m in range(l + 1):
-            legendre = sum(
-                as_in(directions, factor) * powers[power] for power, factor in _legendre(l, m)
-            )
-            values[l * l + l - m], values[l * l + l + m] = legendre * sine[m], legendre * cosine[m]
+            terms = _normalized_legendre(l, m)
+            legendre = sum(as_in(directions, factor) * powers_of_z[n] for n, factor in terms)
+            # If m is 0, the second line replaces the value of the first.
+            values[center - m] = legendre * sines[m]
+            values[center + m] = legendre * cosines[m]
     return values
 
 
-def lambertian(l: int) -> Fraction:
-    """What the clamped cosine keeps of band l, over 2π: ∫₀¹ P_l(z) z dz."""
-    return sum(
-        (factor / (power + 2) for power, factor in _derivative_of_legendre(l, 0)), Fraction()
-    )
-
-
-def stepped(values: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Moved by an imaginary step: a function's value there has its `derivative` along the step."""
-    return values + along * (
-        MP.mpc(0, STEP) if values.dtype == object else np.clongdouble(1j) * np.longdouble(STEP)
-    )
-
-
-def derivative(values: np.ndarray) -> np.ndarray:
-    return (
-        _imag(values) / MP.mpf(STEP)
-        if values.dtype == object
-        else values.imag / np.longdouble(STEP)
-    )
-
-
 def reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
-    """{l² + l + m: A_l Y_lm(n)}, without the bands whose A_l is zero."""
-    live = [l for l in range(degree + 1) if lambertian(l)]
-    factors = {l: as_in(normals, 2 * MP.pi * _number(lambertian(l))) for l in live}
-    return {
-        index: value * factors[int(index**0.5)] for index, value in harmonics(normals, live).items()
-    }
-
-
-def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
-    """(G, 3) what Σ upstream × image gives for each unit of a face's irradiance."""
-    return added(len(view.corners), view.face, upstream[view.pixel]) / view.samples * view.albedo
-
-
-def normals_of(view: View) -> np.ndarray:
-    """(3, G) unit normals, on the side that is seen."""
-    return unit(cross(view.first, view.second)) * view.side
-
-
-def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    first, second, third = vertices[faces].transpose(1, 2, 0)
-    return second - first, third - first
-
-
-def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.stack(
-        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-    )
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """(3, N), zero where they are."""
-    square = (vectors * vectors).sum(axis=0)
-    length = _sqrt(square) if vectors.dtype == object else np.sqrt(square)
-    return vectors / np.where(length == 0, 1, length)
-
-
-def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(count, ...) sums of rows by index."""
-    total = np.zeros((count, *rows.shape[1:]), dtype=rows.dtype)
-    np.add.at(total, index, rows)
-    return total
+    """Compute A_l Y_lm(n) by the index l² + l + m, for the bands whose factor A_l is not zero."""
+    live_bands = [l for l in range(degree + 1) if lambertian(l)]
+    values = {}
+    for index, value in harmonics(normals, live_bands).items():
+        l = int(index**0.5)
+        factor = 2 * MP.pi * _number(lambertian(l))
+        values[index] = value * as_in(normals, factor)
+    return values
 
 
 @cache
-def _legendre(l: int, m: int) -> list[tuple[int, Any]]:
-    """Normalized dᵐP_l/dzᵐ as (power, 256-bit factor)."""
-    norm = MP.sqrt(
-        (2 * l + 1) * (2 if m else 1) * MP.mpf(factorial(l - m)) / factorial(l + m) / (4 * MP.pi)
-    )
-    return [(power, norm * _number(factor)) for power, factor in _derivative_of_legendre(l, m)]
+def lambertian(l: int) -> Fraction:
+    """Compute A_l / 2π = ∫₀¹ P_l(z) z dz, the part of a band that the clamped cosine keeps."""
+    terms = _legendre(l, 0)
+    return sum((factor / (power + 2) for power, factor in terms), Fraction())
 
 
-def _derivative_of_legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
-    """dᵐP_l/dzᵐ as (power, factor), from 2ˡ P_l = Σ (-1)ᵏ C(l, k) C(2l - 2k, l) z^(l - 2k)."""
-    terms = [
-        (l - 2 * k, (-1) ** k * comb(l, k) * comb(2 * l - 2 * k, l)) for k in range(l // 2 + 1)
-    ]
-    return [
-        (power - m, Fraction(factor * perm(power, m), 2**l))
-        for power, factor in terms
-        if power >= m
-    ]
+@cache
+def _normalized_legendre(l: int, m: int) -> list[tuple[int, Any]]:
+    """Return the powers of z and 256-bit factors of dᵐP_l/dzᵐ, normalized for a harmonic."""
+    sides = 2 if m else 1
+    quotient = MP.mpf(factorial(l - m)) / factorial(l + m)
+    norm = MP.sqrt((2 * l + 1) * sides * quotient / (4 * MP.pi))
+    return [(power, norm * _number(factor)) for power, factor in _legendre(l, m)]
 
 
-def _number(fraction: Fraction) -> Any:
-    return MP.mpf(fraction.numerator) / fraction.denominator
+def _legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
+    """Return the powers of z and factors of dᵐP_l/dzᵐ.
 
-
-def as_in(like: np.ndarray, number: Any) -> Any:
-    """A 256-bit number as the entries of an array are."""
-    return number if like.dtype == object else np.longdouble(MP.nstr(number, 25))
+    The formula is 2ˡ P_l = Σ (-1)ᵏ C(l, k) C(2l - 2k, l) z^(l - 2k).
+    """
+    terms = []
+    for k in range(l // 2 + 1):
+        power = l - 2 * k
+        if power < m:
+            continue
+        factor = (-1) ** k * comb(l, k) * comb(2 * l - 2 * k, l)
+        terms.append((power - m, Fraction(factor * perm(power, m), 2**l)))
+    return terms
 
 
 # ---------------------------------------------------------------------------- shadows
 
 
 def shadow(
-    view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int
+    view: View,
+    points: np.ndarray,
+    corners: np.ndarray,
+    directions: np.ndarray,
+    degree: int,
 ) -> np.ndarray:
-    """(P, (degree + 1)², 3) radiance that shadows take from each pixel, per unit of each coefficient.
+    """Compute the radiance that shadows take from each pixel.
 
-    Faces of corners (F, 3 corners, 3) block rays from the samples' origins (S, 3) in directions (D, 3), which share the
-    sphere equally. Rays and origins are the renderer's; which are blocked and all sums are computed here.
+    The rays and their origins are those of the renderer. Which rays are blocked,
+    and all sums, are computed here.
+
+    Args:
+        view: The view.
+        points: Origin of the rays of each sample, shape (S, 3).
+        corners: Corners of the faces that block rays, shape (F, 3 corners, 3).
+        directions: Directions of the rays, which share the sphere equally,
+            shape (D, 3).
+        degree: Degree of the light.
+
+    Returns:
+        Radiance per unit of each coefficient, shape (P, (degree + 1)², 3).
     """
-    sky, normals = basis(directions.T, degree), normals_of(view).T[view.face]
+    sky = basis(directions.T, degree)
+    normals = normals_of(view).T[view.face]
     solid_angle = as_in(points, 4 * MP.pi) / len(directions)
     lost = []
     for point, normal in zip(points, normals, strict=True):
-        cosine = (directions @ normal).clip(0) * blocked(point, directions, corners)
-        lost.append(cosine @ sky * solid_angle)
-    by_sample = np.stack(lost)[:, :, None] * view.albedo[view.face][:, None]
+        cosine = (directions @ normal).clip(0)
+        blocked_cosine = cosine * is_blocked(point, directions, corners)
+        lost.append(blocked_cosine @ sky * solid_angle)
+    albedo = view.albedo[view.face]
+    by_sample = np.stack(lost)[:, :, None] * albedo[:, None]
     return added(len(view.pixels), view.pixel, by_sample) / view.samples
 
 
-def blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(D,) whether rays from a point (3,) meet a face: they pass all of its edges on the side that it lies on."""
-    a, b, c = (corners[:, corner] - point for corner in range(3))
-    passed = np.stack(
-        [directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))]
-    )
+def is_blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Find which rays from a point meet a face.
+
+    A ray meets a face if it passes all edges on the side on which the face lies.
+
+    Args:
+        point: Origin of the rays, shape (3,).
+        directions: Directions of the rays, shape (D, 3).
+        corners: Corners of the faces, shape (F, 3 corners, 3).
+
+    Returns:
+        Mask of the rays, shape (D,).
+    """
+    a = corners[:, 0] - point
+    b = corners[:, 1] - point
+    c = corners[:, 2] - point
+    # Shape (3 edges, D, F).
+    passed = np.stack([directions @ np.cross(*edge).T for edge in ((a, b), (b, c), (c, a))])
     volume = (a * np.cross(b, c)).sum(axis=1)
-    return (passed * np.sign(volume) > 0).all(axis=0).any(axis=1)
+    is_met = (passed * np.sign(volume) > 0).all(axis=0)
+    return is_met.any(axis=1)
+
+
+# ---------------------------------------------------------------------------- numbers
+
+
+def stepped(values: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Move values by an imaginary step, so that `derivative` finds the slope along the step."""
+    if is_exact(values):
+        return values + along * MP.mpc(0, STEP)
+    return values + along * (np.clongdouble(1j) * np.longdouble(STEP))
+
+
+def derivative(values: np.ndarray) -> np.ndarray:
+    """Return the derivatives of real functions from their values after an imaginary step."""
+    if is_exact(values):
+        return _exact_imaginary_part(values) / MP.mpf(STEP)
+    return values.imag / np.longdouble(STEP)
+
+
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Compute the cross products (3, N) of vectors (3, N)."""
+    x = u[1] * v[2] - u[2] * v[1]
+    y = u[2] * v[0] - u[0] * v[2]
+    z = u[0] * v[1] - u[1] * v[0]
+    return np.stack([x, y, z])
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Scale vectors (3, N) to unit length. Zero vectors stay zero."""
+    square = (vectors * vectors).sum(axis=0)
+    length = _exact_sqrt(square) if is_exact(vectors) else np.sqrt(square)
+    return vectors / np.where(length == 0, 1, length)
+
+
+def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Add rows with the same index, and return the sums (count, ...)."""
+    total = np.zeros((count, *rows.shape[1:]), dtype=rows.dtype)
+    np.add.at(total, index, rows)
+    return total
+
+
+def as_in(like: np.ndarray, number: Any) -> Any:
+    """Convert a 256-bit number to the type of an array's entries."""
+    if is_exact(like):
+        return number
+    return np.longdouble(MP.nstr(number, LONG_DOUBLE_DIGITS))
+
+
+def _number(fraction: Fraction) -> Any:
+    """Convert a fraction to a 256-bit number."""
+    return MP.mpf(fraction.numerator) / fraction.denominator

@@ -134,9 +134,8 @@ def boards() -> Mesh:
     """Create five boards of thickness 0.02 with gaps of 0.03 between them."""
     board = trimesh.creation.box((0.8, 0.8, 0.02))
     heights = [0.0, 0.05, 0.1, 0.15, 0.2]
-    return concatenate(
-        [painted(board.vertices + np.array([0, 0, height]), board.faces) for height in heights]
-    )
+    lifted = [board.vertices + np.array([0, 0, height]) for height in heights]
+    return concatenate([painted(vertices, board.faces) for vertices in lifted])
 
 
 def non_manifold() -> Mesh:

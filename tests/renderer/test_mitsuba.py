@@ -1,13 +1,15 @@
-"""Images of convex meshes against Mitsuba 3, which traces rays from the surface into a map of the same light.
+"""Images compared with Mitsuba 3, which traces rays from the surface into a map of the same light.
 
-A diffuse face reflects albedo / π of its irradiance and our radiance leaves the 1/π out, so an image of Mitsuba's
-times π is one of ours. It draws directions by the cosine: its noise is then the light's variation alone.
+A diffuse face reflects albedo / π of its irradiance. This renderer leaves out
+the factor 1 / π, and the scene files for Mitsuba make up for it. Mitsuba draws
+directions by the cosine, so that its noise only comes from the variation of the
+light.
 """
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import hard_meshes as hard
 import numpy as np
@@ -28,19 +30,17 @@ from renderer.visibility.rasterizers import choose
 
 pytest.importorskip("mitsuba")
 
-SEEDS = 32  # independent images of Mitsuba's, from which its noise is estimated
-SIGMAS = 5  # a right image fails a bound once in a million times
-FEW = 0.02  # of a pixel: less surface is hit too seldom for a normal distribution
-MAP_ROWS = 192  # linear interpolation dims band l by l(l + 1) (π / 191)² / 12: 5e-5 of band 1, 1e-3 of the faint band 6
-BAND_WEIGHTS = [
-    0,
-    1,
-    1,
-    0.3,
-    1,
-    0.3,
-    1,
-]  # bands 3 and 5 reach no diffuse surface and only add noise
+# Number of independent images of Mitsuba, from which its noise is estimated.
+SEED_COUNT = 32
+# A correct image exceeds a bound of so many standard errors once in a million times.
+SIGMAS = 5
+# Rays hit a smaller part of a pixel too seldom for a normal distribution.
+LEAST_COVERAGE = 0.02
+# Rows of the environment map. Linear interpolation dims band l by
+# l (l + 1) (π / 191)² / 12, which is 5e-5 for band 1 and 1e-3 for the faint band 6.
+MAP_ROWS = 192
+# Bands 3 and 5 reach no diffuse surface. They only add noise.
+BAND_WEIGHTS = [0, 1, 1, 0.3, 1, 0.3, 1]
 
 VIEWS = {
     "near the pole": OrthographicCamera(1.72, 22.9, 2.5),
@@ -51,83 +51,129 @@ VIEWS = {
 
 
 def positive_light(seed: int) -> np.ndarray:
-    """(49, 3): every coefficient at random, over just enough ambient light to be positive everywhere."""
+    """Draw coefficients (49, 3), and add ambient light until the radiance is positive."""
     weights = np.repeat(BAND_WEIGHTS, 2 * np.arange(7) + 1)
     light = weights[:, None] * np.random.default_rng(seed).normal(size=(49, 3))
-    light[0] = (
-        0.1 - mitsuba_map(torch.from_numpy(light), MAP_ROWS).numpy().min(axis=(0, 1))
-    ) * math.sqrt(4 * math.pi)
+    radiance = mitsuba_map(torch.from_numpy(light), MAP_ROWS).numpy()
+    missing_radiance = 0.1 - radiance.min(axis=(0, 1))
+    light[0] = missing_radiance * math.sqrt(4 * math.pi)
     return light / light[0]
 
 
-LIGHT = positive_light(1)
+LIGHT = torch.from_numpy(positive_light(1))
+
+
+# ---------------------------------------------------------------------------- meshes
 
 
 def ball() -> Mesh:
+    """Create a ball of one color."""
     return mesh_of(trimesh.creation.icosphere(subdivisions=1), (0.9, 0.5, 0.2))
 
 
 def colored_cube() -> Mesh:
-    return mesh_of(
-        trimesh.creation.box((1.1, 1.1, 1.1)), np.random.default_rng(1).uniform(0.1, 1, (8, 3))
-    )
+    """Create a cube with a color at each corner."""
+    colors = np.random.default_rng(1).uniform(0.1, 1, (8, 3))
+    return mesh_of(trimesh.creation.box((1.1, 1.1, 1.1)), colors)
 
 
 def textured_hull() -> Mesh:
-    """Twelve points on an ellipsoid; the texture repeats and each face has its own piece of it."""
+    """Create the hull of twelve points on an ellipsoid.
+
+    The texture repeats, and each face has another part of it.
+    """
     rng = np.random.default_rng(2)
     points = rng.normal(size=(12, 3))
-    hull = trimesh.convex.convex_hull(
-        points / np.linalg.norm(points, axis=1, keepdims=True) * [1.0, 0.8, 0.9]
-    )
-    count = len(hull.faces)
+    on_sphere = points / np.linalg.norm(points, axis=1, keepdims=True)
+    hull = trimesh.convex.convex_hull(on_sphere * [1.0, 0.8, 0.9])
+    face_count = len(hull.faces)
+    uvs = rng.uniform(-0.5, 1.5, (face_count, 3, 2))
+    texture = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
     return replace(
         Mesh.plain(hull.vertices, hull.faces),
-        corner_uvs=rng.uniform(-0.5, 1.5, (count, 3, 2)).astype(np.float32),
-        texture_ids=np.zeros(count, dtype=np.int32),
-        textures=(rng.integers(0, 256, (5, 7, 3), dtype=np.uint8),),
+        corner_uvs=uvs.astype(np.float32),
+        texture_ids=np.zeros(face_count, dtype=np.int32),
+        textures=(texture,),
     )
 
 
 def bowl() -> Mesh:
-    """The lower half of a ball, seen from within."""
+    """Create the lower half of a ball, which is seen from within."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.9)
-    lower = ball.vertices[ball.faces].mean(axis=1)[:, 2] < 0
-    return Mesh.plain(ball.vertices, ball.faces[lower], (0.8, 0.8, 0.3))
+    heights = ball.vertices[ball.faces].mean(axis=1)[:, 2]
+    return Mesh.plain(ball.vertices, ball.faces[heights < 0], (0.8, 0.8, 0.3))
 
 
 def cup() -> Mesh:
+    """Create a cup, whose inner wall is in the shadow of the rim."""
     return normalize(solid("cup"))
 
 
-def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -> np.ndarray:
-    """(size, size, 4): radiance and coverage."""
-    settings = ImageSettings(size, samples, **settings)
+# ---------------------------------------------------------------------------- images
+
+
+def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray:
+    """Render radiance and coverage with an operator, shape (size, size, 4)."""
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
-    canvas = np.zeros((size * size, 4))
-    canvas[operator.pixels, :3] = operator.radiance(torch.from_numpy(LIGHT)).T
-    canvas[operator.pixels, 3] = operator.coverage
-    return canvas.reshape(size, size, 4)
+    image = np.zeros((settings.size**2, 4))
+    image[operator.pixels, :3] = operator.radiance(LIGHT).T
+    image[operator.pixels, 3] = operator.coverage
+    return image.reshape(settings.size, settings.size, 4)
+
+
+class NoisyImage(NamedTuple):
+    """Mean of several images of Mitsuba.
+
+    Attributes:
+        mean: Radiance and coverage, shape (size, size, 4).
+        noise: Standard error of the mean, shape (size, size, 4).
+    """
+
+    mean: np.ndarray
+    noise: np.ndarray
 
 
 def mitsuba_image(
-    folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int, **settings
-) -> tuple[np.ndarray, ...]:
-    """The mean (size, size, 4) of SEEDS images of files, of so many rays per pixel, and its standard error."""
-    write_map(folder / "light.exr", mitsuba_map(torch.from_numpy(LIGHT), MAP_ROWS))
-    write_mitsuba_scene(folder, mesh, 1.0, [camera], ImageSettings(size, **settings), "light.exr")
-    file = folder / SCENE
-    file.write_text(file.read_text().replace("multijitter", "independent"))
+    folder: Path,
+    mesh: Mesh,
+    camera: Camera,
+    settings: ImageSettings,
+    ray_count: int,
+) -> NoisyImage:
+    """Render the files of a scene with Mitsuba.
+
+    Args:
+        folder: Folder to which the files are written.
+        mesh: The mesh.
+        camera: The camera.
+        settings: Settings of the image.
+        ray_count: Rays per pixel of each of the images.
+    """
+    write_map(folder / "light.exr", mitsuba_map(LIGHT, MAP_ROWS))
+    write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
+    scene_path = folder / SCENE
+    scene_text = scene_path.read_text()
+    scene_path.write_text(scene_text.replace("multijitter", "independent"))
+    images = []
     with mitsuba() as mi:
-        scene = mi.load_file(str(file))
-        images = np.stack(
-            [np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]
-        ).astype(float)
-    return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
+        scene = mi.load_file(str(scene_path))
+        for seed in range(SEED_COUNT):
+            images.append(np.array(mi.render(scene, spp=ray_count, seed=seed)))
+    stack = np.stack(images).astype(float)
+    noise = stack.std(axis=0, ddof=1) / math.sqrt(SEED_COUNT)
+    return NoisyImage(stack.mean(axis=0), noise)
+
+
+def mean_square(values: np.ndarray) -> float:
+    """Compute the mean of the squares."""
+    return float((values**2).mean())
+
+
+# ---------------------------------------------------------------------------- tests
 
 
 @pytest.mark.parametrize(
-    ("solid", "view"),
+    ("make_mesh", "view"),
     [
         (ball, "near the pole"),
         (colored_cube, "from below"),
@@ -135,71 +181,111 @@ def mitsuba_image(
     ],
 )
 @pytest.mark.parametrize(
-    ("size", "samples", "rays"), [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)]
+    ("size", "samples", "ray_count"),
+    [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)],
 )
-def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(
-    tmp_path, solid, view, size, samples, rays
+def test_a_convex_mesh_is_rendered_as_by_mitsuba_within_its_noise(
+    tmp_path,
+    make_mesh,
+    view,
+    size,
+    samples,
+    ray_count,
 ):
-    """Our error, in Mitsuba's standard errors: its root mean square is one and its mean is zero.
+    """Errors in units of Mitsuba's standard errors have a mean of 0 and a mean square of about 1.
 
-    A standard error from n images makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
-    square follow. The three channels share their rays, so a pixel counts once.
+    A standard error from n images makes an error follow Student's t distribution
+    with n - 1 degrees of freedom. This gives the mean and the variance of the
+    squared error. The three channels share their rays, so a pixel counts once.
 
-    s² samples misjudge the coverage at the outline by 1 / √(12 s³), as each of s rows rounds to its samples: 0.2 % of
-    a pixel, against Mitsuba's noise of up to 0.8 % there (0.06 and 0.4 % in the slow runs), too little to show.
+    With s rows of samples, the coverage of a pixel at the outline is wrong by
+    1 / √(12 s³), because each row is rounded to its samples. That is 0.2 % of a
+    pixel, and 0.06 % in the slow runs. Mitsuba's noise there is up to 0.8 % and
+    0.4 %.
     """
-    ours = our_image(solid(), VIEWS[view], size, samples)
-    theirs, noise = mitsuba_image(tmp_path, solid(), VIEWS[view], size, rays)
-    covered = np.maximum(ours, theirs)[..., 3] > FEW
-    errors = (ours - theirs)[covered, :3] / noise[covered, :3]
-    freedom = SEEDS - 1
+    settings = ImageSettings(size, samples)
+    ours = our_image(make_mesh(), VIEWS[view], settings)
+    theirs = mitsuba_image(tmp_path, make_mesh(), VIEWS[view], settings, ray_count)
+    difference = (ours - theirs.mean)[..., :3]
+    noise = theirs.noise[..., :3]
+
+    is_covered = np.maximum(ours, theirs.mean)[..., 3] > LEAST_COVERAGE
+    errors = difference[is_covered] / noise[is_covered]
+    freedom = SEED_COUNT - 1
     mean = freedom / (freedom - 2)
     variance = 3 * freedom**2 / ((freedom - 2) * (freedom - 4)) - mean**2
-    assert (errors**2).mean() == pytest.approx(mean, abs=SIGMAS * math.sqrt(variance / len(errors)))
+    tolerance = SIGMAS * math.sqrt(variance / len(errors))
+    assert mean_square(errors) == pytest.approx(mean, abs=tolerance)
 
-    inside = np.minimum(ours, theirs)[..., 3] == 1
-    total_noise = np.sqrt((noise[inside, :3] ** 2).sum(axis=0))
-    np.testing.assert_array_less(
-        np.abs((ours - theirs)[inside, :3].sum(axis=0)), SIGMAS * total_noise
-    )
+    is_inside = np.minimum(ours, theirs.mean)[..., 3] == 1
+    sum_of_errors = difference[is_inside].sum(axis=0)
+    noise_of_sum = np.sqrt((noise[is_inside] ** 2).sum(axis=0))
+    np.testing.assert_array_less(np.abs(sum_of_errors), SIGMAS * noise_of_sum)
+
+
+def lumpy_sphere() -> Mesh:
+    """Create a closed sphere whose dents shade each other."""
+    return hard.sphere(2, lowest=0.5)
+
+
+def slow_bounces() -> list[object]:
+    """Return the parameters of slow tests of bounces."""
+    scenes = [
+        (bowl, "near the pole", "flat"),
+        (lumpy_sphere, "from above", "flat"),
+        (cup, "near the pole", "smooth"),
+    ]
+    parameters = []
+    for make_mesh, view, normals in scenes:
+        for bounces in (1, 3):
+            values = (make_mesh, view, bounces, normals)
+            parameters.append(pytest.param(*values, marks=pytest.mark.slow))
+    return parameters
 
 
 @pytest.mark.parametrize(
-    ("solid", "view", "bounces", "normals"),
+    ("make_mesh", "view", "bounces", "normals"),
     [
         (bowl, "near the pole", 0, "flat"),
         (cup, "near the pole", 0, "smooth"),
         (hard.heap, "from above", 3, "flat"),
-        *(
-            pytest.param(solid, view, bounces, normals, marks=pytest.mark.slow)
-            for solid, view, normals in [
-                (bowl, "near the pole", "flat"),
-                (partial(hard.sphere, 2, 0.5), "from above", "flat"),
-                (cup, "near the pole", "smooth"),
-            ]
-            for bounces in (1, 3)
-        ),
+        *slow_bounces(),
     ],
 )
-def test_shadows_and_bounces_are_mitsubas_within_its_noise(
-    tmp_path, solid, view, bounces, normals, monkeypatch
+def test_shadows_and_bounces_are_those_of_mitsuba_within_its_noise(
+    tmp_path,
+    make_mesh,
+    view,
+    bounces,
+    normals,
+    monkeypatch,
 ):
-    """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average. Of a closed
-    mesh that shows no smooth normal turned away from the camera: Mitsuba takes the normal's other side there."""
+    """The rays are enough for errors of 0.5 % of the brightest value, and 0.1 % on average.
+
+    If a smooth normal turns away from the camera, Mitsuba takes its other side.
+    The meshes with smooth normals show no such normal.
+    """
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    theirs, noise = mitsuba_image(
-        tmp_path, solid(), VIEWS[view], 32, 128, bounces=bounces, normals=normals
-    )
-    inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
-    ours, less = (
-        our_image(solid(), VIEWS[view], 32, 8, normals=normals, **options)
-        for options in (
-            ({"bounces": bounces}, {"shadows": True}) if bounces else ({"shadows": True}, {})
-        )
-    )
-    error, without, noise = (
-        values[inside, :3] / brightest for values in (ours - theirs, less - theirs, noise)
-    )
-    assert (error**2).mean() < 0.005**2 + (noise**2).mean()
+    plain = ImageSettings(32, 8, normals=normals)
+    with_shadows = replace(plain, shadows=True)
+    if bounces:
+        settings = replace(plain, bounces=bounces)
+        settings_of_less = with_shadows
+    else:
+        settings = with_shadows
+        settings_of_less = plain
+    mesh = make_mesh()
+    theirs_settings = replace(plain, bounces=bounces)
+    theirs = mitsuba_image(tmp_path, mesh, VIEWS[view], theirs_settings, ray_count=128)
+    ours = our_image(mesh, VIEWS[view], settings)
+    less = our_image(mesh, VIEWS[view], settings_of_less)
+
+    is_inside = theirs.mean[..., 3] == 1
+    brightest = theirs.mean[..., :3].max()
+    error = (ours - theirs.mean)[is_inside, :3] / brightest
+    noise = theirs.noise[is_inside, :3] / brightest
+    assert mean_square(error) < 0.005**2 + mean_square(noise)
     assert abs(error.mean()) < 0.001
-    assert (without**2).mean() > 0.02**2
+    # An image without the bounces, or without shadows, differs clearly.
+    error_of_less = (less - theirs.mean)[is_inside, :3] / brightest
+    assert mean_square(error_of_less) > 0.02**2

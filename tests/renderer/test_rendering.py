@@ -226,7 +226,7 @@ def ball_from_above(size: int) -> tuple[Tensor, Tensor]:
     """
     centers = (torch.arange(size).double() + 0.5) * 2 / size - 1
     y = centers.expand(size, -1)
-    # Up in the image is -x.
+    # The top of the image lies at -x.
     x = centers[:, None].expand(-1, size)
     z = (1 - x**2 - y**2).clamp(min=0).sqrt()
     return torch.stack([x, y, z], dim=2), z > 0.3

@@ -161,7 +161,8 @@ every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 @pytest.mark.parametrize(("min_count", "expected_count"), [(0, 12), (11, 12), (12, 42), (42, 162)])
 def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(
-    min_count, expected_count
+    min_count,
+    expected_count,
 ):
     mesh = subdivide(mesh_of(trimesh.creation.icosahedron()), min_count)
     assert len(mesh.vertices) == expected_count

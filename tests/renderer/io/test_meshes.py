@@ -332,7 +332,10 @@ def test_unused_vertices_are_removed_and_both_zeros_are_one_position(tmp_path):
     ],
 )
 def test_the_texture_of_an_obj_is_found_by_the_names_that_any_system_writes(
-    tmp_path, texture, library, location
+    tmp_path,
+    texture,
+    library,
+    location,
 ):
     folder = tmp_path / "mesh"
     path = write_obj(folder, texture, library)
@@ -491,7 +494,8 @@ def use_huge_scale(tree: dict[str, Any]) -> None:
 # trimesh warns of invalid colors.
 @pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")
 def test_a_gltf_that_trimesh_would_read_incorrectly_is_refused(
-    tmp_path, change: Callable[[dict[str, Any]], None]
+    tmp_path,
+    change: Callable[[dict[str, Any]], None],
 ):
     path = write_gltf(tmp_path)
     write(tmp_path / "peel.png", png())

@@ -53,9 +53,9 @@ def test_a_light_is_split_into_environment_light_and_local_lights(parts, first_r
     assert len(split.environment) == SKY.size
     (lamps, lamp_values), (projector, pattern) = split.local_lights
     assert lamps == LAMPS
-    assert (
-        lamp_values[:, 0].tolist() == coefficients[first_rows[parts.index(LAMPS)] :][:2, 0].tolist()
-    )
+    first_lamp = first_rows[parts.index(LAMPS)]
+    expected_values = coefficients[first_lamp : first_lamp + 2, 0]
+    assert lamp_values[:, 0].tolist() == expected_values.tolist()
     assert projector == PROJECTOR
     assert pattern[:, 0].tolist() == list(range(11, 20))
 

@@ -207,9 +207,8 @@ def test_perturbations_with_a_radius_have_this_norm_on_the_nonzero_coefficients(
     draws = torch.Generator().manual_seed(0)
     offsets = perturb(torch.zeros(49, 3), 50, amplitude, 1.5, draws)
     expected_norms = torch.full((50,), 1.5)
-    torch.testing.assert_close(
-        offsets.flatten(1).norm(dim=1), expected_norms, rtol=4 * EPS32, atol=0
-    )
+    norms = offsets.flatten(1).norm(dim=1)
+    torch.testing.assert_close(norms, expected_norms, rtol=4 * EPS32, atol=0)
     changed = (offsets != 0).any(dim=2).any(dim=0).nonzero().flatten()
     assert changed.tolist() == nonzero_coefficients(6).tolist()
 

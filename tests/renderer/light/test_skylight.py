@@ -68,7 +68,10 @@ def chromaticity(rows: list[list[float]], sun_zenith: float, t: float) -> float:
 
 
 def published_sky(
-    directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float
+    directions: np.ndarray,
+    sun_zenith: float,
+    sun_azimuth: float,
+    t: float,
 ) -> np.ndarray:
     """Evaluate the formulas of Preetham et al., appendix A.2, as they are printed, in angles.
 

@@ -107,10 +107,10 @@ class WindowSearch:
         count = self.degree // 2 + 1
         starts = np.random.default_rng(0).uniform(0.2, 1, (4, count)) + np.eye(count)[0]
         options = {"ftol": 1e-12, "maxiter": 500}
-        results = [
-            optimize.minimize(self.objective, start, method="SLSQP", options=options)
-            for start in starts
-        ]
+        results = []
+        for start in starts:
+            result = optimize.minimize(self.objective, start, method="SLSQP", options=options)
+            results.append(result)
         return self.factors(min(results, key=lambda result: result.fun).x)
 
 

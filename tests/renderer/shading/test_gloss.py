@@ -445,9 +445,8 @@ class FloorUnderSky:
     def __init__(self, gloss: Gloss) -> None:
         node, weight = legendre.leggauss(24)
         cosines = torch.from_numpy((node + 1) / 2)
-        cameras = [
-            OrthographicCamera(math.degrees(math.acos(cosine)), 17.2, 1.0) for cosine in cosines
-        ]
+        polar_angles = [math.degrees(math.acos(cosine)) for cosine in cosines]
+        cameras = [OrthographicCamera(polar, 17.2, 1.0) for polar in polar_angles]
         operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
         rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
         self.transfer = torch.stack(rows)
@@ -722,10 +721,9 @@ class GlossyView:
             "metallic": (face_count,),
             "specular_factor": (face_count,),
         }
-        uniform = {
-            name: 0.3 + 0.5 * draw_uniform(*size, seed=seed)
-            for seed, (name, size) in enumerate(shapes.items())
-        }
+        uniform = {}
+        for seed, (name, size) in enumerate(shapes.items()):
+            uniform[name] = 0.3 + 0.5 * draw_uniform(*size, seed=seed)
         vertices = torch.from_numpy(self.mesh.vertices)
         return {
             "environment": positive_light(6),
@@ -770,7 +768,9 @@ def test_derivatives_by_all_parameters_are_finite_differences(normals, camera):
 
 
 @pytest.mark.parametrize(
-    "options", [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}], ids=str
+    "options",
+    [{"normals": "flat"}, {"shadows": True}, {"bounces": 2}],
+    ids=str,
 )
 def test_an_operator_gives_the_images_of_render(options):
     mesh = normalize(solid("cup"))
@@ -812,9 +812,8 @@ def test_the_parts_of_a_joined_mesh_keep_their_gloss():
     pear = Gloss(0.3).on(solid("pear"))
     gloss = concatenate([pear, solid("table")]).gloss
     pear_gloss, table_gloss = np.split(gloss, [len(pear.faces)])
-    np.testing.assert_array_equal(
-        pear_gloss, np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1))
-    )
+    expected_gloss = np.tile(np.float32([0.3, 0, 1]), (len(pear_gloss), 1))
+    np.testing.assert_array_equal(pear_gloss, expected_gloss)
     np.testing.assert_array_equal(table_gloss, np.tile([1, 0, 0], (len(table_gloss), 1)))
 
 

@@ -85,9 +85,9 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
     # Row and column in units of texels, whose centers are whole numbers in SciPy.
     position = np.stack([(1 - v) * height - 0.5, u * width - 0.5])
     channels = np.moveaxis(decoded(texture / 255, encoding), 2, 0)
-    expected = [
-        map_coordinates(channel, position, order=1, mode="grid-wrap") for channel in channels
-    ]
+    expected = []
+    for channel in channels:
+        expected.append(map_coordinates(channel, position, order=1, mode="grid-wrap"))
     albedo = surface_albedo(mesh, fragments, encoding)
     np.testing.assert_allclose(albedo, np.stack(expected, axis=1), atol=64 * EPS)
 

@@ -59,7 +59,10 @@ def ball_on_a_table() -> Mesh:
 
 
 def operator_of(
-    mesh: Mesh, basis: Basis, size: int = SIZE, samples: int = SAMPLES
+    mesh: Mesh,
+    basis: Basis,
+    size: int = SIZE,
+    samples: int = SAMPLES,
 ) -> TransferOperator:
     """Build the float64 operator of the camera."""
     [operator] = build_operators(
@@ -264,7 +267,10 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normal
 
 
 def irradiance_of_lamp(
-    position: list[float], radius: float, points: Tensor, normals: Tensor
+    position: list[float],
+    radius: float,
+    points: Tensor,
+    normals: Tensor,
 ) -> Tensor:
     """Compute the irradiance (N,) of a lamp of power 1 without occlusion."""
     paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
@@ -318,7 +324,9 @@ def test_a_surface_behind_a_lamp_casts_no_shadow():
 @pytest.mark.parametrize("batch", [(), (2, 3)], ids=["one light", "a batch"])
 @pytest.mark.parametrize("make_mesh", [ball, ball_on_a_table], ids=["one color", "two colors"])
 def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
-    monkeypatch, batch, make_mesh
+    monkeypatch,
+    batch,
+    make_mesh,
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()

@@ -118,14 +118,15 @@ def test_all_views_in_one_call_are_the_single_views(scene, call):
     found = operators.image(variable, background, light_per_view=call.per_view)
     single = lights.clone().requires_grad_()
     light_of_view = single if call.per_view else single.expand(VIEW_COUNT, *single.shape)
-    expected = torch.stack(
-        [
-            operator.image(light, behind)
-            for operator, light, behind in zip(
-                operators, light_of_view, background_of_view, strict=True
-            )
-        ]
-    )
+    images = []
+    for operator, light, behind in zip(
+        operators,
+        light_of_view,
+        background_of_view,
+        strict=True,
+    ):
+        images.append(operator.image(light, behind))
+    expected = torch.stack(images)
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance)
 
     upstream = draw(*found.shape, seed=1)

@@ -140,7 +140,8 @@ def sphere_quadrature() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("bounces", [0, 2])
 def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive(
-    bounces, monkeypatch
+    bounces,
+    monkeypatch,
 ):
     """The smooth normal of the octahedron at a point p is p / |p|.
 

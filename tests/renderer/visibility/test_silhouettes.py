@@ -249,9 +249,10 @@ def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
     Returns:
         A tuple of the mesh and the albedo of its triangles, shape (2 cells², 3).
     """
-    along = torch.linspace(-0.8, 0.8, cells + 1, dtype=torch.float64)
+    # The turned square fits into the image of `FROM_ABOVE`.
+    along = torch.linspace(-0.7, 0.7, cells + 1, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(along, along, indexing="ij"), dim=2)
-    grid += (draw_uniform(*grid.shape, seed=4) - 0.5) * 0.8 / cells
+    grid += (draw_uniform(*grid.shape, seed=4) - 0.5) * 0.7 / cells
     points = torch.nn.functional.pad(grid.flatten(0, 1), (0, 1))
     # Vertices of a row have successive indices.
     row = cells + 1
