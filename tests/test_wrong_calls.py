@@ -963,7 +963,6 @@ ATTACKS = [
         CLASSIFIER,
         ["squeezenet"],
         None,
-        [LINEAR],
         3,
     ),
     *calls_of(

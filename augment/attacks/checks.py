@@ -26,6 +26,12 @@ from augment.attacks.eot import preprocessed_model
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
+from augment.classifiers.plain_networks import (
+    UNIT_RANGE,
+    Normalization,
+    as_classifier,
+    gradient_flags_kept,
+)
 from augment.parameter_settings import StepSettings
 from augment.progress import progress
 from augment.random_streams import generator
@@ -181,9 +187,12 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
 
 def transfer(
     result: AttackResult,
-    classifiers: Sequence[Classifier] = (),
+    classifiers: Sequence[Classifier | Callable[[Tensor], Tensor]] = (),
     azimuths: Sequence[float] = (),
     objects: Sequence[SceneObject] = (),
+    *,
+    normalization: Normalization = None,
+    value_range: tuple[float, float] = UNIT_RANGE,
 ) -> list[dict[str, Any]]:
     """Show adversaries to other classifiers, from other sides and on other objects.
 
@@ -193,9 +202,13 @@ def transfer(
     Args:
         result: The result of `augment.attack`.
         classifiers: Other classifiers, for each of which the adversaries are
-            rendered at its size.
+            rendered at its size, or plain networks that take the images and
+            have the classes of the attacked classifier.
         azimuths: Degrees by which all cameras are turned around the vertical.
         objects: Objects that take the place of the attacked ones.
+        normalization: What plain networks need in front of them, as `attack`
+            takes it.
+        value_range: Values of black and white that they take before it.
 
     Returns:
         A dict for each, for JSON. "network", "azimuth" or "mesh" tells which.
@@ -218,7 +231,8 @@ def transfer(
         ([['other']], '+20°')
     """
     require_result(result)
-    classifiers = as_list("classifiers", classifiers, Classifier, "a list of augment.Classifier")
+    expected = "a list of torch.nn.Module, functions to logits, or augment.Classifier"
+    networks = as_list("classifiers", classifiers, Callable, expected)
     objects = as_list(
         "objects",
         objects,
@@ -234,9 +248,12 @@ def transfer(
 
     adversaries = _Adversaries.of(result)
     rows = []
-    for classifier in classifiers:
-        resized = adversaries.changed(partial(_resized, size=classifier.size))
-        rows.append({"network": classifier.name, **resized.shown_to(classifier)})
+    for index, network in enumerate(networks):
+        with gradient_flags_kept(network):
+            argument = f"classifiers[{index}]"
+            classifier = _as_classifier(network, result, normalization, value_range, argument)
+            resized = adversaries.changed(partial(_resized, size=classifier.size))
+            rows.append({"network": classifier.name, **resized.shown_to(classifier)})
     for azimuth in azimuths:
         turned = adversaries.changed(partial(_turned, angle=azimuth))
         rows.append({"azimuth": f"{azimuth:+g}°", **turned.shown_to(result.classifier)})
@@ -244,6 +261,22 @@ def transfer(
         exchanged = adversaries.changed(partial(replace, shown=item))
         rows.append({"mesh": Path(item.name).name, **exchanged.shown_to(result.classifier)})
     return rows
+
+
+def _as_classifier(
+    network: Classifier | Callable[[Tensor], Tensor],
+    result: AttackResult,
+    normalization: Normalization,
+    value_range: tuple[float, float],
+    argument: str,
+) -> Classifier:
+    """Give a plain network the size and the classes of the attacked classifier."""
+    if isinstance(network, Classifier):
+        return network
+    attacked = result.classifier
+    device = result.images.device
+    options = (attacked.size, attacked.classes, normalization, value_range, device)
+    return as_classifier(network, *options, argument)
 
 
 def require_transferable(

@@ -313,6 +313,9 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     if name in classes:
         return classes.index(str(name))
     text = str(name)
+    if isinstance(name, str) and not name.isdecimal() and _are_indices(classes):
+        remedy = f"give an index from 0 to {len(classes) - 1}, or name the classes"
+        raise InputError(f"{subject}: the classes have no names, and {name!r} is given: {remedy}")
     if text.isascii() and text.isdecimal():
         if int(text) < len(classes):
             return int(text)
@@ -321,6 +324,11 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     raise InputError(
         f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
     )
+
+
+def _are_indices(classes: Sequence[str]) -> bool:
+    """Tell whether the names of classes are "0", "1" and so on."""
+    return [*classes] == [str(index) for index in range(len(classes))]
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:

@@ -85,7 +85,10 @@ def as_classifier(
         argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
     )
     names = None if classes is None else as_class_names("classes", classes)
-    if isinstance(network, nn.Module) and network.training:
+    if isinstance(network, type):
+        name = network.__name__
+        raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
+    if isinstance(network, nn.Module) and any(part.training for part in network.modules()):
         raise InputError(f"{argument} is a network in training mode: call its eval() first")
     size = USUAL_SIZE if size is None else size
     device = device_of(network) if device is None else device
@@ -148,6 +151,11 @@ def _preprocessed(
         return module.eval()
     if normalization is not None:
         _require_no_normalization(module)
+    if normalization is not None and not black <= min(mean) <= max(mean) <= white:
+        raise InputError(
+            f"normalization has the mean {tuple(mean)}, which is not between black, {black:g}, and "
+            f"white, {white:g}: give it in these units, or the value_range of the network"
+        )
     # (black + (white - black) x - mean) / std in the form of `Normalized`.
     span = white - black
     scaled_mean = [(value - black) / span for value in mean]

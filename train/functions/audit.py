@@ -19,7 +19,7 @@ from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
 from train.system.folders import folder_or_temporary
 
 
@@ -100,12 +100,17 @@ def audit(
             raise InputError(
                 f"meshes are of several classes ({', '.join(positive_classes)}): give one"
             )
+        negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+        require_others(negatives, positive_classes)
+        if not negatives and laboratory is None:
+            example = "name one mesh or more, such as 'solid:lemon', or give laboratory"
+            raise InputError(f"hard_negatives is empty: {example}")
         with folder_or_temporary(out) as folder:
             settings = AuditSettings(
                 classifier=classifier.name,
                 label=positive_classes[0],
                 meshes=items,
-                look_alikes=as_mappings("hard_negatives", hard_negatives, classifier),
+                look_alikes=negatives,
                 photos=None if photographs is None else str(photographs),
                 laboratory=None if laboratory is None else str(laboratory),
                 environments=[*environments],

@@ -26,7 +26,7 @@ from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
 from train.command import read_settings
-from train.functions.meshes import MeshItem, as_mappings, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.runs.run_lock import sole_writer
@@ -139,6 +139,7 @@ def harden(
         }
         if hard_negatives is not None:
             negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+            require_others(negatives, labels)
             changes["scene"]["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None

@@ -76,11 +76,37 @@ def studied_classes(
     return list(dict.fromkeys(_class_of(mesh, classifier) for mesh in meshes))
 
 
+def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
+    """Check that no hard negative is of a class under study.
+
+    Args:
+        hard_negatives: Hard negatives as `as_mappings` returns them.
+        labels: Classes under study.
+
+    Raises:
+        InputError: If one is of such a class, by its label or by its name.
+    """
+    for index, item in enumerate(hard_negatives):
+        name = item.get("label") or _name_of(item)
+        # With several classes under study, an object of one is a hard negative for the others.
+        is_studied = name in labels and (len(labels) == 1 or not item.get("label"))
+        if is_studied:
+            raise InputError(
+                f"hard_negatives[{index}] is {item['mesh']}, of the class {name} under study: "
+                "name it in meshes, or leave it out"
+            )
+
+
+def _name_of(mesh: dict[str, Any]) -> str:
+    """Return the name of a solid, or that of a file without its ending."""
+    return solid_name(mesh["mesh"]) or Path(mesh["mesh"]).stem
+
+
 def _class_of(mesh: dict[str, Any], classifier: Classifier) -> str:
     """Return the label of a mesh or, without a label, the class that its file is named after."""
     if mesh.get("label"):
         return str(mesh["label"])
-    name = solid_name(mesh["mesh"]) or Path(mesh["mesh"]).stem
+    name = _name_of(mesh)
     if name not in classifier.classes:
         raise InputError(
             f"label is not given, and {mesh['mesh']} is not named by a class of the network: "

@@ -119,3 +119,41 @@ def test_a_classifier_takes_no_options_of_plain_networks(network, options):
 def test_an_index_beyond_the_classes_is_refused(network):
     with pytest.raises(InputError, match="label 3"):
         augment.attack(network, scene(3))
+
+
+def test_a_network_with_a_part_in_training_mode_is_refused(network):
+    network[2].train()
+    with pytest.raises(InputError, match="training mode"):
+        as_classifier(network, SIZE)
+
+
+def test_a_network_that_normalizes_by_a_buffer_is_not_normalized_again(network):
+    network.register_buffer("pixel_mean", torch.zeros(3))
+    with pytest.raises(InputError, match="pixel_mean"):
+        as_classifier(network, SIZE, normalization="imagenet")
+
+
+def test_a_mean_outside_of_the_value_range_is_refused(network):
+    bytes_of_imagenet = ((123.0, 116.0, 103.0), (58.0, 57.0, 57.0))
+    with pytest.raises(InputError, match="value_range"):
+        as_classifier(network, SIZE, normalization=bytes_of_imagenet)
+
+
+def test_a_class_in_place_of_a_network_is_refused():
+    with pytest.raises(InputError, match="Flatten"):
+        as_classifier(nn.Flatten, SIZE)
+
+
+def test_a_name_is_refused_if_the_classes_have_none(network):
+    with pytest.raises(InputError, match="name the classes"):
+        augment.attack(network, scene("orange"))
+
+
+def test_adversaries_are_shown_to_a_plain_network_as_to_its_classifier(network):
+    result = augment.attack(network, scene(0), settings=light(), force=True)
+    classifier = augment.Classifier(network, SIZE, ["0", "1", "2"])
+    [expected] = augment.transfer(result, [classifier])
+    network.requires_grad_(True)
+    [row] = augment.transfer(result, [network])
+    assert row | {"network": ""} == expected | {"network": ""}
+    assert all(parameter.requires_grad for parameter in network.parameters())

@@ -16,7 +16,7 @@ from train.networks import WideResNet
 from train.settings import AUGMENTATIONS, TRANSFORMS, TrainSettings
 from train.training.baselines import PGD, Baseline
 from train.training.loss import TrainingLoss
-from train.training.recipe import SCHEDULE_FACTORS
+from train.training.recipe import SCHEDULE_FACTORS, freeze
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 
@@ -214,3 +214,9 @@ def test_pgd_raises_the_probability_of_the_classes_that_hard_negatives_are_not(i
     before, with_2, with_both = (model(batch / 255).softmax(1).mean(0) for batch in batches)
     assert with_2[2] > before[2]
     assert with_both[[0, 2]].sum() > max(with_2[[0, 2]].sum(), before[[0, 2]].sum())
+
+
+def test_a_network_of_one_layer_learns_in_it():
+    network = nn.Sequential(nn.Flatten(), nn.Linear(4, 2))
+    freeze(network, "all_but_last")
+    assert all(parameter.requires_grad for parameter in network.parameters())
