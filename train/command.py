@@ -48,7 +48,8 @@ from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
 from train.system.user_errors import user_message
 
-USER_ERROR = 2  # exit status
+# Exit status after an error of the user.
+USER_ERROR = 2
 INTERRUPTED = "ended by SIGINT"
 # Start of the names of the installed commands.
 PREFIX = "pnb-"
@@ -160,7 +161,7 @@ class Command:
             raise InputError(sentence) from error
 
     def read(self, overrides: Sequence[str] = ()) -> Any:
-        """Return the settings of the command for words of a command line, without starting it."""
+        """Return the settings that words of a command line give to the command."""
         return read_settings(self.settings, self.compose(overrides))
 
     @contextmanager

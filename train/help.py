@@ -16,8 +16,10 @@ import conf
 from renderer.settings import facts_of, field_types
 
 CONF = Path(conf.__path__[0])
-KEY_WIDTH = 44  # columns of a key and its value
-TEXT_WIDTH = 80  # columns of the explanation beside it
+# Number of characters of a key with its value.
+KEY_WIDTH = 44
+# Number of characters of an explanation in a line.
+TEXT_WIDTH = 80
 
 
 @dataclass(frozen=True)

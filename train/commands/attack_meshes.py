@@ -237,7 +237,7 @@ def _attack_adversary(
 ) -> MeshAttack:
     """Attack the scene of a saved adversary."""
     if adversary.pixels is not None:
-        fault = "no attack goes on from changed pixels"
+        fault = "an attack cannot continue from changed pixels"
         raise InputError(f"reload={settings.reload}: {fault}: leave attack= out")
     scene = adversary.scene(_start_rasterizer(settings), device)
     result = attack(

@@ -8,7 +8,10 @@ from train.report.summary import summarize
 
 
 def print_comparison(settings: CompareSettings) -> None:
-    """Print Markdown tables of finished runs, side by side.
+    """Print Markdown tables that compare finished runs.
+
+    Args:
+        settings: Settings of pnb-compare.
 
     Raises:
         InputError: If a folder holds no finished run.

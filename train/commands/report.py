@@ -10,15 +10,20 @@ from train.system.user_errors import writable_folder
 
 
 def report(settings: ReportSettings) -> None:
-    """Write the page, and print its path.
+    """Write the page of runs and attacks, and print its path.
+
+    Args:
+        settings: Settings of pnb-report.
 
     Raises:
-        InputError: If a folder holds nothing to report, or the page cannot be written.
+        InputError: If a folder holds no run and no attack, or if the page cannot
+            be written.
     """
     folders = [Path(run) for run in settings.runs]
     parent = Path(os.path.commonpath([folder.absolute() for folder in folders]))
     out = writable_folder(settings.out or parent, "out")
-    # The page beside the runs is of them, and is written anew. That of an audit is not.
+    # The folder that holds the runs may have a report of them, which is replaced.
+    # The report of an audit is not replaced.
     own: list[str] = []
     if out.resolve() == parent.resolve():
         own = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]

@@ -20,7 +20,7 @@ from train.data.sets import Split
 # Images of up to 64 pixels per side are shifted by up to this many pixels. Larger images are
 # shifted by up to a sixteenth of their side.
 PADDING = 4
-# The bytes of the batches that are shifted and flipped at a time.
+# Bytes of the batches that `_batches_in_memory` shifts and flips at a time.
 CHUNK_BYTES = 2**24
 
 # Images (B, 3, H, W) uint8, labels (B,), and which of them are renders (B,).
@@ -28,12 +28,15 @@ Batch = tuple[Tensor, Tensor, Tensor]
 
 
 class TrainingImages(NamedTuple):
-    """The images that a round draws from. It numbers the data first, and the renders after them.
+    """Images from which the batches of a round are drawn.
+
+    The N images of the data have the numbers 0 to N - 1. The renders have the
+    numbers from N.
 
     Attributes:
-        split: The images, of which no copy is made.
-        rows: The rows of the split that are trained on, shape (N,).
-        renders: The renders.
+        split: Data set, which also holds the images that validate.
+        rows: Rows of the data set that are trained on, shape (N,).
+        renders: Renders of the round.
     """
 
     split: Split
@@ -45,9 +48,10 @@ class Round(NamedTuple):
     """The training between two regenerations of the renders: an epoch, or a part of one.
 
     Attributes:
-        number: The number of the round in the run, from 0.
-        epoch: The number of its epoch, from 0.
-        rows: The numbers of the images that it shows, ascending, int64, shape (N,).
+        number: Number of the round in the run, from 0.
+        epoch: Number of its epoch, from 0.
+        rows: Numbers of its images in `TrainingImages`, ascending, int64, shape
+            (M,).
     """
 
     number: int
@@ -133,10 +137,11 @@ def training_batches(
     flips: str = "random",
     first: int = 0,
 ) -> Iterator[Batch]:
-    """Give this process's part of each batch of a round.
+    """Yield the part of each batch of a round that this process trains on.
 
-    All batches have one size. The last one is filled up with the first images of the round. All
-    draws are made on the CPU. They are the same for every device and number of processes.
+    All batches have the same size. The last one is filled up with the first
+    images of the round. All draws are made on the CPU. They are the same for
+    every device and every number of processes.
 
     Args:
         images: The data and the renders.
@@ -160,7 +165,7 @@ def training_batches(
 
 
 def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips: str) -> Draws:
-    """Draw the order, the shifts, the flips and the crops of a round, a row for each batch."""
+    """Draw the order, shifts, flips and crops of the images of a round."""
     shown = len(now.rows)
     batches = math.ceil(shown / batch_size)
     shuffled = now.rows[torch.randperm(shown, generator=generator(seed, now.number, "batches"))]
@@ -185,13 +190,14 @@ def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips:
 
 
 def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iterator[Batch]:
-    """Give the batches of images that lie in memory. Several batches are made at a time."""
+    """Yield the batches of images in memory. Several batches are computed at a time."""
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
     device = pixels.device
     at_once = share * max(1, CHUNK_BYTES // (share * pixels[0].numel()))
 
-    # Everything is sent to the device at once, so that no batch waits for it.
+    # The draws of all batches are copied to the device together, so that no batch
+    # waits for a copy.
     order = draws.order.flatten()
     is_render_on_cpu = order >= len(rows)
     parts = [slice(begin, begin + at_once) for begin in range(0, len(order), at_once)]
@@ -222,7 +228,7 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
-    """Give the batches of images that are read from files, in random crops.
+    """Yield the batches of images that are read from files, in random crops.
 
     The crops are flipped at random when they are read. Renders are shifted and flipped here.
     """

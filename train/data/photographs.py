@@ -78,16 +78,16 @@ class _Row:
 
 
 def require_outside(out: Path, folder: Path) -> None:
-    """Check that a folder for results does not lie among photographs.
+    """Check that a folder for results does not lie inside a folder of photographs.
 
-    The contact sheet would be scored there, too.
+    Otherwise the contact sheet would be scored as a photograph.
 
     Args:
-        out: The folder for results.
-        folder: The folder of photographs.
+        out: Folder for results.
+        folder: Folder of photographs.
 
     Raises:
-        InputError: The first folder lies inside the second.
+        InputError: If `out` lies inside `folder`.
     """
     if out.resolve().is_relative_to(folder.resolve()):
         raise InputError(f"out={out} lies inside the photographs' folder: choose another")
@@ -96,28 +96,36 @@ def require_outside(out: Path, folder: Path) -> None:
 def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list[Photograph]:
     """Find the images of a folder, each with its class.
 
-    The folder holds a sub-folder per class, or images only. Images only are all of class `label`.
-    A sub-folder of no class shows other things. It is warned of unless its name begins with
-    "other_". Sub-folders are searched to any depth, through symbolic links, too. Hidden files and
-    other kinds (see `unsupported_files`) are skipped.
+    The folder has one of two layouts:
 
-    A file photos.csv gives sources in its columns `path` and `source_tag`. Its column
-    `hard_negatives` names further sources, separated by ";", and its column `mesh` names the
-    object.
+    - A sub-folder for each class. Sub-folders of other names hold negatives, and
+      a warning names them unless their names begin with "other_".
+    - Images only. All of them belong to the class `label`.
+
+    Sub-folders and symbolic links are searched to any depth. Hidden files and
+    files of other types (see `unsupported_files`) are skipped.
+
+    A file photos.csv may have these columns:
+
+    - path and source_tag: path of an image, and its source;
+    - hard_negatives: other sources, separated by ";", whose negatives the image
+      is ranked against;
+    - mesh: name of the object.
 
     Args:
         folder: The folder.
-        classes: The names of the network's classes.
-        label: The class under study, or several.
+        classes: Names of the classes of the network.
+        label: Positive class, or a list of several.
 
     Returns:
         The images, sorted by path.
 
     Raises:
-        InputError: The folder is missing, unreadable or empty, or it mixes both layouts. `label`
-            is not a class. A sub-folder is none, but has a name like `label`. No sub-folder is a
-            class. photos.csv lacks its columns, contradicts itself, or names no file of the
-            folder or a source without images.
+        InputError: If the folder is missing, unreadable or empty, or mixes both
+            layouts; if `label` is not a class; if the name of a sub-folder is
+            not a class but resembles `label`; if no sub-folder is named after a
+            class; or if photos.csv lacks a column, contradicts itself, or names
+            only missing files or a source without images.
     """
     labels = label_names(label)
     for name in labels:
@@ -246,22 +254,24 @@ def is_hidden(name: str) -> bool:
 
 
 def _files(folder: Path) -> Iterator[PurePosixPath]:
-    """Give the paths of all files that are not hidden.
+    """Yield the paths of all files that are not hidden, relative to the folder.
 
-    Links are followed, except to a folder that they lie in.
+    Symbolic links are followed, except if they lead to a folder around them.
     """
 
     def refuse(error: OSError) -> NoReturn:
         raise error
 
     for root, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
-        inside = Path(os.path.realpath(root))
-        visited = []
+        real_root = Path(os.path.realpath(root))
+        to_visit = []
         for name in folders:
             target = os.path.realpath(os.path.join(root, name))
-            if not is_hidden(name) and not inside.is_relative_to(target):
-                visited.append(name)
-        folders[:] = visited  # os.walk goes on with these.
+            leads_back = real_root.is_relative_to(target)
+            if not is_hidden(name) and not leads_back:
+                to_visit.append(name)
+        # os.walk visits the folders in this list next.
+        folders[:] = to_visit
         parent = PurePosixPath(Path(root).relative_to(folder).as_posix())
         yield from (parent / name for name in files if not is_hidden(name))
 
@@ -272,10 +282,10 @@ def _has_class_folders(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> bool:
-    """Say whether the images lie in class folders, and check the names of these.
+    """Return whether the images lie in class folders, and check the names of the folders.
 
-    Raise InputError if no folder is a class, if a folder may be meant for a label, or if images
-    lie beside folders.
+    Raise InputError if no folder is named after a class, if the name of another
+    folder resembles a label, or if images lie beside the folders.
     """
     names = folder_names(folder)
     others = [name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)]
@@ -297,12 +307,12 @@ def _has_class_folders(
 
 
 def _is_like(name: str, label: str) -> bool:
-    """Say whether a folder's name may be meant for a label."""
+    """Return whether the name of a folder resembles a label."""
     return label in name.lower() or bool(get_close_matches(name.lower(), [label]))
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
-    """Read photos.csv by path; nothing if there is no such file."""
+    """Read the rows of photos.csv by path. Return no rows if there is no such file."""
     rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
         return rows

@@ -124,20 +124,21 @@ def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
     """Say how often adversaries still succeed in another version of their images."""
-    numbers = [line["versions"][version] for line in adversaries]
-    success = sum(line["success"] for line in numbers)
+    results = [line["versions"][version] for line in adversaries]
+    success = sum(result["success"] for result in results)
     without_noise = ""
     if has_noise:
-        count = sum(line[f"success{WITHOUT_NOISE}"] for line in numbers)
+        count = sum(result[f"success{WITHOUT_NOISE}"] for result in results)
         without_noise = f" ({count} without noise)"
+    # Adversaries that deceived the classifier with the margin that was asked for.
     with_margin = [line for line in adversaries if line["success_with_margin"]]
-    by_margin = [line["versions"][version]["success"] for line in with_margin]
-    largest = 255 * max(line["largest_difference"] for line in numbers)
-    mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
+    success_with_margin = sum(line["versions"][version]["success"] for line in with_margin)
+    largest = 255 * max(result["largest_difference"] for result in results)
+    mean = 255 * sum(result["mean_difference"] for result in results) / len(results)
     return (
         f"images as {VERSIONS.get(version, version)}: "
-        f"{success} of {len(numbers)} still succeed{without_noise}, "
-        f"{sum(by_margin)} of the {len(by_margin)} with the margin; "
+        f"{success} of {len(results)} still succeed{without_noise}, "
+        f"{success_with_margin} of the {len(with_margin)} with the margin; "
         f"pixels differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )
 

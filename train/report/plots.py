@@ -124,7 +124,7 @@ def _draw_curves(
     lines_of_method: Mapping[str, list[list[tuple[float, float]]]],
     x_title: str,
 ) -> None:
-    """Draw the lines of each method in its color; the first one is named in the legend."""
+    """Draw the lines of each method in its color. The legend names the first line of a method."""
     for index, (method, lines) in enumerate(lines_of_method.items()):
         name: str | None = method
         for line in lines:
@@ -142,15 +142,20 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     """Plot ROC curves, one for each seed of a method.
 
     Args:
-        methods: The scores of the positives and the negatives of each seed, by method.
-        label: The classes under study, as the axes name them.
+        methods: Pairs of the scores of the positives and of the negatives, one
+            pair for each seed, by method.
+        label: Positive classes in words, for the title of an axis.
 
     Returns:
-        The plot. None if no seed has scores of both kinds.
+        The plot. None if no seed has both positives and negatives.
     """
     known = {}
     for method, pairs in methods.items():
-        known[method] = [pair for pair in pairs if all(map(len, pair))]
+        known[method] = [
+            (positives, negatives)
+            for positives, negatives in pairs
+            if len(positives) and len(negatives)
+        ]
     if not any(known.values()):
         return None
     styles = {method: style(index) for index, method in enumerate(methods)}

@@ -133,7 +133,7 @@ def _title(found: summary.Findings, methods: Methods) -> str:
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-# Lines of metrics.jsonl of the epochs of each run of each method.
+# Metrics of each epoch of each run, by method. An epoch is a line of metrics.jsonl.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 

@@ -520,14 +520,15 @@ def _spread(metrics: Sequence[Estimate | None]) -> str:
 
 
 class ExampleRow(NamedTuple):
-    """An example of an attack, as a row of a table.
+    """Row of a table about an example of an attack.
 
     Attributes:
         number: Number of the example.
-        label: Its class, or its classes in several views.
-        before: Predictions before the attack, with their probabilities.
-        after: Predictions after the attack.
-        outcome: What came of the attack, in words.
+        label: Class of the example, or the classes of its views.
+        before: Predicted class of each view before the attack, with its
+            probability.
+        after: The same after the attack.
+        outcome: Success or failure in words, such as "success in 12 steps".
     """
 
     number: int
@@ -709,8 +710,8 @@ def _walk(folder: Path) -> Iterator[Path]:
         below.sort()
         is_run = bool(names & of_run)
         if is_run:
-            # os.walk goes on in the folders that this list keeps.
             evaluations = {name for name in below if (path / name / SUMMARY).is_file()}
+            # os.walk visits the folders that stay in this list.
             below[:] = [name for name in below if name != BEFORE and name not in evaluations]
         if is_run or names & of_others or names >= {CONFIG, "train.log"}:
             yield path

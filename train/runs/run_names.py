@@ -11,9 +11,12 @@ from omegaconf import OmegaConf
 
 from train.settings import CIRCUMSTANCES
 
-MAX_PART = 48  # characters of a setting in a folder's name
-MAX_NAME = 200  # characters of a folder's name; file systems take 255
-HYDRAS_OWN = re.compile(r"\+*hydra[./]")  # settings of Hydra itself
+# Maximum number of characters of a setting in the name of a folder.
+MAX_PART = 48
+# Maximum number of characters of the name of a folder. File systems take 255.
+MAX_NAME = 200
+# Start of the overrides that are settings of Hydra itself.
+HYDRAS_OWN = re.compile(r"\+*hydra[./]")
 
 
 def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str = "") -> str:

@@ -85,11 +85,11 @@ class Averages:
         self.selected = cast(MixedPrecision, average.module) if average else model
 
     def begin_epoch(self, initial: nn.Module | None, optimizer: torch.optim.Optimizer) -> None:
-        """Go back to the initial network, where each epoch of a soup begins.
+        """Reset the network to the initial one if the run makes a soup.
 
         Args:
-            initial: The network that the run began with, if any.
-            optimizer: The optimizer, which forgets its momentum.
+            initial: Network with which the run began. None for random weights.
+            optimizer: Optimizer of the network. Its momentum is reset.
         """
         if self._soup is None or initial is None:
             return

@@ -30,7 +30,8 @@ class Baseline:
             images), "trivial_augment" or "augmix".
         model: The network that PGD attacks.
         seed: The seed of the run.
-        absent: Further classes that no image of a complementary label shows; see `label_loss`.
+        absent: Other classes that no image with a complementary label shows. See
+            `label_loss`.
     """
 
     def __init__(self, name: str, model: nn.Module, seed: int, absent: Sequence[int] = ()):

@@ -105,28 +105,30 @@ class EpochPlan:
 
 
 class Trainer:
-    """One run's network, optimizer, augmentation service and folder.
+    """Trainer of one network. It writes checkpoints to the folder of the run.
 
-    `fit` trains. `resume` goes on with what the folder holds.
+    `fit` trains the network. `resume` restores the newest checkpoint before.
 
     Args:
-        settings: How the network is trained.
-        model: The network that is trained.
-        architecture: What rebuilds the network from a checkpoint, its classes included.
-        service: What regenerates the renders.
-        folder: The folder of the run.
+        settings: Settings of the training.
+        model: Network to train.
+        architecture: Arguments that build the network, with its classes. They
+            are stored in checkpoints.
+        service: Service that renders the training examples anew for each round.
+        folder: Folder of the run.
         labeled: Whether the labels of the data are known.
 
     Attributes:
-        initial: A copy of the network as the run began, if that was with another network's
-            weights. It is the teacher, and the epochs of a soup begin with it.
-        averages: The averages of the network, and which network is kept.
-        epoch: The number of epochs that have ended.
-        history: The metrics of each of these epochs.
+        initial: Copy of the network before the training. None if the run begins
+            with random weights. The copy is the teacher of a distillation loss,
+            and each epoch of a model soup begins with it.
+        averages: Moving average and soup of the network.
+        epoch: Number of finished epochs.
+        history: Metrics of each finished epoch.
 
     Raises:
-        InputError: The processes cannot share a batch equally, or there are no hard negatives
-            for a ranking loss.
+        InputError: If a batch cannot be divided equally among the processes, or
+            if there are no hard negatives for a ranking loss.
     """
 
     def __init__(
@@ -213,17 +215,20 @@ class Trainer:
     def fit(self, split: Split, held_out: Tensor, log: RunLog | None) -> None:
         """Train to the last epoch.
 
-        Afterwards best.pt holds the network that validated best. For a soup, and for data without
-        labels, it holds the last network.
+        Afterwards, best.pt holds the network with the highest validation
+        accuracy. For a soup, and for data without labels, it holds the last
+        network.
 
         Args:
-            split: The images, on the trainer's device.
-            held_out: Which of the images validate, bool on the CPU, shape (N,).
-            log: What the first process writes to; None for the others.
+            split: Images and labels, on the device of the network.
+            held_out: Mask of the images that validate, bool on the CPU, shape
+                (N,).
+            log: Log of the run. None in all processes but the first one.
 
         Raises:
-            InputError: The training diverges.
-            Interrupted: A signal ended the training, after a checkpoint.
+            InputError: If the training diverges.
+            Interrupted: If a signal ended the training. A checkpoint was
+                written before.
         """
         train = torch.nonzero(~held_out).squeeze(1)
         validation = torch.nonzero(held_out).squeeze(1)
@@ -246,7 +251,7 @@ class Trainer:
         signals: SignalHandler,
         log: RunLog | None,
     ) -> bool:
-        """Take the epoch's remaining steps; return whether all were taken before a signal came."""
+        """Take the remaining steps of an epoch. Return False if a signal came before the last."""
         plan = self._plan(split, rows)
         if self._under_way is None:
             self._under_way = self._begin_epoch(plan, log)
@@ -287,7 +292,7 @@ class Trainer:
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
     ) -> Generator[Batch, None, None]:
-        """Give the batches that are left of an epoch, and render before each further round."""
+        """Yield the remaining batches of an epoch, and render before each of its other rounds."""
         current = len(state.diagnostics) - 1
         for index in range(current, len(plan.rounds)):
             if index == len(state.diagnostics):
@@ -316,7 +321,8 @@ class Trainer:
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
         if log and renders.attack_examples:
-            # They are written now, since a run that resumes within the epoch makes no others.
+            # A run that is resumed within the epoch does not attack these renders
+            # again, so their images are written now.
             with self.phases("input_output"):
                 classes = self.architecture["classes"]
                 log.attack_examples(renders.attack_examples, classes, self.epoch + 1)
@@ -343,7 +349,7 @@ class Trainer:
             The sum of the losses and the number of correct predictions, shape (2,).
         """
         settings = self.settings
-        # Each epoch of a soup has the whole schedule.
+        # Each epoch of a soup runs through the whole schedule.
         done = progress if settings.soup else (self.epoch + progress) / settings.epochs
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(settings, done)
@@ -404,7 +410,7 @@ class Trainer:
         console.info("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
-        """Raise InputError where the loss or a weight is NaN or infinite, before either is kept."""
+        """Raise InputError if the loss or a weight is NaN or infinite."""
         weights = self.model.network.state_dict().values()
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
@@ -412,13 +418,14 @@ class Trainer:
             rate = f"learning_rate={settings.learning_rate}"
             decay = f"weight_decay={settings.weight_decay}"
             effect = f"made the loss or weights NaN or infinite in epoch {epoch}"
-            raise InputError(f"{rate} with {decay} {effect}: set lower ones", "learning_rate")
+            raise InputError(f"{rate} with {decay} {effect}: set lower values", "learning_rate")
 
     def _save(self) -> None:
-        """Write last.pt, keeping the one before, and best.pt if there is a better network."""
+        """Write last.pt, keep its predecessor, and write best.pt if there is a better network."""
         if self._under_way:
             self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
-        # This follows the epoch's line of metrics, so that a resumed run never lacks the line.
+        # The line of the epoch in metrics.jsonl is written before the checkpoint, so
+        # that a resumed run never lacks this line.
         with self.phases("input_output"):
             state = self.state_dict()
             best = self._best
@@ -434,16 +441,17 @@ class Trainer:
             self._saving_took = self._saved_at - start
 
     def _saving_is_due(self) -> bool:
-        """Say whether to write a checkpoint within the epoch.
+        """Return whether to write a checkpoint within the epoch.
 
-        A killed run then loses about a minute. Several processes would have to agree on the
-        moment. They write at the end of an epoch, or on a signal.
+        If the run is killed, it then loses about a minute. Several processes
+        would have to agree on the moment, so they write only at the end of an
+        epoch or after a signal.
         """
         wait = max(SAVING_EVERY, self._saving_took / SAVING_SHARE)
         return distributed.world_size() == 1 and time.perf_counter() - self._saved_at > wait
 
     def _description(self) -> dict[str, Any]:
-        """Return what is stored beside the weights of a network."""
+        """Return the facts that are stored with the weights of a network."""
         return {
             "architecture": self.architecture,
             "epoch": self.epoch,
@@ -452,7 +460,7 @@ class Trainer:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a run needs to go on as if it had never ended."""
+        """Return the state from which a run continues as if it had not stopped."""
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
@@ -467,10 +475,11 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` gave.
+        """Restore the state that `state_dict` returned.
 
         Args:
-            state: The state. Anything else raises many kinds of errors.
+            state: State of the same network. Any other value raises errors of
+                many types.
         """
         self.epoch = state["epoch"]
         self.history = state["history"]

@@ -58,15 +58,17 @@ SAMPLED = 1000
 class Run:
     """One training run: its data, its network, its folder and its scores.
 
-    The steps are called in order: `load`, `fit`, `score`, `export`. Wrong input shows in `load`,
-    so that several runs can be loaded before the first of them trains.
+    The steps are called in this order: `load`, `fit`, `score`, `export`. Wrong
+    input raises an error in `load`, so that several runs can be checked before
+    the first of them trains.
 
     Args:
-        settings: The settings of the run.
-        data: Its data set.
-        folder: The folder that the run writes to.
-        initial: The network that it begins with; None for random weights.
-        command: The command that was given, which is recorded.
+        settings: Settings of the run.
+        data: Data set of the run.
+        folder: Folder that the run writes to.
+        initial: Network with whose weights the run begins. None for random
+            weights.
+        command: Command that was given. The run records it.
     """
 
     trainer: Trainer
@@ -93,10 +95,11 @@ class Run:
         self._answers: Tensor | None = None
 
     def load(self) -> None:
-        """Do everything that comes before the first epoch.
+        """Check the inputs, build the network and its renders, and restore a checkpoint if asked.
 
         Raises:
-            InputError: The settings, the data, the folder or its checkpoint are wrong.
+            InputError: If the settings, the data, the folder or its checkpoint
+                are wrong.
         """
         settings = self.settings
         self.data = _data_for(settings, self.data, self.initial)
@@ -164,7 +167,7 @@ class Run:
         return self._scores
 
     def export(self) -> None:
-        """Write the weights of a network that began as a classifier, as its own file has them."""
+        """Write the weights of a pretrained classifier in the format in which they were loaded."""
         if self.log and CLASSIFIER in self.trainer.architecture:
             path = self.folder / WEIGHTS
             export(path, self.trainer.selected.network)
@@ -191,9 +194,10 @@ class Run:
         return recorded if isinstance(recorded, int) and recorded > 0 else None
 
     def _warn_of_stretched_schedule(self, planned: int) -> None:
-        """Warn of the jump of the learning rate that another number of epochs causes."""
+        """Warn if a resumed run continues at another learning rate, due to a new number of epochs."""
         recipe = self.settings.train
-        # Each epoch of a soup has the whole schedule.
+        # Each epoch of a soup runs through the whole schedule, so that the number of
+        # epochs does not change it.
         if recipe.epochs == planned or recipe.soup:
             return
         rate = learning_rate(recipe, self.trainer.epoch / recipe.epochs)

@@ -701,6 +701,18 @@ def _fraction_above(scores: np.ndarray, cutoffs: np.ndarray) -> np.ndarray:
     return (len(scores) - at_or_below) / len(scores)
 
 
+def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the entry of a metric, or an empty dictionary if there is none.
+
+    The metric "recall_at/0.05" is summary["recall_at"]["0.05"] in summary.json,
+    and summary["recall_at/0.05"] in the file of a published network.
+    """
+    entry: Any = summary
+    for key in name.split("/"):
+        entry = entry.get(key, {})
+    return entry or summary.get(name, {})
+
+
 def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
     """Read a metric from summary.json.
 
@@ -716,11 +728,7 @@ def read_metric(summary: Mapping[str, Any], name: str) -> Estimate | None:
     Raises:
         KeyError, TypeError, ValueError: If the entry is damaged.
     """
-    entry: Any = summary
-    for key in name.split("/"):
-        entry = entry.get(key, {})
-    # Published networks have the name itself as the key.
-    entry = entry or summary.get(name, {})
+    entry = _find_entry(summary, name)
     if not entry:
         return None
     ends: dict[str, float | None] = dict.fromkeys(("value", "low", "high"))
@@ -753,6 +761,6 @@ def metric_title(name: str) -> str:
     """
     if name in TITLES:
         return TITLES[name]
-    # All other names are those of a recall, as in "recall_at/0.10".
+    # The name is one of a recall, such as "recall_at/0.10".
     _, _, rate = name.partition("/")
     return f"recall at {float(rate):.0%} FPR"

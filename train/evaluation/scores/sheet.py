@@ -93,12 +93,14 @@ def _sections(
     images: torch.Tensor,
 ) -> list[_Section]:
     """Divide the predictions about a class into the sections of the contact sheet."""
-    pairs = sorted(zip(predictions, images, strict=True), key=lambda pair: -pair[0].probability)
-    positives = [pair for pair in pairs if pair[0].positive]
-    negatives = [pair for pair in pairs if not pair[0].positive]
-    found = [pair for pair in positives if pair[0].predicted == label]
-    missed = [pair for pair in positives if pair[0].predicted != label]
-    mistaken = [pair for pair in negatives if pair[0].predicted == label]
+    pairs = list(zip(predictions, images, strict=True))
+    # The images with the most confident predictions come first.
+    pairs.sort(key=lambda pair: pair[0].probability, reverse=True)
+    positives = [(item, image) for item, image in pairs if item.positive]
+    negatives = [(item, image) for item, image in pairs if not item.positive]
+    found = [(item, image) for item, image in positives if item.predicted == label]
+    missed = [(item, image) for item, image in positives if item.predicted != label]
+    mistaken = [(item, image) for item, image in negatives if item.predicted == label]
     return [
         _Section("true positives", GREEN, found, len(positives)),
         _Section("false negatives", RED, missed, len(positives)),
