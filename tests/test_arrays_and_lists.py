@@ -14,6 +14,7 @@ from augment.progress import Phases
 from renderer import harmonics, skylight
 from renderer.camera import Camera
 from renderer.light.lamps import Lamps
+from tests.helpers import bright_or_dark
 
 SIZE = 8
 MESH = renderer.Mesh.plain(
@@ -29,12 +30,6 @@ COVERED = len(OPERATOR.pixels)
 SCENE = augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 LABELS = torch.tensor([1, 0])
-
-
-def bright_or_dark(images: Tensor) -> Tensor:
-    """Logits of two classes that depend on the mean of an image alone."""
-    mean = images.mean((1, 2, 3))
-    return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
 
 
 CLASSIFIER = augment.Classifier(bright_or_dark, SIZE, ["orange", "other"])
@@ -105,7 +100,11 @@ CALLS: dict[str, tuple[Tensor, Callable[[Any], Tensor]]] = {
         torch.tensor([3, 1]),
         lambda x: (
             augment.AugmentationService(
-                augment.AugmentationSettings(), SCENE, x, 0, Phases()
+                augment.AugmentationSettings(),
+                SCENE,
+                x,
+                0,
+                Phases(),
             ).labels
         ),
     ),
@@ -118,7 +117,9 @@ def orbit_of(values: Any) -> list[Camera]:
 
 
 @pytest.mark.parametrize(
-    "convert", [lambda x: x.numpy(), lambda x: x.tolist()], ids=["array", "list"]
+    "convert",
+    [lambda x: x.numpy(), lambda x: x.tolist()],
+    ids=["array", "list"],
 )
 @pytest.mark.parametrize("name", CALLS)
 def test_an_array_or_a_list_gives_what_the_tensor_gives(name, convert):

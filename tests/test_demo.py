@@ -1,4 +1,4 @@
-"""The demonstration, run as the README's first command runs it."""
+"""The first command of the README trains the demonstration."""
 
 import json
 import os
@@ -10,6 +10,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+
+
+def read_auc(folder: Path) -> float:
+    """Read the AUC on the photographs of the laboratory."""
+    summary = json.loads((folder / "laboratory" / "summary.json").read_text())
+    return summary["auc"]["value"]
 
 
 @pytest.mark.slow
@@ -26,13 +32,12 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
     *_, sheet = re.findall(r"^image: (.*)$", done.stdout, re.M)
     folder = Path(sheet).parents[1]
     assert Path(sheet).read_bytes().startswith(b"\x89PNG")
-    auc = {
-        network: json.loads((path / "laboratory" / "summary.json").read_text())["auc"]["value"]
-        for network, path in [("the initial network", folder / "before"), ("random", folder)]
-    }
-    assert auc["random"] > auc["the initial network"] + 0.05
-    for network, value in auc.items():
+    before = read_auc(folder / "before")
+    after = read_auc(folder)
+    assert after > before + 0.05
+    for network, value in [("the initial network", before), ("random", after)]:
         assert re.search(rf"^\| {network} .*\b{value:.3f}\b", done.stdout, re.M)
     *_, last = done.stdout.splitlines()
     page = Path(last.removeprefix("report: "))
-    assert page.parent == folder and "Examples of renders" in page.read_text()
+    assert page.parent == folder
+    assert "Examples of renders" in page.read_text()

@@ -11,15 +11,18 @@ from torch import Tensor
 import augment
 import renderer
 
-PUBLIC = {
-    f"{package.__name__}.{name}": getattr(package, name)
-    for package in (renderer, augment)
-    for name in package.__all__
-}
-MODULES = {
-    value.__name__ if isinstance(value, ModuleType) else value.__module__
-    for value in PUBLIC.values()
-}
+PUBLIC = {}
+for package in (renderer, augment):
+    for name in package.__all__:
+        PUBLIC[f"{package.__name__}.{name}"] = getattr(package, name)
+
+
+def module_of(value: object) -> str:
+    """Return the name of a module, or of the module that defines a function or a class."""
+    return value.__name__ if isinstance(value, ModuleType) else value.__module__
+
+
+MODULES = {module_of(value) for value in PUBLIC.values()}
 FUNCTIONS = [name for name, value in PUBLIC.items() if isinstance(value, FunctionType)]
 
 
@@ -30,7 +33,7 @@ def logits(images: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def result() -> augment.AttackResult:
-    """As in the example of `augment.attack`."""
+    """Define what the example of `augment.attack` defines."""
     classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
     scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
     light = augment.StepSettings(step_size=0.5)
@@ -50,7 +53,9 @@ def test_examples_run(module, result, tmp_path, monkeypatch):
         "result": result,
     }
     failures, _ = doctest.testmod(
-        importlib.import_module(module), extraglobs=names, optionflags=flags
+        importlib.import_module(module),
+        extraglobs=names,
+        optionflags=flags,
     )
     assert not failures
 

@@ -44,22 +44,19 @@ def test_only_one_module_imports_opengl():
 
 
 def modules() -> dict[str, Path]:
-    """The files of all packages by module."""
+    """Map all modules of the packages to their files."""
     paths = [path for package in ALLOWED for path in (ROOT / package).rglob("*.py")]
     names = [path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for path in paths]
     return dict(zip((name.removesuffix(".__init__") for name in names), paths, strict=True))
 
 
 def imported_modules() -> dict[str, set[str]]:
-    """What each module imports of the packages, also inside functions and for types alone."""
+    """Map each module to what it imports of the packages, also in functions and for types."""
     known = modules()
     imported = {}
     for name, path in known.items():
-        nodes = [
-            node
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.ImportFrom)
-        ]
+        tree = ast.parse(path.read_text())
+        nodes = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
         members = {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
         parents = {f"{node.module}" for node in nodes} - {name}
         imported[name] = (members | parents) & known.keys() - {name}
@@ -67,9 +64,8 @@ def imported_modules() -> dict[str, set[str]]:
 
 
 def test_no_import_leads_back_to_its_module():
-    order = list(
-        TopologicalSorter(imported_modules()).static_order()
-    )  # CycleError names the circle
+    # A circle raises CycleError, which names it.
+    order = list(TopologicalSorter(imported_modules()).static_order())
     path = [
         "renderer.geometry.mesh",
         "renderer.io.meshes",
@@ -91,20 +87,19 @@ def test_no_folder_of_a_package_imports_one_that_imports_it(package):
 
 
 def folder_of(module: str) -> str:
-    """The folder below a package, or the module itself if it lies in no such folder."""
+    """Return the folder of a module below its package, or the module if it has none."""
     parts = module.split(".")
     return ".".join(parts[:2])
 
 
 def test_only_commands_and_what_gets_all_their_settings_name_keys():
-    """Other modules name their Python arguments, and `keyed` says which setting gave the value."""
+    """Other modules name Python arguments. `keyed` replaces them by settings."""
     main = importlib.import_module("train.__main__").main
-    parts = {
-        key.rpartition(".")[0] for key in main.keys
-    }  # such as augment.attack, which is a function, too
-    keys = {key for key in main.keys if "." in key} - parts
+    # A group of settings may have the name of a function, such as augment.attack.
+    groups = {key.rpartition(".")[0] for key in main.keys}
+    keys = {key for key in main.keys if "." in key} - groups
     assert "train.precision" in keys
-    told = re.compile("ExperimentSettings|DictConfig")
+    gets_settings = re.compile("ExperimentSettings|DictConfig")
     command_layer = (
         "train.command",
         "train.help",
@@ -115,7 +110,7 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
     checked = 0
     for name, path in modules().items():
         has_help = name.endswith("settings")
-        if has_help or name.startswith(command_layer) or told.search(path.read_text()):
+        if has_help or name.startswith(command_layer) or gets_settings.search(path.read_text()):
             continue
         checked += 1
         for text in texts(path):
@@ -124,23 +119,18 @@ def test_only_commands_and_what_gets_all_their_settings_name_keys():
 
 
 def texts(path: Path) -> list[str]:
-    """The strings of a module but for its docstrings."""
+    """List the strings of a module, except for docstrings."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-    constants = [
-        node for node in nodes if isinstance(node, ast.Constant) and id(node) not in docstrings
-    ]
-    return [node.value for node in constants if isinstance(node.value, str)]
+    constants = [node for node in nodes if isinstance(node, ast.Constant)]
+    others = [node.value for node in constants if id(node) not in docstrings]
+    return [value for value in others if isinstance(value, str)]
 
 
 def test_settings_need_neither_torch_nor_numpy():
-    """Commands check their settings and print --help before anything that takes seconds to import."""
-    modules = [
-        path.relative_to(ROOT).with_suffix("").as_posix() for path in ROOT.glob("*/**/*settings.py")
-    ]
-    names = [name.replace("/", ".") for name in modules if name.partition("/")[0] in ALLOWED]
-    code = (
-        f"import sys; sys.modules['torch'] = sys.modules['numpy'] = None; import {', '.join(names)}"
-    )
+    """Commands check settings and print --help before they import slow libraries."""
+    names = [name for name in modules() if name.endswith("settings")]
+    hide = "import sys; sys.modules['torch'] = sys.modules['numpy'] = None"
+    code = f"{hide}; import {', '.join(names)}"
     assert len(names) > 2
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -1,4 +1,4 @@
-"""The Python of the README, the guide and pretrained/, block by block, in a folder that holds what it reads."""
+"""Each block of Python in the README, the guide and pretrained/ runs beside its files."""
 
 import re
 from pathlib import Path
@@ -19,7 +19,9 @@ BLOCKS = {
     heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     for page in PAGES
     for heading, text in re.findall(
-        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)", (ROOT / page).read_text(), re.M | re.DOTALL
+        r"^#{2,3} (.*?)\n(.*?)(?=^#{2,3} |\Z)",
+        (ROOT / page).read_text(),
+        re.M | re.DOTALL,
     )
     if "```python" in text
 }
@@ -34,7 +36,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def run(heading: str, **names) -> dict[str, object]:
-    """The names that the block under a heading defines, given those of its reader."""
+    """Run the block under a heading with given names, and return the names that it defines."""
     exec(BLOCKS[heading], names)
     return names
 
@@ -57,13 +59,10 @@ def test_render_block_has_a_gradient_by_light():
 
 def test_many_views_block_renders_each_view_and_light():
     names = run("Many lights and views")
-    assert names["images"].shape == (100, 2, 3, 32, 32) and names["own_images"].shape == (
-        100,
-        3,
-        32,
-        32,
-    )
-    assert names["lights"].grad.any() and names["gradient"].any()
+    assert names["images"].shape == (100, 2, 3, 32, 32)
+    assert names["own_images"].shape == (100, 3, 32, 32)
+    assert names["lights"].grad.any()
+    assert names["gradient"].any()
 
 
 def test_load_block_recognizes_an_orange(folder):
@@ -108,6 +107,7 @@ def test_training_loop_block_trains_on_data_and_renders():
         data=Photographs(),
         optimizer=optimizer,
     )
-    assert len(names["renders"]) == 10 and names["renders"].labels.eq(53).all()
+    assert len(names["renders"]) == 10
+    assert names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32)
     assert not torch.equal(network[1].weight, before)

@@ -1,4 +1,4 @@
-"""Plausible wrong calls of every public function and class: each is refused by a sentence that names the argument."""
+"""Wrong calls of public functions and classes are refused by the name of the argument."""
 
 import math
 from collections.abc import Callable
@@ -23,6 +23,7 @@ from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps
 from renderer.light.projector import Projector
+from tests.helpers import bright_or_dark
 from train import load_run
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs, score
@@ -43,17 +44,11 @@ COMPLEX = torch.ones(49, 3) * 1j
 OBJECTS = np.full((49, 3), None)
 IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 BYTES = IMAGES * 255
-COUNT_FAULTS = (16.5, True, 0, -1, "16", None, NAN, (16, 16))  # in place of a number of pixels
-
-
-def bright_or_dark(images: Tensor) -> Tensor:
-    """Logits of two classes that depend on the mean of an image alone."""
-    mean = images.mean((1, 2, 3))
-    return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
+COUNT_FAULTS = (16.5, True, 0, -1, "16", None, NAN, (16, 16))  # A wrong number of pixels.
 
 
 def probabilities(images: Tensor) -> Tensor:
-    """What a network with a softmax at its end returns."""
+    """Return probabilities, like a network with a softmax at its end."""
     return bright_or_dark(images).softmax(1)
 
 
@@ -124,9 +119,11 @@ def mesh_of(**changed: Any) -> renderer.Mesh:
 
 
 def calls_of(
-    name: str, call: Callable[[Any], object], *values: Any
+    name: str,
+    call: Callable[[Any], object],
+    *values: Any,
 ) -> list[tuple[str, str, Callable[[], object]]]:
-    """(the argument's name, a title, the call) for each wrong value of an argument."""
+    """List a name, a title and a call for each wrong value of an argument."""
     return [(name, f"{name}={_title(value)}", lambda value=value: call(value)) for value in values]
 
 
@@ -270,10 +267,24 @@ RENDERING = [
         [None],
     ),
     *calls_of(
-        "albedo_scale", lambda x: render(albedo_scale=x), "2", None, -1.0, NAN, 1j, [1.0, 2.0], MESH
+        "albedo_scale",
+        lambda x: render(albedo_scale=x),
+        "2",
+        None,
+        -1.0,
+        NAN,
+        1j,
+        [1.0, 2.0],
+        MESH,
     ),
     *calls_of(
-        "gloss", lambda x: render(gloss=x), 0.3, (0.3, 0, 1), "shiny", MESH, {"roughness": 0.3}
+        "gloss",
+        lambda x: render(gloss=x),
+        0.3,
+        (0.3, 0, 1),
+        "shiny",
+        MESH,
+        {"roughness": 0.3},
     ),
     *calls_of("samples", lambda x: render(samples=x), 0, 2.5, "2", True, 65),
     *calls_of("encoding", lambda x: render(encoding=x), "sRGB", None, 3, ["linear"]),
@@ -332,7 +343,16 @@ RENDERING = [
 
 CAMERAS = [
     *calls_of(
-        "views", lambda x: renderer.orbit_cameras(x, 2.0), 0, -1, 2.5, "3", True, None, NAN, [3]
+        "views",
+        lambda x: renderer.orbit_cameras(x, 2.0),
+        0,
+        -1,
+        2.5,
+        "3",
+        True,
+        None,
+        NAN,
+        [3],
     ),
     *calls_of(
         "width",
@@ -365,7 +385,14 @@ CAMERAS = [
         -721.0,
     ),
     *calls_of(
-        "fov", lambda x: renderer.orbit_cameras(1, 2.0, fov=x), 173.0, "30", 0, -1.0, NAN, 1j
+        "fov",
+        lambda x: renderer.orbit_cameras(1, 2.0, fov=x),
+        173.0,
+        "30",
+        0,
+        -1.0,
+        NAN,
+        1j,
     ),
     *calls_of(
         "polar",
@@ -378,7 +405,12 @@ CAMERAS = [
         1j,
     ),
     *calls_of(
-        "azimuth", lambda x: renderer.OrthographicCamera(1.0, x, 2.0), "east", None, NAN, [1.0, 2.0]
+        "azimuth",
+        lambda x: renderer.OrthographicCamera(1.0, x, 2.0),
+        "east",
+        None,
+        NAN,
+        [1.0, 2.0],
     ),
     *calls_of(
         "width",
@@ -399,7 +431,11 @@ CAMERAS = [
         (0.0, 0.1),
     ),
     *calls_of(
-        "reach", lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x), 0.0, "far", None
+        "reach",
+        lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x),
+        0.0,
+        "far",
+        None,
     ),
     *calls_of(
         "distance",
@@ -417,7 +453,16 @@ CAMERAS = [
 
 LIGHTS = [
     *calls_of(
-        "light", renderer.load_light, None, 3, LIGHT, "sunset", ".", ["grace"], True, b"grace"
+        "light",
+        renderer.load_light,
+        None,
+        3,
+        LIGHT,
+        "sunset",
+        ".",
+        ["grace"],
+        True,
+        b"grace",
     ),
     *calls_of("missing.hdr", renderer.load_light, "missing.hdr"),
     *calls_of("degree", lambda x: renderer.load_light("grace", x), 2.5, -1, 41, "6", True, LIGHT),
@@ -431,7 +476,11 @@ LIGHTS = [
         COMPLEX,
     ),
     *calls_of(
-        "basis", lambda x: renderer.save_light(Path("l.json"), LIGHT, x), "harmonics", None, 6
+        "basis",
+        lambda x: renderer.save_light(Path("l.json"), LIGHT, x),
+        "harmonics",
+        None,
+        6,
     ),
     *calls_of("path", lambda x: renderer.save_light(x, LIGHT), None, 3, LIGHT),
     *calls_of(
@@ -445,7 +494,14 @@ LIGHTS = [
         1j,
     ),
     *calls_of(
-        "degree", lambda x: harmonics.basis(torch.ones(2, 3), x), -1, 2.5, 41, "2", None, True
+        "degree",
+        lambda x: harmonics.basis(torch.ones(2, 3), x),
+        -1,
+        2.5,
+        41,
+        "2",
+        None,
+        True,
     ),
     *calls_of("light", harmonics.degree_of, "grace", None, torch.ones(49), torch.ones(3, 49), 6),
     *calls_of(
@@ -488,10 +544,21 @@ LIGHTS = [
         LAMP,
     ),
     *calls_of(
-        "azimuth", lambda x: skylight.coefficients(0.5, x, 3.0), "south", None, NAN, [[1], [1, 2]]
+        "azimuth",
+        lambda x: skylight.coefficients(0.5, x, 3.0),
+        "south",
+        None,
+        NAN,
+        [[1], [1, 2]],
     ),
     *calls_of(
-        "turbidity", lambda x: skylight.coefficients(0.5, 0.0, x), "clear", None, 1.0, 11.0, NAN
+        "turbidity",
+        lambda x: skylight.coefficients(0.5, 0.0, x),
+        "clear",
+        None,
+        1.0,
+        11.0,
+        NAN,
     ),
     *calls_of(
         "positions",
@@ -519,7 +586,15 @@ MESHES = [
     *calls_of("mesh", renderer.normalize, "a.glb", None, TRIMESH, MESH.vertices, [MESH]),
     *calls_of("mesh", lambda x: renderer.subdivide(x, 10), "a.glb", None, TRIMESH),
     *calls_of(
-        "vertices", lambda x: renderer.subdivide(MESH, x), 2.5, -1, "many", None, True, 10**8, NAN
+        "vertices",
+        lambda x: renderer.subdivide(MESH, x),
+        2.5,
+        -1,
+        "many",
+        None,
+        True,
+        10**8,
+        NAN,
     ),
     *calls_of("mesh", lambda x: renderer.export_mesh(x, "a.glb"), "b.glb", None, TRIMESH),
     *calls_of("path", lambda x: renderer.export_mesh(MESH, x), None, 3, MESH),
@@ -598,7 +673,12 @@ MESHES = [
     ),
     *calls_of("corner_uvs", lambda x: mesh_of(corner_uvs=x), None, np.ones((4, 3)), "x"),
     *calls_of(
-        "texture_ids", lambda x: mesh_of(texture_ids=x), None, np.zeros(4, int), np.zeros(4), [0, 0]
+        "texture_ids",
+        lambda x: mesh_of(texture_ids=x),
+        None,
+        np.zeros(4, int),
+        np.zeros(4),
+        [0, 0],
     ),
     *calls_of(
         "textures",
@@ -630,7 +710,12 @@ MESHES = [
         MESH,
     ),
     *calls_of(
-        "metallic", lambda x: renderer.Gloss(0.3, x).on(MESH), "gold", None, 1.5, np.ones((4, 3))
+        "metallic",
+        lambda x: renderer.Gloss(0.3, x).on(MESH),
+        "gold",
+        None,
+        1.5,
+        np.ones((4, 3)),
     ),
     *calls_of("specular_factor", lambda x: renderer.Gloss(0.3, 0.0, x).on(MESH), "full", None, 1.5),
     *calls_of("mesh", renderer.Gloss(0.3).on, "a.glb", None, TRIMESH),
@@ -704,7 +789,11 @@ SCENES = [
     *calls_of("samples", lambda x: scene(samples=x), 0, 2.5, "2"),
     *calls_of("rasterizer", lambda x: scene(rasterizer=x), "gpu", None, 3),
     *calls_of(
-        "pixels", lambda x: scene(projector=augment.ProjectorSettings(pixels=x)), 2.5, 0, "16"
+        "pixels",
+        lambda x: scene(projector=augment.ProjectorSettings(pixels=x)),
+        2.5,
+        0,
+        "16",
     ),
     *calls_of(
         "pattern",
@@ -735,7 +824,12 @@ SCENES = [
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, 3, "", MESH),
     *calls_of("label", lambda x: scene([augment.ObjectSettings("solid:orange", x)]), None, 3),
     *calls_of(
-        "albedo_scale", lambda x: augment.ObjectSettings("solid:cup", "cup", x), "2", None, 0, NAN
+        "albedo_scale",
+        lambda x: augment.ObjectSettings("solid:cup", "cup", x),
+        "2",
+        None,
+        0,
+        NAN,
     ),
     *calls_of(
         "color",
@@ -797,7 +891,11 @@ SCENES = [
     *calls_of("instances", lambda x: augment.VariationSettings(instances=x), "yes", None),
     *calls_of("fov", lambda x: augment.VariationSettings(fov=x), 30.0, None, [50, 60], "wide"),
     *calls_of(
-        "gloss", lambda x: augment.VariationSettings(gloss=x), 0.3, None, renderer.Gloss(0.3)
+        "gloss",
+        lambda x: augment.VariationSettings(gloss=x),
+        0.3,
+        None,
+        renderer.Gloss(0.3),
     ),
     *calls_of("camera", lambda x: augment.VariationSettings(camera=x), 0.3, None, CAMERA),
     *calls_of("noise", lambda x: augment.CameraEffectSettings(noise=x), 2.0, "much", None, NAN),
@@ -849,7 +947,13 @@ ATTACKS = [
     *calls_of("radius", lambda x: augment.StepSettings("l2", x), "big", -1, NAN, [0.1], True),
     *calls_of("step", lambda x: augment.StepSettings(step=x), "adam", None, 0.1),
     *calls_of(
-        "step_size", lambda x: augment.StepSettings(step_size=x), 0, -0.1, "small", None, NAN
+        "step_size",
+        lambda x: augment.StepSettings(step_size=x),
+        0,
+        -0.1,
+        "small",
+        None,
+        NAN,
     ),
     *calls_of("rotation", lambda x: augment.PoseSettings(rotation=x), 200, "much", None, NAN),
     *calls_of("joints", lambda x: augment.PoseSettings(joints=x), "elbow", None, 200.0, [30.0]),
@@ -866,10 +970,16 @@ ATTACKS = [
     ),
     *calls_of("pose", lambda x: augment.AttackSettings(pose=x), augment.StepSettings(), 10.0, True),
     *calls_of(
-        "material", lambda x: augment.AttackSettings(material=x), augment.StepSettings(), 0.3
+        "material",
+        lambda x: augment.AttackSettings(material=x),
+        augment.StepSettings(),
+        0.3,
     ),
     *calls_of(
-        "skylight", lambda x: augment.AttackSettings(skylight=x), augment.StepSettings(), True
+        "skylight",
+        lambda x: augment.AttackSettings(skylight=x),
+        augment.StepSettings(),
+        True,
     ),
     *calls_of(
         "max_steps",
@@ -881,13 +991,27 @@ ATTACKS = [
         None,
     ),
     *calls_of(
-        "restarts", lambda x: augment.AttackSettings(lighting=STEPS, restarts=x), 1.5, "x", -1, None
+        "restarts",
+        lambda x: augment.AttackSettings(lighting=STEPS, restarts=x),
+        1.5,
+        "x",
+        -1,
+        None,
     ),
     *calls_of(
-        "margin", lambda x: augment.AttackSettings(lighting=STEPS, margin=x), "x", -1, NAN, None
+        "margin",
+        lambda x: augment.AttackSettings(lighting=STEPS, margin=x),
+        "x",
+        -1,
+        NAN,
+        None,
     ),
     *calls_of(
-        "quantized", lambda x: augment.AttackSettings(lighting=STEPS, quantized=x), "yes", None, 8
+        "quantized",
+        lambda x: augment.AttackSettings(lighting=STEPS, quantized=x),
+        "yes",
+        None,
+        8,
     ),
     *calls_of(
         "allow_negative",
@@ -908,10 +1032,23 @@ ATTACKS = [
         None,
     ),
     *calls_of(
-        "classifier", attack, None, LINEAR, bright_or_dark, "efficientnet_lite0", small_scene
+        "classifier",
+        attack,
+        None,
+        LINEAR,
+        bright_or_dark,
+        "efficientnet_lite0",
+        small_scene,
     ),
     *calls_of(
-        "scene", lambda x: attack(scene=x), None, "solid:orange", [MESH], MESH, CLASSIFIER, IMAGES
+        "scene",
+        lambda x: attack(scene=x),
+        None,
+        "solid:orange",
+        [MESH],
+        MESH,
+        CLASSIFIER,
+        IMAGES,
     ),
     *calls_of(
         "target",
@@ -927,7 +1064,12 @@ ATTACKS = [
         {},
     ),
     *calls_of(
-        "settings", lambda x: attack(settings=x), {"lighting": STEPS}, STEPS, "lighting", True
+        "settings",
+        lambda x: attack(settings=x),
+        {"lighting": STEPS},
+        STEPS,
+        "lighting",
+        True,
     ),
     *calls_of("attack", lambda x: attack(settings=x), augment.AttackSettings()),
     *calls_of("seed", lambda x: attack(seed=x, force=True), "x", 1.5, None, -1, True),
@@ -1024,7 +1166,9 @@ DIRECT = [
     *calls_of("backgrounds", lambda x: scene(backgrounds=x), [True]),
     *calls_of("textured", lambda x: renderer.Gloss(0.3, textured=x).on(MESH), "yes", None),
     *calls_of(
-        "classes", lambda x: augment.Classifier(bright_or_dark, SIZE, x), {"orange", "other"}
+        "classes",
+        lambda x: augment.Classifier(bright_or_dark, SIZE, x),
+        {"orange", "other"},
     ),
     *calls_of("degree", harmonics.quadrature, "x", 2.5, -1, None),
     *calls_of("height", lambda x: harmonics.equirectangular(x, 8), "x", 0, None, 4.5),
@@ -1055,7 +1199,12 @@ DIRECT = [
 
 CLASSIFIERS = [
     *calls_of(
-        "function", lambda x: augment.Classifier(x, SIZE, CLASSES), None, "resnet50", 3, IMAGES
+        "function",
+        lambda x: augment.Classifier(x, SIZE, CLASSES),
+        None,
+        "resnet50",
+        3,
+        IMAGES,
     ),
     *calls_of(
         "size",
@@ -1107,7 +1256,9 @@ CLASSIFIERS = [
     *calls_of("float16", half_network(), IMAGES),
     *calls_of("float64", augment.Classifier(LINEAR, SIZE, CLASSES), IMAGES.double()),
     *calls_of(
-        "logits", lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True), probabilities
+        "logits",
+        lambda x: attack(augment.Classifier(x, SIZE, CLASSES), force=True),
+        probabilities,
     ),
     *calls_of("float16", lambda x: attack(x, force=True), half_network()),
     *calls_of("label", CLASSIFIER.label, 3, None, ["orange"], 0.5),
@@ -1117,7 +1268,12 @@ CLASSIFIERS = [
     *calls_of("name", augment.load_classifier, None, 3, LINEAR, ["timm:resnet18"], Path("a.pth")),
     *calls_of("resnet50", augment.load_classifier, "resnet50"),
     *calls_of(
-        "weights", lambda x: augment.load_classifier("torchvision:resnet18", x), 3, ".", LINEAR, {}
+        "weights",
+        lambda x: augment.load_classifier("torchvision:resnet18", x),
+        3,
+        ".",
+        LINEAR,
+        {},
     ),
     *calls_of("run", load_run, None, 3, LINEAR),
     *calls_of("missing", load_run, "missing"),
@@ -1150,17 +1306,27 @@ SERVICES = [
     ),
     *calls_of("label", small_service, "orange", 1.5, None, True, [0], NAN),
     *calls_of(
-        "size", lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x), 16.5, None, 0
+        "size",
+        lambda x: augment.AugmentationService.from_meshes([(MESH, 0)], x),
+        16.5,
+        None,
+        0,
     ),
     *calls_of("settings", lambda x: small_service(settings=x), {"mode": "random"}, STEPS, "random"),
     *calls_of("seed", lambda x: small_service(seed=x), "x", 1.5, None, -1),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2, 53),
     *calls_of("model", lambda x: small_service().regenerate(x, 0), None, "resnet", 3, IMAGES),
     *calls_of(
-        "model", lambda x: small_service().regenerate(x, 0), nn.Flatten(0), nn.Linear(5, 2), HALF
+        "model",
+        lambda x: small_service().regenerate(x, 0),
+        nn.Flatten(0),
+        nn.Linear(5, 2),
+        HALF,
     ),
     *calls_of(
-        "logits", lambda x: small_service().regenerate(x, 0), nn.Sequential(LINEAR, nn.Softmax(1))
+        "logits",
+        lambda x: small_service().regenerate(x, 0),
+        nn.Sequential(LINEAR, nn.Softmax(1)),
     ),
     *calls_of("number", lambda x: small_service().regenerate(LINEAR, x), "x", 1.5, None, -1, True),
     *calls_of(
@@ -1180,10 +1346,14 @@ SERVICES = [
         small_service(),
     ),
     *calls_of(
-        "state", lambda x: x.load_state_dict(small_service(label=1).state_dict()), small_service()
+        "state",
+        lambda x: x.load_state_dict(small_service(label=1).state_dict()),
+        small_service(),
     ),
     *calls_of(
-        "state", lambda x: x.load_state_dict(small_service(width=3.0).state_dict()), small_service()
+        "state",
+        lambda x: x.load_state_dict(small_service(width=3.0).state_dict()),
+        small_service(),
     ),
 ]
 
@@ -1269,7 +1439,7 @@ CALLS = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A mesh file, a file that is nothing else, a folder named like a mesh and two photographs."""
+    """Write a mesh, a text, a folder named like a mesh, and two photographs."""
     from PIL import Image
 
     here = tmp_path_factory.mktemp("wrong_calls")
@@ -1278,18 +1448,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "folder.glb").mkdir()
     for name in ("orange", "other"):
         (here / "photos" / name).mkdir(parents=True)
-        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
-            here / "photos" / name / "0.png"
-        )
+        Image.new(
+            "RGB",
+            (20, 20),
+            name.replace("other", "blue"),
+        ).save(here / "photos" / name / "0.png")
     return here
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    ("name", "call"), [pytest.param(name, call, id=title) for name, title, call in CALLS]
+    ("name", "call"),
+    [pytest.param(name, call, id=title) for name, title, call in CALLS],
 )
 def test_a_wrong_call_is_refused_by_a_sentence_that_names_the_argument(
-    folder, monkeypatch, name, call
+    folder,
+    monkeypatch,
+    name,
+    call,
 ):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError) as refused:
@@ -1321,7 +1497,10 @@ def test_ones_whole_floats_and_paths_pass_where_they_always_did():
     assert torch.equal(render(shadows=1), render(shadows=True))
     assert len(renderer.subdivide(MESH, 1e1).vertices) > 10
     assert scene(vertices=1e1).vertices.shape[1] > 10
-    augment.VariationSettings(backgrounds=Path("photos"), environments=[Path("a.hdr")])  # type: ignore[arg-type]
+    augment.VariationSettings(
+        backgrounds=Path("photos"),
+        environments=[Path("a.hdr")],
+    )  # type: ignore[arg-type]
     assert renderer.Mesh.plain(MESH.vertices, MESH.faces.astype(float)).faces.dtype == np.int64
     assert scene(ground=np.array([0.5, 0.5, 0.5]), backgrounds=torch.tensor([0.2, 0.4])).views == 1
     assert skylight.coefficients([15.0, 30.0], 30.0, 3.0).dtype == torch.float64
@@ -1338,7 +1517,7 @@ def test_gradients_reach_fields_of_cameras_and_lists_of_tensors():
 
 
 def test_logits_are_not_taken_for_probabilities():
-    """A single image, outputs beyond [0, 1], sums of 2 and single classes are no proof of a softmax."""
+    """A single image, values outside [0, 1], sums of 2 and single classes prove no softmax."""
     one_image = augment.Classifier(probabilities, SIZE, CLASSES)
     one_image(IMAGES[:1])
     with pytest.raises(InputError, match="logits"):

@@ -91,11 +91,8 @@ def test_the_benchmarks_plain_autograd_is_the_analytic_gradient(view):
 @pytest.mark.parametrize(("samples", "count"), [(1, 5), (scene.SAMPLES, 4)])
 def test_all_ways_to_the_gradient_by_the_light_agree_at_equal_samples(samples, count):
     view = scene.View(scene.ellipsoid(2), 16, choose("numpy"))
-    results = [
-        contender.step()
-        for contender in renderer.light_gradients(view)
-        if contender.samples == samples
-    ]
+    contenders = renderer.light_gradients(view)
+    results = [contender.step() for contender in contenders if contender.samples == samples]
     first, *others = results
     assert len(results) == count
     for other in others:

@@ -157,7 +157,8 @@ def test_the_change_of_light_is_drawn_over_the_epochs_that_have_attacks(tmp_path
 
 @pytest.mark.parametrize(("fraction_of_radius", "success"), [(0.9, True), (1.1, False)])
 def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(
-    fraction_of_radius, success
+    fraction_of_radius,
+    success,
 ):
     radius = 0.02
     scene = make_scene(1)
@@ -233,7 +234,9 @@ def test_the_bootstrap_resamples_cameras_and_not_renders():
     ],
 )
 def test_only_what_deceives_the_attacked_network_and_was_clean_correct_counts(
-    network, state, outcomes
+    network,
+    state,
+    outcomes,
 ):
     source = {
         "before": ["orange", "orange", "orange", "orange"],

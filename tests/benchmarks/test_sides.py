@@ -115,7 +115,9 @@ def photographs_of(side: str) -> set[str]:
 
 @pytest.mark.slow  # Scoring takes bootstraps.
 def test_the_sides_share_no_image_object_or_light_and_looks_are_logged(
-    made_sides, monkeypatch, capsys
+    made_sides,
+    monkeypatch,
+    capsys,
 ):
     names = [TRAINING, names_of("choosing"), names_of("reporting")]
     assert len(set.union(*names)) == sum(len(part) for part in names)

@@ -54,7 +54,8 @@ def test_a_foreign_module_that_was_imported_first_is_named(tmp_path, name):
     done = run(tmp_path, "-c", f"import sys; sys.path[0] = '.'; import {name}, norm_balls")
     last_line = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 1
-    assert last_line.startswith("ImportError: ") and str(tmp_path / name) in last_line
+    assert last_line.startswith("ImportError: ")
+    assert str(tmp_path / name) in last_line
 
 
 def test_packages_of_the_library_that_were_imported_before_stay(folder):

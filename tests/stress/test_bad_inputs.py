@@ -1,6 +1,7 @@
-"""Damaged and forged files, given to whatever reads them: each is used with finite results, or refused in one sentence.
+"""Damaged and forged files are used with finite results, or refused in one sentence.
 
-Never another exception, a hang, or code run from data. By default a small fixed sample; `-m slow` tries many more.
+No reader raises another exception, hangs, or runs code from a file. By default,
+the tests try a small fixed sample. `-m slow` tries many more.
 """
 
 import io
@@ -26,79 +27,82 @@ from hypothesis import strategies as st
 
 from renderer import InputError, load_light, load_mesh
 from renderer.io.images import gray_or_image
+from train.command import USER_ERROR
 from train.data.sets import load_folder, load_npz
 from train.runs import checkpoint
 from train.system.hashing import content_hash
 
 from .conftest import MAX_SECONDS, RENDERER, TRAINING, run_here
 
-CODE_RAN = (
-    "code_ran"  # a file that appears in the working folder where a reader runs code from its input
-)
-SECONDS = 60  # for a reader; a command has `MAX_SECONDS`
-MEMORY = (
-    12 * 2**30
-)  # bytes of address space beyond today's: what asks for more fails here, and not the machine
+# A reader that runs code from its input creates this file in the working folder.
+CODE_RAN = "code_ran"
+# Limit for a reader in seconds. A command has `MAX_SECONDS`.
+READER_SECONDS = 60
+# Additional bytes of address space. A reader that asks for more fails, and not the machine.
+MEMORY = 12 * 2**30
 
 MESHES = ("mesh.obj", "mesh.glb", "mesh.ply", "mesh.stl", "mesh.off")
-READERS: dict[str, Callable[[Path], Any]] = {  # the library's, by the file that is damaged
+
+
+def load_mesh_of_same_folder(path: Path) -> Any:
+    return load_mesh(path.with_name("mesh.obj"))
+
+
+def load_light_file(path: Path) -> Any:
+    return load_light(str(path))
+
+
+# Functions of the library by the files that they read.
+READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys(MESHES, load_mesh),
-    "mesh.mtl": lambda path: load_mesh(path.with_name("mesh.obj")),
-    "peel.png": lambda path: load_mesh(path.with_name("mesh.obj")),
-    **dict.fromkeys(
-        ("light.npy", "light.hdr", "light.exr", "light.json"), lambda path: load_light(str(path))
-    ),
+    "mesh.mtl": load_mesh_of_same_folder,
+    "peel.png": load_mesh_of_same_folder,
+    "light.npy": load_light_file,
+    "light.hdr": load_light_file,
+    "light.exr": load_light_file,
+    "light.json": load_light_file,
     "background.png": lambda path: gray_or_image("background", str(path), 16),
     "data.npz": lambda path: load_npz(str(path)),
     "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
 }
-PHOTOGRAPHS = (
-    "evaluate",
-    "photos=photographs",
-    "run=finished",
+EVALUATE = ("evaluate", "photos=photographs", "out=out", "device=cpu", "precision=float32")
+EVALUATE_RUN = (*EVALUATE, "run=finished")
+EVALUATE_PUBLISHED = (*EVALUATE, "run=published")
+ATTACK = (
+    "attack",
+    "classifier=run:finished",
+    "scene.meshes=[mesh.obj]",
     "out=out",
     "device=cpu",
-    "precision=float32",
+    "attack.max_steps=1",
+    "attack.force=true",
+    "attack.checks=false",
+    *RENDERER,
 )
-ATTACK = (
-    *(
-        "attack",
-        "classifier=run:finished",
-        "scene.meshes=[mesh.obj]",
-        "out=out",
-        "device=cpu",
-        "attack.max_steps=1",
-    ),
-    *("attack.force=true", "attack.checks=false", *RENDERER),
-)
+LAMPS = "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"
+PROJECTOR = "scene.projector={pixels: 4, pattern: pattern.png}"
 RESUME = ("train", "run=finished", *TRAINING, "train.epochs=3", "train.resume=true")
 COMPARE = ("compare", "runs=[finished]")
-COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
-    "finished/best.pt": PHOTOGRAPHS,
-    "published/model.safetensors": tuple(
-        word.replace("run=finished", "run=published") for word in PHOTOGRAPHS
-    ),
+# Commands by the files that they read.
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "finished/best.pt": EVALUATE_RUN,
+    "published/model.safetensors": EVALUATE_PUBLISHED,
     "finished/last.pt": RESUME,
     "finished/config.yaml": RESUME,
     "finished/metrics.jsonl": COMPARE,
     "finished/photographs/summary.json": COMPARE,
     "finished/photographs/predictions.csv": COMPARE,
-    "photographs/orange/0.png": PHOTOGRAPHS,
-    "photographs/photos.csv": PHOTOGRAPHS,
-    "lamps.json": (
-        *ATTACK,
-        "attack=lamps",
-        "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}",
-    ),
-    "pattern.png": (
-        *ATTACK,
-        "attack=projector",
-        "scene.projector={pixels: 4, pattern: pattern.png}",
-    ),
+    "photographs/orange/0.png": EVALUATE_RUN,
+    "photographs/photos.csv": EVALUATE_RUN,
+    "lamps.json": (*ATTACK, "attack=lamps", LAMPS),
+    "pattern.png": (*ATTACK, "attack=projector", PROJECTOR),
 }
 UNLIMITED = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
-QUICK, MANY = 8, 100  # examples; a command takes longer: a fifth of them
-SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]  # they train
+# Numbers of examples. A command takes longer, and tries a fifth of them.
+QUICK = 8
+MANY = 100
+# These commands train.
+SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]
 
 
 NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
@@ -130,10 +134,11 @@ ARRAY_EDITS: tuple[Callable[[np.ndarray], np.ndarray], ...] = (
     lambda values: values[: len(values) // 2],
     lambda values: values[..., None],
     lambda values: values.T,
-    *(
-        lambda values, fill=fill: np.full(values.shape, fill)
-        for fill in (np.nan, -1, 2**63 + 1, "word", 1j)
-    ),
+    lambda values: np.full(values.shape, np.nan),
+    lambda values: np.full(values.shape, -1),
+    lambda values: np.full(values.shape, 2**63 + 1),
+    lambda values: np.full(values.shape, "word"),
+    lambda values: np.full(values.shape, 1j),
     lambda values: np.full(values.shape, {}, dtype=object),
 )
 TENSOR_EDITS: tuple[Callable[[torch.Tensor], Any], ...] = (
@@ -147,7 +152,7 @@ TENSOR_EDITS: tuple[Callable[[torch.Tensor], Any], ...] = (
 
 @st.composite
 def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
-    """Cut, with flipped bytes, with one number replaced, or another file altogether."""
+    """Cut a file, flip bytes, replace one number, or replace the whole file."""
     numbers = [found.span() for found in NUMBER.finditer(good)]
     kind = draw(st.sampled_from(["cut", "flip", "other", *(["number"] * 3 if numbers else [])]))
     if kind == "cut":
@@ -157,9 +162,9 @@ def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
     if kind == "number":
         begin, end = numbers[draw(st.integers(0, len(numbers) - 1))]
         token = draw(st.sampled_from(TOKENS))
-        return (
-            good[:begin] + token.ljust(end - begin) + good[end:]
-        )  # padded: headers of binary files keep their length
+        # Headers of binary files keep their length.
+        padded = token.ljust(end - begin)
+        return good[:begin] + padded + good[end:]
     changed = bytearray(good)
     for place in draw(st.lists(st.integers(0, len(good) - 1), min_size=1, max_size=8)):
         changed[place] ^= draw(st.integers(1, 255))
@@ -168,9 +173,10 @@ def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
 
 @st.composite
 def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
-    """An .npz file, one of whose arrays is of another type or shape."""
+    """Change the type or the shape of one array of an .npz file."""
     arrays = dict(np.load(io.BytesIO(good)))
-    name, edit = draw(st.sampled_from(sorted(arrays))), draw(st.sampled_from(ARRAY_EDITS))
+    name = draw(st.sampled_from(sorted(arrays)))
+    edit = draw(st.sampled_from(ARRAY_EDITS))
     content = io.BytesIO()
     np.savez(content, **arrays | {name: edit(arrays[name])})
     return content.getvalue()
@@ -178,19 +184,19 @@ def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
 
 @st.composite
 def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
-    """A checkpoint, one of whose values is another, with a hash that is right."""
+    """Replace one value of a checkpoint, and give it the right hash."""
     state = torch.load(io.BytesIO(good), weights_only=True)
     state.pop(checkpoint.HASH)
-    node, key = state, draw(st.sampled_from(sorted(state)))
+    node = state
+    key = draw(st.sampled_from(sorted(state)))
     while isinstance(node[key], Mapping) and node[key] and draw(st.integers(0, 3)):
         node = node[key]
         key = draw(st.sampled_from(list(node)))
-    edits = (
-        [edit(node[key]) for edit in TENSOR_EDITS]
-        if isinstance(node[key], torch.Tensor)
-        else VALUES
-    )
-    node[key] = draw(st.sampled_from(edits))
+    if isinstance(node[key], torch.Tensor):
+        edit = draw(st.sampled_from(TENSOR_EDITS))
+        node[key] = edit(node[key])
+    else:
+        node[key] = draw(st.sampled_from(VALUES))
     content = io.BytesIO()
     torch.save({**state, checkpoint.HASH: content_hash(state)}, content)
     return content.getvalue()
@@ -199,11 +205,9 @@ def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
 def damages(file: str, good: bytes) -> st.SearchStrategy[bytes]:
     if file.endswith(".npz"):
         return bytes_changed(good) | arrays_changed(good)
-    return (
-        bytes_changed(good) | checkpoint_changed(good)
-        if file.endswith(".pt")
-        else bytes_changed(good)
-    )
+    if file.endswith(".pt"):
+        return bytes_changed(good) | checkpoint_changed(good)
+    return bytes_changed(good)
 
 
 @pytest.fixture(autouse=True)
@@ -216,7 +220,7 @@ def memory_limit() -> Iterator[None]:
 
 
 def by_library(file: str, folder: Path) -> str | None:
-    """The sentence of a refusal, None for a finite result."""
+    """Read a file, and return the sentence of a refusal, or None for a finite result."""
     try:
         require_finite(READERS[file](folder / file))
     except InputError as error:
@@ -224,57 +228,66 @@ def by_library(file: str, folder: Path) -> str | None:
     return None
 
 
+def by_command(file: str, folder: Path, capfd) -> str | None:
+    """Run the command that reads a file, and return its error, or None if it succeeds."""
+    capfd.readouterr()
+    name, *arguments = COMMANDS[file]
+    status = run_here(name, *arguments, folder=folder)
+    errors = capfd.readouterr().err
+    assert status in (0, USER_ERROR), errors
+    if status == 0:
+        return None
+    assert errors.startswith("error: "), errors
+    assert errors.count("\n") == 1, errors
+    return errors.removeprefix("error: ").rstrip("\n")
+
+
+def time_out(*_) -> None:
+    """Fail with an exception that no reader handles."""
+    pytest.fail("a file was read for minutes")
+
+
 @pytest.fixture
 def outcome(corpus, tmp_path, capfd) -> Callable[[str, Callable[[Path], object]], str | None]:
-    """Gives a function that edits a file of a copy of the corpus and reads it: the sentence of a refusal, None for a
-    good result. It fails for everything else."""
-    folder = tmp_path / "copy"
+    """Return a function that edits a file of a copy of the corpus, and reads it.
 
-    def by_command(file: str) -> str | None:
-        capfd.readouterr()
-        name, *arguments = COMMANDS[file]
-        status, errors = run_here(name, *arguments, folder=folder), capfd.readouterr().err
-        assert status in (0, 2), errors
-        assert status == 0 or (errors.startswith("error: ") and errors.count("\n") == 1), errors
-        return errors.removeprefix("error: ").rstrip("\n") if status else None
+    The function returns the sentence of a refusal, or None for a good result.
+    It fails in all other cases.
+    """
+    folder = tmp_path / "copy"
 
     def read(file: str, edit: Callable[[Path], object]) -> str | None:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(corpus, folder)
         edit(folder / file)
-        signal.signal(
-            signal.SIGALRM, lambda *_: pytest.fail(f"{file} was read for minutes")
-        )  # no handler catches it
-        signal.alarm(SECONDS if file in READERS else MAX_SECONDS)
+        is_library = file in READERS
+        signal.signal(signal.SIGALRM, time_out)
+        signal.alarm(READER_SECONDS if is_library else MAX_SECONDS)
         try:
-            sentence = by_library(file, folder) if file in READERS else by_command(file)
+            sentence = by_library(file, folder) if is_library else by_command(file, folder, capfd)
         finally:
             signal.alarm(0)
         assert not list(folder.glob(f"**/{CODE_RAN}")), "code ran"
         if sentence is not None:
-            names = (
-                *Path(file).parts,
-                "mesh.obj",
-                "checkpoint",
-            )  # of whose NaN the training reports
-            assert "\n" not in sentence and any(name in sentence for name in names), sentence
+            # Training reports a NaN of these.
+            names = (*Path(file).parts, "mesh.obj", "checkpoint")
+            assert "\n" not in sentence, sentence
+            assert any(name in sentence for name in names), sentence
         return sentence
 
     return read
 
 
 def require_finite(result: Any) -> None:
-    """Every float in tensors, arrays and the fields of nested values is finite."""
+    """Check that every float in tensors, arrays and nested fields is finite."""
     if isinstance(result, torch.Tensor | np.ndarray):
         values = torch.as_tensor(result)
         assert not values.is_floating_point() or values.isfinite().all()
-    parts = (
-        result
-        if isinstance(result, list | tuple)
-        else vars(result).values()
-        if hasattr(result, "__dict__")
-        else ()
-    )
+    parts = []
+    if isinstance(result, list | tuple):
+        parts = result
+    elif hasattr(result, "__dict__"):
+        parts = vars(result).values()
     for part in parts:
         require_finite(part)
 
@@ -289,12 +302,17 @@ def require_finite(result: Any) -> None:
     ],
 )
 def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
-    corpus, outcome, file, examples
+    corpus,
+    outcome,
+    file,
+    examples,
 ):
+    good = (corpus / file).read_bytes()
+
     @settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
-    @given(content=damages(file, (corpus / file).read_bytes()))
+    @given(content=damages(file, good))
     def used_or_refused(content: bytes) -> None:
-        outcome(file, lambda path: path.write_bytes(content))
+        outcome(file, partial(Path.write_bytes, data=content))
 
     used_or_refused()
 
@@ -308,16 +326,17 @@ def pickled_code(path: Path) -> None:
 
 
 def npy_header(shape: str) -> bytes:
-    """A file that ends after the header."""
+    """Make a file that ends after the header."""
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
 
 
 def zip_bomb(path: Path) -> None:
-    """Arrays of 10 TB, by their headers, in a small file."""
+    """Write a small file whose headers announce arrays of 10 TB."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
-        header, {"descr": "|u1", "fortran_order": False, "shape": (10**13,)}
+        header,
+        {"descr": "|u1", "fortran_order": False, "shape": (10**13,)},
     )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in ("train_images", "train_labels", "test_images", "test_labels", "classes"):
@@ -329,30 +348,35 @@ def name_not_text(path: Path) -> None:
 
 
 def huge_png() -> bytes:
-    """A small file whose header says 10¹⁰ pixels."""
+    """Make a small file whose header announces 10¹⁰ pixels."""
 
     def chunk(name: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-        )
+        length = struct.pack(">I", len(body))
+        checksum = struct.pack(">I", zlib.crc32(name + body))
+        return length + name + body + checksum
 
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", 10**5, 10**5, 8, 2, 0, 0, 0))
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + head
-        + chunk(b"IDAT", zlib.compress(bytes(10**6)))
-        + chunk(b"IEND", b"")
-    )
+    pixels = chunk(b"IDAT", zlib.compress(bytes(10**6)))
+    return b"\x89PNG\r\n\x1a\n" + head + pixels + chunk(b"IEND", b"")
 
 
 def safetensors(**header: object) -> bytes:
-    """A file that ends after the header."""
+    """Make a file that ends after the header."""
     text = json.dumps(header).encode()
     return struct.pack("<Q", len(text)) + text
 
 
-PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
-PLY += "property list uchar int vertex_indices\nend_header\n{}\n"
+PLY = """ply
+format ascii 1.0
+element vertex {}
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+{}
+"""
 LARGE = {"dtype": "F32", "shape": [10**13], "data_offsets": [0, 4]}
 DEEP = {"depth": 10**9, "width": 1, "dropout": 0, "classes": ["a"]}
 YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
@@ -360,8 +384,17 @@ YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
     for before, letter in zip("abcdefgh", "bcdefghi", strict=True)
 )
 FORGED: list[
-    tuple[str, str, str | bytes | Callable[[Path], object]]
-] = [  # file, what is wrong with it, the content
+    tuple[
+        str,
+        str,
+        str
+        | bytes
+        | Callable[
+            [Path],
+            object,
+        ],
+    ]
+] = [
     ("mesh.obj", "vertex 10¹²", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n"),
     ("mesh.ply", "10¹² vertices", PLY.format(10**12, "0 0 0")),
     ("mesh.ply", "a negative vertex", PLY.format(3, "0 0 0\n1 0 0\n0 1 0\n3 0 1 -2")),
@@ -419,7 +452,10 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 def test_a_forged_file_is_refused(outcome, file, content):
     content = content.encode() if isinstance(content, str) else content
     assert (
-        outcome(file, content if callable(content) else partial(Path.write_bytes, data=content))
+        outcome(
+            file,
+            content if callable(content) else partial(Path.write_bytes, data=content),
+        )
         is not None
     )
 
@@ -427,7 +463,8 @@ def test_a_forged_file_is_refused(outcome, file, content):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("instead", INSTEAD)
 @pytest.mark.parametrize(
-    "file", ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"]
+    "file",
+    ["mesh.obj", "light.npy", "light.json", "background.png", "data.npz"],
 )
 def test_what_is_no_file_is_refused(outcome, file, instead):
     assert outcome(file, lambda path: (path.unlink(), INSTEAD[instead](path))) is not None

@@ -1,4 +1,4 @@
-"""What tests of several modules of training read and write."""
+"""Functions that tests of several modules of training use."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""pnb-fit finds the camera and the light of path-traced photographs, and its printed error is that of its attack."""
+"""pnb-fit finds the camera and the light of path-traced photographs."""
 
 import math
 import re
@@ -28,10 +28,10 @@ from renderer.settings import ImageSettings
 from scripts.attack import main as attack_command
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
-MARGIN = 1.6  # the square around the object, in widths of the object
-SIZE = 192  # pixels per side of the photographs
-WHOLE = 0.98  # share from which a pixel is the object's
-ROUNDING = 0.0005  # of a printed percentage with one decimal
+MARGIN = 1.6  # Side of the square around the object, in widths of the object.
+SIZE = 192  # Photographs have so many pixels per side.
+WHOLE = 0.98  # From this coverage on, a pixel shows the object alone.
+ROUNDING = 0.0005  # Rounding error of a printed percentage with one decimal.
 
 
 def missed(reason: str) -> pytest.MarkDecorator:
@@ -40,7 +40,7 @@ def missed(reason: str) -> pytest.MarkDecorator:
 
 
 def textured(name: str) -> Mesh:
-    """A solid with a texture of smooth noise around its axis, which tells its sides apart."""
+    """Make a solid with a texture of smooth noise, which tells its sides apart."""
     mesh = renderer.solid(name)
     azimuth = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0])[mesh.faces] / (2 * np.pi)
     azimuth = np.where(np.ptp(azimuth, axis=1, keepdims=True) > 0.5, azimuth % 1, azimuth)
@@ -56,7 +56,7 @@ def textured(name: str) -> Mesh:
 
 
 def generated_map() -> Tensor:
-    """(64, 128, 3): a blue sky over a brown ground, and a warm lamp a hundred times as bright."""
+    """Make a map (64, 128, 3) of a blue sky, a brown ground and a warm, much brighter lamp."""
     directions, _ = equirectangular(64, 128)
     up = directions[..., 2:]
     sky = torch.tensor([0.5, 0.7, 1.0]).double() * (0.6 + 0.4 * up)
@@ -67,7 +67,7 @@ def generated_map() -> Tensor:
 
 
 def unclipped(radiance: Tensor) -> Tensor:
-    """The map, so dim that a white surface is nowhere brighter than 1."""
+    """Scale a map so that a white surface is nowhere brighter than 1."""
     light = project(radiance.double(), 20)
     directions = torch.from_numpy(renderer.normalize(renderer.solid("orange")).vertices)
     directions = directions / directions.norm(dim=1, keepdim=True)
@@ -77,7 +77,7 @@ def unclipped(radiance: Tensor) -> Tensor:
 
 
 def photograph(folder: Path, mesh: Mesh, camera: Camera, radiance: Tensor, encoding: str) -> float:
-    """Path-trace photo.png, before gray, and mask.png; the width of the object in the image."""
+    """Path-trace photo.png and mask.png, and return the width of the object in image widths."""
     write_map(folder / "light.exr", radiance)
     settings = ImageSettings(SIZE, bounces=3, encoding=encoding)
     write_mitsuba_scene(folder, mesh, 1.0, [camera], settings, "light.exr")
@@ -91,14 +91,21 @@ def photograph(folder: Path, mesh: Mesh, camera: Camera, radiance: Tensor, encod
 
 
 def irradiance(mesh: Mesh, camera: Camera, light: Tensor) -> Tensor:
-    """(3, pixels) of the visible surface, without shadows."""
+    """Compute the irradiance of the visible surface without shadows, shape (3, pixels)."""
     white = Mesh.plain(mesh.vertices, mesh.faces)
-    dim = 1e-3  # no value is clamped
+    dim = 1e-3  # Values are so small that none is clamped.
     return renderer.render(white, camera, dim * light.double(), 96, 0.0)[0].flatten(1) / dim
 
 
 def check_fit(
-    call, capsys, here, name: str, camera: Camera, radiance: Tensor, encoding: str, determined: bool
+    call,
+    capsys,
+    here,
+    name: str,
+    camera: Camera,
+    radiance: Tensor,
+    encoding: str,
+    determined: bool,
 ):
     mesh = load_object(ObjectSettings(name, label="orange")).mesh
     side = MARGIN * photograph(here, mesh, camera, radiance, encoding)
@@ -138,10 +145,8 @@ def check_fit(
     assert real < 0.05
     light = load_light(str(here / "fitted" / "light.json"), None)
     assert float(to_map(light, 256).min()) >= 0
-    found, true = (
-        irradiance(mesh, camera, light),
-        irradiance(mesh, camera, project(radiance.double(), 20)),
-    )
+    found = irradiance(mesh, camera, light)
+    true = irradiance(mesh, camera, project(radiance.double(), 20))
     assert float(((found - true).norm(dim=1) / true.norm(dim=1)).max()) < 0.07
     scene = attack_command.read(command[1:]).scene
     if determined:
@@ -154,7 +159,10 @@ def check_fit(
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["srgb", "linear"])
 def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
-    call, tmp_path, capsys, encoding
+    call,
+    tmp_path,
+    capsys,
+    encoding,
 ):
     pytest.importorskip("mitsuba")
     mesh = tmp_path / "pear.glb"
@@ -181,17 +189,32 @@ def test_camera_and_light_of_a_path_traced_textured_solid_are_found(
         ("banana.glb", "city", True),
         ("apple_scan.glb", "forest", True),
         pytest.param(
-            "golf_ball.glb", "night", False, marks=missed("no descent begins near the ball's label")
+            "golf_ball.glb",
+            "night",
+            False,
+            marks=missed("no descent begins near the ball's label"),
         ),
     ],
 )
 def test_camera_and_light_of_a_path_traced_scan_are_found(
-    call, tmp_path, capsys, name, light, determined
+    call,
+    tmp_path,
+    capsys,
+    name,
+    light,
+    determined,
 ):
-    """The shape of a golf ball does not determine the camera."""
+    """Check the camera as well, except for a golf ball, whose shape does not determine it."""
     pytest.importorskip("mitsuba")
     camera = PerspectiveCamera(63.0, 57.3, 3.0, 0.2, -0.1, distance=6.0)
     radiance = unclipped(read_panorama(DATA / "hdri" / f"{light}.npy"))
     check_fit(
-        call, capsys, tmp_path, str(DATA / "meshes" / name), camera, radiance, "srgb", determined
+        call,
+        capsys,
+        tmp_path,
+        str(DATA / "meshes" / name),
+        camera,
+        radiance,
+        "srgb",
+        determined,
     )

@@ -31,7 +31,7 @@ NAMES = (
 
 
 def help_of(name: str, *arguments: str) -> str:
-    """What --help prints, and whatever else the program says, where torch cannot be imported."""
+    """Run --help where torch cannot be imported, and return everything that is printed."""
     module = "train" if name == "train" else f"scripts.{name}"
     code = (
         "import runpy, sys; sys.modules['torch'] = sys.modules['numpy'] = None; "
@@ -46,7 +46,7 @@ def command_of(name: str) -> Command:
 
 
 def facts_below(kind: type) -> list[tuple[type, str]]:
-    """The class and the name of each field of a settings class and of those in it."""
+    """List the class and the name of each field of a settings class, and of nested classes."""
     found = []
     for name, hint in field_types(kind).items():
         found.append((kind, name))
@@ -89,7 +89,11 @@ def test_every_setting_has_an_explanation(name):
     ids=["installed"],
 )
 def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(
-    tmp_path, program, path, word, completed
+    tmp_path,
+    program,
+    path,
+    word,
+    completed,
 ):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "pnb-train").write_text("from train.__main__ import main\nmain()")

@@ -76,7 +76,7 @@ def calibrated(finished, photos, tmp_path_factory) -> Path:
 
 class TestAnOperatingPoint:
     def test_is_the_second_lowest_of_the_log_odds_of_four_negatives(self, calibrated, photos):
-        """With rate 1/2 and 4 negatives, at most 2 score above the threshold."""
+        """Compare with the log-odds of the negatives, of which 2 may exceed the threshold."""
         network = load_run(calibrated)
         paths = sorted(photos.rglob("*.png"))
         negatives = read_images([path for path in paths if path.parent.name != "orange"])

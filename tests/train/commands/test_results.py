@@ -1,4 +1,4 @@
-"""No command replaces results, its own or another's, unless `overwrite=true` says so."""
+"""Commands replace results only with `overwrite=true`."""
 
 import json
 from pathlib import Path

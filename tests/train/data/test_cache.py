@@ -21,10 +21,13 @@ TENSORS = {
 def test_any_change_of_the_sources_is_another_key(tmp_path):
     package = tmp_path / "package"
     shutil.copytree(
-        Path(renderer.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+        Path(renderer.__file__).parent,
+        package,
+        ignore=shutil.ignore_patterns("__pycache__"),
     )
     assert source_key(package) == source_key(Path(renderer.__file__).parent)
-    module, keys = package / "camera.py", {source_key(package)}
+    module = package / "camera.py"
+    keys = {source_key(package)}
     for change in (
         lambda: module.write_text(module.read_text() + "\n"),
         lambda: module.rename(package / "other.py"),
@@ -47,7 +50,8 @@ def test_tensors_come_back_to_the_bit_and_not_under_another_key(written):
     loaded = tensors.read(KEY)
     assert loaded.keys() == TENSORS.keys()
     for name, tensor in TENSORS.items():
-        assert loaded[name].dtype == tensor.dtype and loaded[name].shape == tensor.shape
+        assert loaded[name].dtype == tensor.dtype
+        assert loaded[name].shape == tensor.shape
         assert loaded[name].numpy().tobytes() == tensor.numpy().tobytes()
     shutil.copy(path, path.with_name("another key"))
     assert tensors.read("another key") is None
@@ -80,7 +84,8 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(written, monk
     monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         tensors.write(KEY, {"ratios": torch.zeros(9)})
-    assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+    assert path.read_bytes() == before
 
 
 def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeypatch, caplog):
@@ -94,9 +99,8 @@ def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeyp
     cache = TensorCache(tmp_path)
     for _ in range(3):
         cache.write(KEY, TENSORS)
-    assert caplog.text.count("No space left on device") == len(tries) == 1 and not list(
-        tmp_path.iterdir()
-    )
+    assert caplog.text.count("No space left on device") == len(tries) == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -114,7 +118,10 @@ def test_a_full_disk_stops_no_run_and_is_tried_and_logged_once(tmp_path, monkeyp
     ],
 )
 def test_the_folder_is_the_users_cache_folder_unless_chosen(
-    choice, environment, folder, monkeypatch
+    choice,
+    environment,
+    folder,
+    monkeypatch,
 ):
     monkeypatch.delenv("XDG_CACHE_HOME")
     for name, value in environment.items():

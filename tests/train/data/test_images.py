@@ -15,15 +15,16 @@ SIZE = 72
 
 
 def ramp(width: int, height: int) -> Image.Image:
-    """Red and green tell the place in the image."""
+    """Make an image whose red grows with the column, and whose green grows with the row."""
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
     return Image.fromarray(np.stack([x, y, np.full_like(x, 128)], axis=-1).astype(np.uint8))
 
 
 @pytest.fixture
 def files(tmp_path) -> ImageFiles:
-    """Of several sizes and modes."""
-    image, turned = ramp(90, 120), Image.Exif()
+    """Save images of several sizes and modes."""
+    image = ramp(90, 120)
+    turned = Image.Exif()
     turned[0x0112] = 6
     image.save(tmp_path / "a.png")
     image.save(tmp_path / "b.jpg", exif=turned)
@@ -33,7 +34,11 @@ def files(tmp_path) -> ImageFiles:
     image.save(tmp_path / "f.gif", save_all=True, append_images=[ramp(90, 120).rotate(90)])
     ramp(1500, 1200).save(tmp_path / "g.jpg")
     return ImageFiles(
-        tmp_path, tuple(item.path for item in find_unlabeled(tmp_path)), SIZE, workers=0, skip=False
+        tmp_path,
+        tuple(item.path for item in find_unlabeled(tmp_path)),
+        SIZE,
+        workers=0,
+        skip=False,
     )
 
 
@@ -42,17 +47,21 @@ def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files)
     squares = torch.cat(list(files.squares(torch.arange(len(files)).split(3))))
     assert squares.shape == files.shape
     torch.testing.assert_close(squares[:-1], expected[:-1], rtol=0, atol=0)
-    assert (
-        squares[-1].int() - expected[-1].int()
-    ).abs().max() <= 3  # decoded at another fraction of its size
+    # The last image is so large that it is decoded at a fraction of its size.
+    assert (squares[-1].int() - expected[-1].int()).abs().max() <= 3
 
 
 def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_processes(files):
-    rows, seeds = torch.zeros(200, dtype=torch.int64), torch.arange(200)
+    rows = torch.zeros(200, dtype=torch.int64)
+    seeds = torch.arange(200)
     (crops,) = files.crops([rows], [seeds])
-    halves = ImageFiles(files.folder, files.paths, SIZE, workers=2, skip=False).crops(
-        rows.split(100), seeds.split(100)
-    )
+    halves = ImageFiles(
+        files.folder,
+        files.paths,
+        SIZE,
+        workers=2,
+        skip=False,
+    ).crops(rows.split(100), seeds.split(100))
     assert torch.equal(crops, torch.cat(list(halves)))
     places = crops[:, :2].float() / 255
     spans = [
@@ -60,10 +69,10 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
         places[:, 1, -1, 36] - places[:, 1, 0, 36],
     ]
     areas = (spans[0] * spans[1]).abs()
-    assert MINIMUM_AREA - 0.04 < areas.min() < 0.45 and 0.9 < areas.max() <= 1
-    assert (
-        70 < (spans[0] < 0).sum() < 130 and (spans[1] > 0).all()
-    )  # half are flipped, none is upside down
+    assert MINIMUM_AREA - 0.04 < areas.min() < 0.45
+    assert 0.9 < areas.max() <= 1
+    assert 70 < (spans[0] < 0).sum() < 130
+    assert (spans[1] > 0).all()  # No crop is upside down.
 
 
 def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, caplog):
@@ -81,14 +90,17 @@ def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, cap
     with pytest.raises(InputError, match=r"lemon/b\.png cannot be read .*skip_unreadable"):
         list(load_files(tmp_path, skip=False).squares(rows))
     (images,) = load_files(tmp_path, skip=True).squares(rows)
-    assert (
-        images[:, 1, 0, 0].tolist() == [255, 255, 0, 0] and "1 images cannot be read" in caplog.text
-    )
+    assert images[:, 1, 0, 0].tolist() == [255, 255, 0, 0]
+    assert "1 images cannot be read" in caplog.text
 
 
 def load_files(folder: Path, skip: bool) -> ImageFiles:
     return ImageFiles(
-        folder, tuple(item.path for item in find_unlabeled(folder)), SIZE, workers=0, skip=skip
+        folder,
+        tuple(item.path for item in find_unlabeled(folder)),
+        SIZE,
+        workers=0,
+        skip=skip,
     )
 
 
@@ -100,7 +112,8 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
         for number in range(4):
             Image.new("RGB", (90, 80), color).save(tmp_path / name / f"{number}.png")
     data = load_folder(str(tmp_path), SIZE, 0.25)
-    assert isinstance(data.train.images, ImageFiles) and data.size == SIZE
+    assert isinstance(data.train.images, ImageFiles)
+    assert data.size == SIZE
     renders = Split(torch.full((3, 3, SIZE, SIZE), 200, dtype=torch.uint8), torch.full((3,), -2))
     rows = torch.arange(1, 9)
     images = TrainingImages(data.train, rows, renders)
@@ -109,19 +122,17 @@ def test_batches_from_disk_hold_images_and_renders_with_their_labels_and_go_on_w
     assert len(batches) == 3
     for pixels, labels, rendered in batches:
         value = pixels[:, 0, 40, 40].long()
-        assert torch.equal(labels, torch.where(rendered, -2, value // 10 - 1)) and torch.equal(
-            rendered, value == 200
-        )
+        assert torch.equal(labels, torch.where(rendered, -2, value // 10 - 1))
+        assert torch.equal(rendered, value == 200)
     rest = list(training_batches(images, 4, 0, every, first=1))
-    assert all(
-        torch.equal(*pair)
-        for batch in zip(batches[1:], rest, strict=True)
-        for pair in zip(*batch, strict=True)
-    )
+    for batch, expected in zip(rest, batches[1:], strict=True):
+        for part, expected_part in zip(batch, expected, strict=True):
+            assert torch.equal(part, expected_part)
 
 
 def test_nothing_of_a_large_folder_is_read_before_it_is_shown_and_few_are_held_out(
-    tmp_path, monkeypatch
+    tmp_path,
+    monkeypatch,
 ):
     (tmp_path / "a.png").write_bytes(b"no image")
     for number in range(9):

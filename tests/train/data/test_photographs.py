@@ -30,9 +30,10 @@ def touch(folder: Path, *names: str) -> Path:
 
 
 def load_one(path: Path) -> np.ndarray:
-    """The image as (32, 32, 3) integers."""
+    """Return the image as integers, shape (32, 32, 3)."""
     _, images, _ = load_photographs(
-        path.parent, [Photograph(PurePosixPath(path.name), "orange", None)]
+        path.parent,
+        [Photograph(PurePosixPath(path.name), "orange", None)],
     )
     return images[0].permute(1, 2, 0).numpy().astype(int)
 
@@ -85,12 +86,8 @@ def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
         ("pear/root", tmp_path),
     ]:
         (photos / circle).symlink_to(target)
-    assert [path for path, _ in find(photos)] == [
-        "orange/b.jpg",
-        "orange/deep/a.jpg",
-        "pear/c.jpg",
-        "pear/d.jpg",
-    ]
+    found = [path for path, _ in find(photos)]
+    assert found == ["orange/b.jpg", "orange/deep/a.jpg", "pear/c.jpg", "pear/d.jpg"]
 
 
 def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
@@ -149,13 +146,16 @@ def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tm
         ("orange/a.jpg", "orange"),
         ("other_bee/c.jpg", "other_bee"),
     ]
-    assert "1 of 3 folders" in caplog.text and "count as other things: lion" in caplog.text
+    assert "1 of 3 folders" in caplog.text
+    assert "count as other things: lion" in caplog.text
 
 
 def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns(tmp_path, caplog):
     touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "pear/d.jpg")
     rows = [
-        "class,hard_negatives,path,source_tag", "orange,lab; web,orange/a.jpg,sun", "orange,,orange/b.jpg,web",
+        "class,hard_negatives,path,source_tag",
+        "orange,lab; web,orange/a.jpg,sun",
+        "orange,,orange/b.jpg,web",
         "lemon,;,other_lemon\\c.jpg,lab", "pear,,pear/d.jpg,", "fig,,fig/gone.jpg,web", "",
     ]  # fmt: skip
     (tmp_path / "photos.csv").write_text("\ufeff" + "\n".join(rows), encoding="utf-8")
@@ -213,10 +213,8 @@ def test_every_exif_orientation_is_undone(tmp_path, orientation):
 
 
 def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_path):
-    thirds = [
-        np.broadcast_to(np.uint8(color), (32, 32, 3))
-        for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))
-    ]
+    colors = np.uint8([(255, 0, 0), (0, 200, 0), (0, 0, 255)])
+    thirds = [np.broadcast_to(color, (32, 32, 3)) for color in colors]
     for axis in (0, 1):
         path = save(tmp_path / "thirds.png", np.concatenate(thirds, axis=axis))
         np.testing.assert_array_equal(load_one(path), thirds[1])
@@ -225,13 +223,16 @@ def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_p
 def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
     coarse = Image.fromarray(np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8))
     path = save(
-        tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90
+        tmp_path / "a.jpg",
+        coarse.resize((2333, 1801), Image.Resampling.BICUBIC),
+        quality=90,
     )
     with Image.open(path) as image:
         whole = save(tmp_path / "a.bmp", image.convert("RGB"))
     difference = np.abs(load_one(path) - load_one(whole))
     # Halving an odd side rounds it up, which moves the center by 1/100 of a final pixel.
-    assert difference.max() <= 8 and difference.mean() <= 1
+    assert difference.max() <= 8
+    assert difference.mean() <= 1
 
 
 @pytest.mark.parametrize(
@@ -252,7 +253,8 @@ def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expecte
 
 def test_unreadable_images_are_named_or_skipped(tmp_path):
     cut = save(
-        tmp_path / "cut.jpg", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+        tmp_path / "cut.jpg",
+        np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8),
     )
     cut.write_bytes(cut.read_bytes()[:2000])
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
@@ -269,6 +271,5 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
         load_photographs(tmp_path, found)
     loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
     assert [str(photograph.path) for photograph in loaded] == ["good.png"]
-    assert (
-        images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])
-    ).all() and unreadable == broken
+    assert (images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])).all()
+    assert unreadable == broken

@@ -13,14 +13,14 @@ FEW = ("apple", "orange", "plate")
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """Few classes and images, one sample per pixel: the tests look at what is rendered, not at how well."""
+    """Render few classes and images with one sample per pixel."""
     monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
     monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.ImageSettings(samples=1))
 
 
 @pytest.fixture
 def instances(monkeypatch) -> list[tuple[str, int]]:
-    """The solids made, in order, as (name, seed)."""
+    """Return a list that grows by the name and the seed of each solid that is made."""
     made = []
     solid = rendered_shapes.solid
 
@@ -35,15 +35,19 @@ def instances(monkeypatch) -> list[tuple[str, int]]:
 def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_shows(instances):
     data = load_shapes(train=21, test=2, size=SIZE, seed=0)
     assert data.classes == FEW
-    assert data.train.images.shape == (63, 3, SIZE, SIZE) and data.train.images.dtype == torch.uint8
+    assert data.train.images.shape == (63, 3, SIZE, SIZE)
+    assert data.train.images.dtype == torch.uint8
     assert data.train.labels.tolist() == [label for label in range(3) for _ in range(21)]
     assert data.test.labels.tolist() == [label for label in range(3) for _ in range(2)]
     assert [name for name, _ in instances] == [name for name in FEW for _ in range(2)] + list(FEW)
-    assert len(data.train.images.unique(dim=0)) == 63 and len(set(instances)) == len(instances)
+    assert len(data.train.images.unique(dim=0)) == 63
+    assert len(set(instances)) == len(instances)
 
 
 def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
-    tmp_path, instances, monkeypatch
+    tmp_path,
+    instances,
+    monkeypatch,
 ):
     def load(**settings):
         before = len(instances)
@@ -58,7 +62,8 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(
 
     first, rendered = load()
     again, cached = load()
-    assert (rendered, cached) == (6, 0) and torch.equal(again.train.images, first.train.images)
+    assert (rendered, cached) == (6, 0)
+    assert torch.equal(again.train.images, first.train.images)
     assert [load(**change)[1] for change in ({"train": 2}, {"size": 9}, {"seed": 1})] == [3, 6, 6]
     monkeypatch.setattr(rendered_shapes, "CODE", "other")
     assert load()[1] == 6

@@ -19,7 +19,7 @@ from train.data.sets import (
 
 
 def arrays(**changes) -> dict[str, np.ndarray]:
-    """What an .npz file of two classes holds, some of it changed; None leaves an array out."""
+    """Make the arrays of an .npz file of two classes, with changes. None removes an array."""
     rng = np.random.default_rng(0)
     good = {
         "train_images": rng.integers(0, 256, (5, 3, 8, 8), dtype=np.uint8),
@@ -32,7 +32,7 @@ def arrays(**changes) -> dict[str, np.ndarray]:
 
 
 def numbered(count: int, classes: int = 1) -> Split:
-    """Images (N, 3, 1, 1) that show their row's number, with labels in turn."""
+    """Make images (N, 3, 1, 1) whose values are their rows, with labels in turn."""
     rows = torch.arange(count)
     return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
 
@@ -45,10 +45,12 @@ def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
 def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     np.savez(tmp_path / "data.npz", **arrays())
     data = load_npz(str(tmp_path / "data.npz"))
-    assert data.classes == ("lime", "fig") and data.size == 8
+    assert data.classes == ("lime", "fig")
+    assert data.size == 8
     for name in ("train", "test"):
         split = getattr(data, name)
-        assert split.images.dtype == torch.uint8 and split.labels.dtype == torch.int64
+        assert split.images.dtype == torch.uint8
+        assert split.labels.dtype == torch.int64
         np.testing.assert_array_equal(split.images, arrays()[f"{name}_images"])
         np.testing.assert_array_equal(split.labels, arrays()[f"{name}_labels"])
 
@@ -83,28 +85,33 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
     for label, name in enumerate(["lime", "fig"]):
         for number in range(10):
             save_image(
-                tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30)
+                tmp_path / name / f"{number}.png",
+                100 * label + number,
+                size=(20 + number, 30),
             )
     (tmp_path / ".thumbnails").mkdir()
     data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
     assert data.classes == ("fig", "lime")
-    assert data.train.images.shape == (16, 3, 8, 8) and data.test.images.shape == (4, 3, 8, 8)
+    assert data.train.images.shape == (16, 3, 8, 8)
+    assert data.test.images.shape == (4, 3, 8, 8)
     shown = {}
     for split in (data.train, data.test):
         for image, label in zip(split.images, split.labels, strict=True):
             assert len(image.unique()) == 1
             shown[int(image[0, 0, 0])] = data.classes[label]
-    assert shown == {
-        100 * label + n: name for label, name in enumerate(["lime", "fig"]) for n in range(10)
-    }
+    limes = {number: "lime" for number in range(10)}
+    figs = {100 + number: "fig" for number in range(10)}
+    assert shown == limes | figs
 
 
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
         save_image(tmp_path / part / name / "a.png", value)
     data = load_folder(str(tmp_path), size=8, test_fraction=0.1)
-    assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
-    assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
+    assert data.train.images[:, 0, 0, 0].tolist() == [1, 2]
+    assert data.train.labels.tolist() == [0, 1]
+    assert data.test.images[:, 0, 0, 0].tolist() == [3]
+    assert data.test.labels.tolist() == [1]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +138,8 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
 
 
 def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(
-    tmp_path, caplog
+    tmp_path,
+    caplog,
 ):
     for number in range(4):
         save_image(tmp_path / "fig" / f"{number}.png", 0)
@@ -153,7 +161,8 @@ def test_torchvisions_data_become_splits_with_the_channels_first(monkeypatch):
 
     monkeypatch.setattr("torchvision.datasets.CIFAR100", cifar100)
     data = load_cifar100("here")
-    assert data.classes == ("fig", "lime") and data.train.labels.tolist() == [3] * 10
+    assert data.classes == ("fig", "lime")
+    assert data.train.labels.tolist() == [3] * 10
     np.testing.assert_array_equal(data.train.images, pixels[1].transpose(0, 3, 1, 2))
     np.testing.assert_array_equal(data.test.images, pixels[0].transpose(0, 3, 1, 2))
 
@@ -162,8 +171,10 @@ def test_the_fraction_of_every_class_is_held_out_as_a_function_of_the_seed():
     torch.manual_seed(1)
     split = numbered(200, classes=4)
     rows, again, other = (held_out_rows(split, 0.1, seed) for seed in (0, 0, 1))
-    assert rows.shape == (200,) and split[rows].labels.bincount().tolist() == [5] * 4
-    assert torch.equal(rows, again) and not torch.equal(rows, other)
+    assert rows.shape == (200,)
+    assert split[rows].labels.bincount().tolist() == [5] * 4
+    assert torch.equal(rows, again)
+    assert not torch.equal(rows, other)
 
 
 @pytest.mark.parametrize("fraction", [0, float("nan"), 0.001, 0.999])

@@ -25,7 +25,9 @@ class Harmful:
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
 def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(
-    tmp_path, monkeypatch, function
+    tmp_path,
+    monkeypatch,
+    function,
 ):
     save(tmp_path / LAST, STATE)
     before = (tmp_path / LAST).read_bytes()
@@ -37,8 +39,10 @@ def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new
         patch.setattr(f"renderer.io.files.os.{function}", fail)
         with pytest.raises(OSError, match="No space left on device") as full:
             save(tmp_path / LAST, STATE | {"epoch": 4}, tmp_path / PREVIOUS)
-    assert full.value.errno == errno.ENOSPC and full.value.filename == str(tmp_path / LAST)
-    assert os.listdir(tmp_path) == [LAST] and (tmp_path / LAST).read_bytes() == before
+    assert full.value.errno == errno.ENOSPC
+    assert full.value.filename == str(tmp_path / LAST)
+    assert os.listdir(tmp_path) == [LAST]
+    assert (tmp_path / LAST).read_bytes() == before
     again = STATE | {"epoch": 4}
     save(tmp_path / LAST, again)
     assert content_hash(load(tmp_path / LAST)) == content_hash(again)
@@ -56,12 +60,15 @@ def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new
             id="NaN",
         ),
         pytest.param(
-            lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"
+            lambda path: save(path, STATE | {"architecture": {"version": 99}}),
+            id="later version",
         ),
     ],
 )
 def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(
-    tmp_path, monkeypatch, spoil
+    tmp_path,
+    monkeypatch,
+    spoil,
 ):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / BEST
@@ -84,9 +91,8 @@ def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(
 def test_different_contents_have_different_hashes_whatever_their_layout_in_memory(other):
     assert content_hash(other) != content_hash({"a": [1, 2], "b": torch.zeros(3)})
     images = torch.rand(2, 3, 4, 4)
-    assert content_hash(images) == content_hash(
-        images.contiguous(memory_format=torch.channels_last)
-    )
+    same_images = images.contiguous(memory_format=torch.channels_last)
+    assert content_hash(same_images) == content_hash(images)
 
 
 def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_reported(tmp_path):
@@ -97,7 +103,8 @@ def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_
     for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-100]), Path.unlink):
         spoil(tmp_path / LAST)
         state, fault = load_newest(tmp_path)
-        assert state["epoch"] == 1 and str(tmp_path / LAST) in fault
+        assert state["epoch"] == 1
+        assert str(tmp_path / LAST) in fault
     (tmp_path / PREVIOUS).unlink()
     with pytest.raises(InputError, match=r"last.pt does not exist"):
         load_newest(tmp_path)

@@ -34,17 +34,18 @@ def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny,
     settings = tiny("train.learning_rate=3e-7", "label=pear", "scene.lamps={power: 3}")
     write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
     config = read_config(tmp_path / CONFIG)
-    assert "command" not in config  # which would be refused, as every interpolation is
-    assert config.pop("precision") == "bfloat16" and config.pop("working_folder") == os.getcwd()
-    assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {
-        settings.data.path
-    }
+    assert "command" not in config  # An interpolation would be refused.
+    assert config.pop("precision") == "bfloat16"
+    assert config.pop("working_folder") == os.getcwd()
+    assert config.pop("versions").torch == torch.__version__
+    assert config.pop("inputs").keys() == {settings.data.path}
     assert read_settings(ExperimentSettings, config) == settings
 
 
-BOMB = "a0: &a0 [x, x]\n" + "".join(
-    f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]\n" for n in range(9)
-)
+BOMB = "a0: &a0 [x, x]\n"
+for number in range(9):
+    references = ", ".join(9 * [f"*a{number}"])
+    BOMB += f"a{number + 1}: &a{number + 1} [{references}]\n"
 
 
 @pytest.mark.parametrize(
@@ -73,11 +74,9 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
             ["run=there/a", "sweep=x", "train.resume=true", "train.cache=null"],
         )
     )
-    assert (
-        here == there
-        and here["evaluate.photos"] == "<run>/images"
-        and here["augment.attack.max_steps"] == 3
-    )
+    assert here == there
+    assert here["evaluate.photos"] == "<run>/images"
+    assert here["augment.attack.max_steps"] == 3
 
 
 @pytest.mark.parametrize(
@@ -96,7 +95,8 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
-    file, folder = tmp_path / "inputs" / "best.pt", tmp_path / "run"
+    file = tmp_path / "inputs" / "best.pt"
+    folder = tmp_path / "run"
     file.parent.mkdir()
     file.write_bytes(b"one")
     settings = tiny(override.format(file), "augment.examples=null", "scene.views=1")
@@ -104,17 +104,22 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     require_same_run(folder, settings)
     file.write_bytes(b"another")
     with pytest.raises(
-        InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"
+        InputError,
+        match=rf"{file.parent}\S* has changed since {folder} began: put it back",
     ):
         require_same_run(folder, settings)
 
 
 def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(
-    tiny, tmp_path, monkeypatch
+    tiny,
+    tmp_path,
+    monkeypatch,
 ):
-    file, reads = tmp_path / "data.npz", []
+    file = tmp_path / "data.npz"
+    reads = []
     file.write_bytes(b"data")
-    settings, digest = tiny(f"data.path={file}"), hashlib.file_digest
+    settings = tiny(f"data.path={file}")
+    digest = hashlib.file_digest
     monkeypatch.setattr(
         hashlib,
         "file_digest",
@@ -127,7 +132,7 @@ def test_an_input_file_is_read_once_by_a_run_that_is_checked_twice_and_written(
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):
-    assert read_metrics(tmp_path) == []  # without a file
+    assert read_metrics(tmp_path) == []  # This log has no file.
     (tmp_path / METRICS).write_text('{"epoch": 1}\n{"epo')
     assert read_metrics(tmp_path) == [{"epoch": 1}]
 
@@ -140,18 +145,22 @@ def write_epochs(folder: Path, epochs: range, history=()) -> None:
 
 @pytest.mark.parametrize("done", [0, 2, 3])
 def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(
-    tmp_path, done, monkeypatch
+    tmp_path,
+    done,
+    monkeypatch,
 ):
-    """Later lines are written again, final scores too; a line cut short and lines that were lost come back."""
+    """Later lines and scores are written again. Lines that were cut or lost come back."""
     monkeypatch.setattr(
-        time, "time", itertools.count(1e9).__next__
+        time,
+        "time",
+        itertools.count(1e9).__next__,
     )  # TensorBoard orders the files by their seconds
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)
     (tmp_path / METRICS).write_text('{"epoch": 3, "train/lo')
     write_epochs(tmp_path, range(done + 1, 4), epochs[:done])
     assert read_metrics(tmp_path) == epochs
-    for accuracy in (0.5, 0.25):  # as when a finished run is scored again
+    for accuracy in (0.5, 0.25):  # A finished run is scored again.
         RunLog(tmp_path, epochs).scalars({"test/accuracy": accuracy})
     assert read_metrics(tmp_path) == [*epochs, {"test/accuracy": 0.25}]
     board = EventAccumulator(str(tmp_path)).Reload()
@@ -167,13 +176,19 @@ def test_tensorboard_shows_the_renders(tmp_path):
     (image,) = EventAccumulator(str(tmp_path)).Reload().Images("renders")
     with Image.open(tmp_path / "renders" / "epoch_002.png") as grid:
         pixels = np.asarray(grid)
-    assert image.step == 2 and np.array_equal(
-        Image.open(io.BytesIO(image.encoded_image_string)), pixels
-    )
+    assert image.step == 2
+    assert np.array_equal(Image.open(io.BytesIO(image.encoded_image_string)), pixels)
     assert pixels.shape == (18, 5 * 17 + 1, 3)
     for number, render in enumerate(renders):
         tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
         np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+
+
+def resize_to_128(image: np.ndarray) -> np.ndarray:
+    """Average squares of 4 × 4 pixels of a large image, or repeat each pixel of a small one."""
+    if len(image) == 512:
+        return image.reshape(128, 4, 128, 4, 3).mean((1, 3))
+    return image.repeat(8, 0).repeat(8, 1)
 
 
 @pytest.mark.parametrize("side", [16, 512])
@@ -185,12 +200,7 @@ def test_examples_of_attacks_are_shown_before_and_after_enlarged_or_reduced(tmp_
     RunLog(tmp_path).attack_examples(examples, ["apple", "orange"], epoch=2)
     sheet = np.asarray(Image.open(tmp_path / "renders" / "attacks_002.png")).astype(int)
     for image in images.flatten(0, 1):
-        shown = image.numpy().transpose(1, 2, 0)
-        shown = (
-            shown.reshape(128, 4, 128, 4, 3).mean((1, 3))
-            if side > 128
-            else shown.repeat(8, 0).repeat(8, 1)
-        )
+        shown = resize_to_128(image.numpy().transpose(1, 2, 0))
         corners = np.argwhere((abs(sheet - 255 * shown[0, 0]) < 1).all(2))
         windows = [sheet[y : y + 128, x : x + 128] for y, x in corners]
         windows = [window for window in windows if window.shape == shown.shape]
@@ -212,6 +222,7 @@ def test_a_folder_goes_on_with_the_same_settings_and_files_and_permitted_changes
         require_same(tmp_path, settings, "out=", lambda *change: False)
     mesh.write_text("v 0 0 1")
     with pytest.raises(
-        InputError, match=r"a\.obj has changed since .* began: .* another folder with out="
+        InputError,
+        match=r"a\.obj has changed since .* began: .* another folder with out=",
     ):
         require_same(tmp_path, Settings(meshes=[str(mesh)]), "out=", lambda *change: False)

@@ -17,7 +17,8 @@ from train.system.device import (
     most_threads,
 )
 
-CPU, GPU = torch.device("cpu"), torch.device("cuda")
+CPU = torch.device("cpu")
+GPU = torch.device("cuda")
 
 
 @pytest.fixture
@@ -33,10 +34,14 @@ def test_a_device_that_is_not_there_is_one_error(name):
 
 
 @pytest.mark.parametrize(
-    "quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)]
+    "quota, cores",
+    [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)],
 )
 def test_threads_are_no_more_than_the_containers_quota_of_cores(
-    tmp_path, monkeypatch, quota, cores
+    tmp_path,
+    monkeypatch,
+    quota,
+    cores,
 ):
     if quota:
         (tmp_path / "cpu.max").write_text(quota)
@@ -61,7 +66,8 @@ def test_threads_are_no_more_than_the_cores_that_the_process_is_bound_to(tmp_pat
 
 def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkeypatch):
     monkeypatch.setattr(device, "most_threads", lambda: 6)
-    tiny, paper = WideResNet(3, 10, 1, dropout=0.0), WideResNet(100, 16, 4, dropout=0.0)
+    tiny = WideResNet(3, 10, 1, dropout=0.0)
+    paper = WideResNet(100, 16, 4, dropout=0.0)
     assert [choose_threads(tiny, 16, 16) for _ in range(3)] == [1, 1, 1]
     assert [choose_threads(paper, 128, 32) for _ in range(3)] == [6, 6, 6]
 
@@ -76,20 +82,28 @@ def test_the_same_training_gets_the_same_threads_and_a_small_one_gets_one(monkey
     ],
 )
 def test_auto_is_bfloat16_where_the_hardware_computes_in_it(
-    monkeypatch, caplog, where, machine, rule, supported
+    monkeypatch,
+    caplog,
+    where,
+    machine,
+    rule,
+    supported,
 ):
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
     monkeypatch.setattr(rule, lambda **options: supported)
     expected = "bfloat16" if supported else "float32" if where.type == "cpu" else "float16"
     assert choose_precision("auto", where) == expected
-    assert choose_precision("float32", where) == "float32" and not caplog.records
+    assert choose_precision("float32", where) == "float32"
+    assert not caplog.records
     assert choose_precision("bfloat16", where) == "bfloat16"
     assert bool(caplog.records) == (where.type == "cpu" and not supported)
     grouped, depthwise = (torch.nn.Conv2d(4, 8, 3, groups=groups) for groups in (2, 4))
     assert choose_precision("auto", where, grouped) == expected
-    assert choose_precision("auto", where, depthwise) == (
-        "float32" if where.type == "cpu" else expected
-    )
+    assert choose_precision(
+        "auto",
+        where,
+        depthwise,
+    ) == ("float32" if where.type == "cpu" else expected)
 
 
 def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
@@ -97,7 +111,7 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     exact = network(images)
     inside = []
     network.stem.register_forward_hook(
-        lambda module, arguments, result: inside.append(result.dtype)
+        lambda module, arguments, result: inside.append(result.dtype),
     )
     logits = MixedPrecision(network, "bfloat16")(images)
     logits.sum().backward()
@@ -106,9 +120,9 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
     assert not torch.equal(logits, exact)
     assert (logits - exact).norm() / exact.norm() < 0.05  # bfloat16 has 8 bits, over a dozen layers
-    assert (
-        torch.rand(8, 8) @ torch.rand(8, 8)
-    ).dtype == torch.float32  # autocast ends with the forward pass
+    # Autocast ends with the forward pass.
+    product = torch.rand(8, 8) @ torch.rand(8, 8)
+    assert product.dtype == torch.float32
 
 
 @pytest.mark.parametrize("works", [True, False])
@@ -117,13 +131,17 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
         raise RuntimeError("Failed to find C compiler.")
 
     monkeypatch.setattr(
-        device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler
+        device.torch,
+        "compile",
+        lambda function: (lambda images: images) if works else no_compiler,
     )
     monkeypatch.setattr(device.torch, "zeros", lambda size, device: None)
     compiles.cache_clear()
     assert [compiles("auto", GPU), compiles("auto", GPU)] == [works, works]
     assert len(caplog.messages) == (not works)  # once
-    assert compiles("always", GPU) and not compiles("never", GPU) and not compiles("auto", CPU)
+    assert compiles("always", GPU)
+    assert not compiles("never", GPU)
+    assert not compiles("auto", CPU)
     compiles.cache_clear()
     monkeypatch.setattr(device.distributed, "world_size", lambda: 2)
     assert not compiles("auto", GPU)
@@ -131,7 +149,7 @@ def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, work
 
 
 @pytest.mark.filterwarnings(
-    "ignore:The .grad attribute of a Tensor that is not a leaf"
+    "ignore:The .grad attribute of a Tensor that is not a leaf",
 )  # the compiler looks at it
 def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_and_gradient():
     sizes = []
@@ -140,20 +158,17 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
         sizes.append(next(len(x) for x in inputs if x.shape[1:] == (3, 8, 8)))
         return module.forward
 
-    linear = (
-        torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3))
-        .double()
-        .requires_grad_(False)
-    )
+    linear = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3))
+    linear = linear.double().requires_grad_(False)
     graphed = GraphedModel(linear, compiler).eval()
     for count in (1, 7, 16, 17, 30, 32, 33):
         images = torch.rand(count, 3, 8, 8, dtype=torch.float64, requires_grad=True)
-        logits, expected = graphed(images), linear(images)
+        logits = graphed(images)
+        expected = linear(images)
         torch.testing.assert_close(logits, expected)
         weights = torch.rand_like(logits)
-        gradient, exact = (
-            torch.autograd.grad((x * weights).sum(), images)[0] for x in (logits, expected)
-        )
+        (gradient,) = torch.autograd.grad((logits * weights).sum(), images)
+        (exact,) = torch.autograd.grad((expected * weights).sum(), images)
         torch.testing.assert_close(gradient, exact)
     graphed.train()(images)
     graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
@@ -161,4 +176,4 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
         16,
         32,
         64,
-    ]  # in training mode, and for larger batches, the model is used as it is
+    ]  # The model itself is used in training mode and for larger batches.

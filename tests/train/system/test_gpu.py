@@ -1,4 +1,4 @@
-"""What only a GPU can show; skipped without one."""
+"""Training on a GPU agrees with training on a CPU. The tests are skipped without one."""
 
 import pytest
 import torch
@@ -18,11 +18,12 @@ def weights_of(config, folder) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("compile", ["auto", "never"])
 def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
-    """At a learning rate so low that rounding does not grow; without dropout, whose draws differ."""
+    """Train with so low a rate that rounding errors do not grow, and without dropout."""
     overrides = ("train.learning_rate=0.001", "model.dropout=0.0", "train.epochs=2")
     expected = weights_of(tiny(*overrides), tmp_path / "cpu")
     found = weights_of(
-        tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu"
+        tiny(*overrides, "train.device=cuda", f"train.compile={compile}"),
+        tmp_path / "gpu",
     )
     torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3)  # convolutions in TF32
     lines = [read_metrics(tmp_path / name) for name in ("cpu", "gpu")]
@@ -35,10 +36,9 @@ def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, 
     again = weights_of(tiny(*overrides), tmp_path / "parts")
     (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
     parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
-    assert all(
-        torch.equal(value, again[name]) and torch.equal(value, parts[name])
-        for name, value in whole.items()
-    )
+    for name, value in whole.items():
+        assert torch.equal(value, again[name])
+        assert torch.equal(value, parts[name])
 
 
 @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
@@ -47,9 +47,9 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
     step = Trainer._step
 
     def asynchronous(self, *batch):
-        torch.cuda.set_sync_debug_mode(
-            "error" if self._under_way.step > 3 else "default"
-        )  # after what is compiled
+        # The first steps compile, which waits for the GPU.
+        is_compiled = self._under_way.step > 3
+        torch.cuda.set_sync_debug_mode("error" if is_compiled else "default")
         try:
             return step(self, *batch)
         finally:

@@ -1,4 +1,4 @@
-"""Two processes against one, over gloo on a CPU; and the signals that end a run."""
+"""Two processes train like one, and signals end a run."""
 
 import os
 import shlex
@@ -31,19 +31,19 @@ EPOCHS = 2
 
 
 def group_norms(patch: pytest.MonkeyPatch) -> None:
-    """In place of batch norms, whose statistics on a CPU are those of a process's own part."""
+    """Replace batch norms, whose statistics on a CPU are those of one process alone."""
     patch.setattr(torch.nn, "BatchNorm2d", lambda channels: torch.nn.GroupNorm(1, channels))
 
 
 def one_of_two(index: int, port: int, folder: Path) -> None:
-    """All that the tests ask of two processes, in one of them."""
+    """Do in one of two processes everything that the tests compare."""
     os.environ |= {"WORLD_SIZE": "2", "RANK": str(index), "LOCAL_RANK": str(index)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     with pytest.MonkeyPatch.context() as patch, process_group():
         group_norms(patch)
         run_from_file(folder / "config.yaml", folder / "two")
-        random_method(folder / f"random_{index}.pt")
-        folder_method(folder / f"folder_{index}.pt")
+        random_mode(folder / f"random_{index}.pt")
+        folder_mode(folder / f"folder_{index}.pt")
         run_until_a_signal(folder / "config.yaml", folder / "mixed")
 
 
@@ -52,9 +52,10 @@ def run_from_file(config: Path, folder: Path) -> None:
     completed_run(settings, folder)
 
 
-def random_method(file: Path) -> None:
-    """Write the images, the diagnostics and how many images this process renders beside those that it shows."""
-    meshes, count = [("solid:table", 0), ("solid:plate", 1)], []
+def random_mode(file: Path) -> None:
+    """Write the images, the diagnostics and the number of renders of this process."""
+    meshes = [("solid:table", 0), ("solid:plate", 1)]
+    count = []
     with pytest.MonkeyPatch.context() as patch:
         render = Scene.render
         patch.setattr(
@@ -62,22 +63,30 @@ def random_method(file: Path) -> None:
             "render",
             lambda self, *args: (count.append(len(args[1])), render(self, *args))[1],
         )
-        settings = AugmentationSettings(method="random")
+        settings = AugmentationSettings(mode="random")
         service = AugmentationService.from_meshes(
-            meshes, 8, settings, views=3, samples=1, rasterizer="numpy"
+            meshes,
+            8,
+            settings,
+            views=3,
+            samples=1,
+            rasterizer="numpy",
         )
-        service.rank, service.world_size = distributed.rank(), distributed.world_size()
+        service.rank = distributed.rank()
+        service.world_size = distributed.world_size()
         torch.manual_seed(0)
         made = service.regenerate(
-            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 0
+            torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)),
+            0,
         )
     torch.save((made.images, made.diagnostics, count[0]), file)
 
 
-def folder_method(file: Path) -> None:
+def folder_mode(file: Path) -> None:
     torch.manual_seed(0)
-    images, labels = torch.randint(256, (9, 3, 8, 8)).byte(), torch.arange(9) % 2
-    settings = AugmentationSettings(method="folder", folder="unread", examples=5)
+    images = torch.randint(256, (9, 3, 8, 8)).byte()
+    labels = torch.arange(9) % 2
+    settings = AugmentationSettings(mode="folder", folder="unread", examples=5)
     process = (), distributed.rank(), distributed.world_size()
     service = AugmentationService(settings, None, labels, 0, Phases(), *process, images)
     made = service.regenerate(torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 2)), 1)
@@ -85,7 +94,10 @@ def folder_method(file: Path) -> None:
 
 
 def run_until_a_signal(config: Path, folder: Path) -> None:
-    """The second process alone gets it, in the second step of the second epoch, and both stop after the third."""
+    """Send a signal to the second process in the second step of the second epoch.
+
+    Both processes stop after the third step.
+    """
     training_batches = loop.training_batches
 
     def signalled(split, batch_size, seed, now, *rest):
@@ -102,8 +114,10 @@ def run_until_a_signal(config: Path, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tiny, tmp_path_factory) -> Path:
-    """An adversarial run by one process, by two, and by two until a signal and then by one; at a learning rate so low
-    that rounding does not grow."""
+    """Train by one process, by two, and by two until a signal and then by one.
+
+    The learning rate is so low that rounding errors do not grow.
+    """
     folder = tmp_path_factory.mktemp("distributed")
     for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
         settings = tiny("train.learning_rate=0.001", f"train.epochs={EPOCHS}", *overrides)
@@ -130,12 +144,15 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
     torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
     for epoch in range(1, EPOCHS + 1):
         grids = [
-            np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png"))
+            np.asarray(
+                Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png"),
+            )
             for folder in ("one", name)
         ]
         np.testing.assert_allclose(
-            *(grid.astype(int) for grid in grids), atol=1
-        )  # of 255, where rounding decides
+            *(grid.astype(int) for grid in grids),
+            atol=1,
+        )  # Rounding changes values by 1 of 255.
     expected, lines = (read_metrics(runs / folder) for folder in ("one", name))
     assert [line.get("epoch") for line in lines] == [*range(1, EPOCHS + 1), None]
     for one, line in zip(expected, lines, strict=True):
@@ -144,7 +161,10 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
     assert all(line["augment/light_change"] > 0 for line in expected[:-1])
     files = [
         {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name}
-        for folder in ("one", name)
+        for folder in (
+            "one",
+            name,
+        )
     ]
     assert files[0] == files[1]
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
@@ -153,14 +173,15 @@ def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
 def test_each_process_renders_its_shard_of_the_random_arm_and_gets_the_images_of_one_as_of_a_folder(
     runs,
 ):
-    random_method(runs / "random.pt")
+    random_mode(runs / "random.pt")
     images, diagnostics, count = torch.load(runs / "random.pt")
     assert count == len(images) == 30
     for index in range(2):
         shared, described, part = torch.load(runs / f"random_{index}.pt")
         torch.testing.assert_close(shared, images, rtol=0, atol=1e-6)
-        assert part == 15 and described == pytest.approx(diagnostics, rel=1e-5)
-    folder_method(runs / "folder.pt")
+        assert part == 15
+        assert described == pytest.approx(diagnostics, rel=1e-5)
+    folder_mode(runs / "folder.pt")
     whole = torch.load(runs / "folder.pt")
     for index in range(2):
         assert all(map(torch.equal, torch.load(runs / f"folder_{index}.pt"), whole))
@@ -195,22 +216,28 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
         (advice,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
     assert first.returncode != 0
     command = shlex.split(advice.partition("to go on: ")[2])
-    assert command[:6] == start and len(command) == 8
+    assert command[:6] == start
+    assert len(command) == 8
     (folder,) = (tmp_path / "runs").glob("*/*")
     epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]
     assert 1 <= epochs < 20
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert f"after epoch {epochs}" in done.stdout and done.stdout.count("| adversarial") == 1
+    assert f"after epoch {epochs}" in done.stdout
+    assert done.stdout.count("| adversarial") == 1
     assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, 21), None]
 
 
 @pytest.mark.parametrize(
     "ended, expected",
-    [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)],
+    [
+        ("asked", Interrupted),
+        ("unasked", KeyboardInterrupt),
+        ("by an error", ZeroDivisionError),
+    ],
 )
 def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
-    """It ends the run where it is asked for, or else where the block ends; the handlers are those of before."""
+    """The run ends where it is asked for, or at the end of the block. Handlers are restored."""
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
     with pytest.raises(expected) as stopped, SignalHandler() as interruption:
         assert not interruption.requested()
@@ -225,7 +252,7 @@ def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
 
 
 def test_a_signal_that_is_ignored_stays_so():
-    """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
+    """nohup ignores SIGHUP, and a shell ignores SIGINT in background processes."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with SignalHandler() as interruption:

@@ -63,7 +63,10 @@ def color_network() -> nn.Sequential:
 
 
 def make_trainer(
-    folder: Path, network: nn.Module | None = None, precision: str = "float32", **settings
+    folder: Path,
+    network: nn.Module | None = None,
+    precision: str = "float32",
+    **settings,
 ) -> Trainer:
     """Make a trainer without renders."""
     torch.manual_seed(0)
@@ -149,7 +152,7 @@ def test_the_schedule_goes_on_within_an_epoch(tmp_path):
     trainer = make_trainer(tmp_path, color_network(), epochs=1, batch_size=4, schedule="cosine")
     rates = []
     trainer.optimizer.register_step_post_hook(
-        lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"])
+        lambda optimizer, *_: rates.append(optimizer.param_groups[0]["lr"]),
     )
     fit(trainer, single_colors(12), single_colors(3))
     expected = [0.05 * SCHEDULE_FACTORS["cosine"](step / 3) for step in range(3)]
@@ -259,9 +262,10 @@ def test_a_frozen_stage_and_all_before_it_stay_as_they_are(tmp_path, stage, trai
     before = {name: value.clone() for name, value in network.named_parameters()}
     freeze(network, stage)
     fit_noise(make_trainer(tmp_path, network, epochs=1))
-    changed = {
-        name for name, value in network.named_parameters() if not torch.equal(value, before[name])
-    }
+    changed = set()
+    for name, value in network.named_parameters():
+        if not torch.equal(value, before[name]):
+            changed.add(name)
     assert changed == {name for name in before if name.startswith(trained)}
 
 
@@ -272,7 +276,8 @@ def test_a_stage_that_the_network_lacks_is_refused():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(
-    monkeypatch, training
+    monkeypatch,
+    training,
 ):
     monkeypatch.setattr(loop, "EVALUATION_BATCH", 7)
     torch.manual_seed(0)
