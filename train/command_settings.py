@@ -22,7 +22,15 @@ from renderer.settings import (
     setting,
     setting_like,
 )
-from train.settings import GROUPS, MAX_IMAGES, MAX_SEED, TIME_FOLDER, label_names
+from train.settings import (
+    GROUPS,
+    MAX_IMAGES,
+    MAX_SEED,
+    TIME_FOLDER,
+    NetworkSettings,
+    class_texts,
+    label_names,
+)
 
 # Default environment maps of an audit.
 ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
@@ -43,8 +51,28 @@ LAB_MESHES = [
 ]
 CLASSIFIERS = (
     "efficientnet_lite0 to 2, torchvision:NAME, timm:NAME, run:FOLDER, squeezenet_caffe or "
-    "python:package.module:function"
+    "python:package.module:function, or a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
 )
+
+
+@dataclass(kw_only=True)
+class ClassifierSettings(Settings):
+    """A classifier, and what a user says about a network of their own."""
+
+    classifier: str | None = setting(None, f"The network: {CLASSIFIERS}.")
+    weights: str | None = setting_like(NetworkSettings, "weights", None)
+    classes: Any = setting_like(NetworkSettings, "classes", None)
+    normalization: Any = setting_like(NetworkSettings, "normalization", None)
+    size: int | None = setting(
+        None,
+        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file records none.",
+        minimum=1,
+        maximum=MAX_SIZE,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.classes = class_texts(self.classes)
 
 
 @dataclass
@@ -121,7 +149,7 @@ class TransferSettings(Settings):
 
 
 @dataclass
-class AttackExperimentSettings(Settings):
+class AttackExperimentSettings(ClassifierSettings):
     """Settings of pnb-attack: one attack on one classifier.
 
     If a projector or lamps are attacked and the scene has none, it gets them with their
@@ -129,10 +157,8 @@ class AttackExperimentSettings(Settings):
     """
 
     classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
-    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
     label: str = setting(
-        "orange",
-        "Class of the meshes. A mapping {mesh, label} names its own class.",
+        "orange", "Class of the meshes. A mapping {mesh, label} names its own class."
     )
     target: Any = setting(
         None,
@@ -289,23 +315,27 @@ class LabSettings(Settings):
 
 
 @dataclass
-class AuditSettings(Settings):
+class AuditSettings(ClassifierSettings):
     """Settings of pnb-audit.
 
     A mesh is a file, solid:NAME:SEED or a mapping with the fields of ObjectSettings.
     """
 
     classifier: str = setting(REQUIRED, f"The audited network: {CLASSIFIERS}.")
-    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
     hardened: str | None = setting(
-        None,
-        "Another classifier to show beside it, such as run:runs/harden.",
+        None, "Another classifier to show beside it, such as run:runs/harden."
     )
-    label: str = setting("orange", "Class of the meshes. Each class has an audit of its own.")
+    label: Any = setting(
+        None,
+        "Class of the meshes, by its name or index. null: the class that the name of the mesh's file tells. "
+        "Each class has an audit of its own.",
+        is_text=True,
+    )
     meshes: list[Any] = setting([], "Meshes of the class.")
-    look_alikes: list[Any] = setting(
+    hard_negatives: list[Any] = setting(
         [],
-        "Hard negatives: meshes of other classes, in the same lighting.",
+        "Meshes of other classes, in the same lighting. []: generated fruit and other things, but none with the name "
+        "of the class.",
     )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(
@@ -329,13 +359,13 @@ class AuditSettings(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("meshes",) if self.laboratory else ("meshes", "look_alikes"):
-            if not getattr(self, name):
-                remedy = f"name one mesh or more, as in {name}=[solid:orange]"
-                raise InputError(f"{name} is empty: {remedy}", name)
-        if self.laboratory and self.look_alikes:
-            instead = f"look_alikes are rendered instead of laboratory={self.laboratory}"
-            raise InputError(f"{instead}: leave one of them out", "look_alikes")
+        if not self.meshes:
+            raise InputError(
+                "meshes is empty: name one mesh or more, as in meshes=[solid:orange]", "meshes"
+            )
+        if self.laboratory and self.hard_negatives:
+            instead = f"hard_negatives are rendered instead of laboratory={self.laboratory}"
+            raise InputError(f"{instead}: leave one of them out", "hard_negatives")
 
     def scale(self, count: int) -> int:
         """Multiply a count by the budget. The result is at least 1."""
@@ -367,20 +397,19 @@ class CompareSettings(Settings):
 
 
 @dataclass
-class EvaluateSettings(Settings):
+class EvaluateSettings(ClassifierSettings):
     """Settings of pnb-evaluate."""
 
     photos: str = setting(
         REQUIRED,
         "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory is installed.",
     )
-    run: str | None = setting(None, "A run folder, or a folder below pretrained/.")
-    model: str | None = setting(
-        None,
-        "python:package.module:function, if such a function made the run's network.",
+    run: str | None = setting(
+        None, "A run folder or a folder below pretrained/, instead of a classifier."
     )
-    classifier: str | None = setting(None, f"Any other network instead of run: {CLASSIFIERS}.")
-    weights: str | None = setting(None, "File of the classifier's weights. null: its own.")
+    model: str | None = setting(
+        None, "python:package.module:function, if such a function made the run's network."
+    )
     label: Any = setting(
         "orange",
         "Positive class, whose recall and false positives count, or several. "

@@ -249,7 +249,7 @@ def build_network(
             images or has other classes.
     """
     if classifier:
-        module = cast(nn.Module, build_classifier(name, size).function)
+        module = cast(nn.Module, build_classifier(name, size, classes).function)
         return module.requires_grad_(True)
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
@@ -277,6 +277,8 @@ def build_network(
 def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
     """Call the Python function of a name, and check the size and the classes that it returns."""
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
+    if not isinstance(network, nn.Module):
+        raise InputError(f"name={name} returns no torch.nn.Module, which training needs", "name")
     if own_size != size:
         given = f"images of {own_size} pixels per side"
         raise InputError(f"name={name} is for {given}, and the data has {size}", "name")

@@ -62,9 +62,16 @@ CIRCUMSTANCES = (
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
-    *("data.path", "weights", "augment.folder", "augment.vary.environments", "train.init_from"),
+    *(
+        "data.path",
+        "weights",
+        "classes",
+        "augment.folder",
+        "augment.vary.environments",
+        "train.init_from",
+    ),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
-    *("classifier", "hardened", "meshes", "look_alikes", "environments", "photos", "laboratory"),
+    *("classifier", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
 )
 
 
@@ -328,8 +335,42 @@ class EvaluationSettings(Settings):
         return {str(name): published(Path(folder)) for name, folder in named.items()}
 
 
+@dataclass(kw_only=True)
+class NetworkSettings(Settings):
+    """What a user says about a network of their own."""
+
+    weights: str | None = setting(
+        None,
+        "File of the classifier's weights: a state dict or a checkpoint, with any number of classes. "
+        "null: its own weights, or a download.",
+    )
+    classes: Any = setting(
+        None,
+        "Names of the classifier's classes in the order of its outputs: a text file with a name in each line, or "
+        "[a,b]. null: the names that its source knows, otherwise 0, 1 and so on.",
+        is_text=True,
+    )
+    normalization: Any = setting(
+        None,
+        "Normalization before the classifier: imagenet, or [MEAN,STD] of red, green and blue in units of [0, 1], "
+        "such as [[0,0,0],[1,1,1]] for none. null: that of its source, and none before a file's network.",
+        is_text=True,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.classes = class_texts(self.classes)
+
+
+def class_texts(classes: Any) -> Any:
+    """Return a setting of class names in which numbers are texts, since YAML takes digits for numbers."""
+    if not isinstance(classes, list):
+        return classes
+    return [str(name) if is_whole(name) else name for name in classes]
+
+
 @dataclass
-class ExperimentSettings(Settings):
+class ExperimentSettings(NetworkSettings):
     """Settings of pnb-train: one run."""
 
     run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
@@ -344,10 +385,6 @@ class ExperimentSettings(Settings):
         "Positive class: the class of the meshes, whose recall and false positives are measured. "
         "Or several: [orange, apple].",
         is_text=True,
-    )
-    weights: str | None = setting(
-        None,
-        "File of weights of the classifier train.init_from. null: its own weights, or a download.",
     )
     compare: list[str] = setting(
         [], "Other kinds of renders to train first, in sub-folders, and to show in the same table."

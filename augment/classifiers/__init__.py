@@ -4,12 +4,14 @@
 one from a function. Both hide the channel order and the normalization of the network.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
+from augment.classifiers.files import SUFFIXES, build_file, load_file
+from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
 from augment.classifiers.sources import (
     SQUEEZENET_CAFFE,
     build_efficientnet_lite,
@@ -24,6 +26,9 @@ from augment.classifiers.sources import (
 from augment.progress import progress_message
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
+
+# Start of the name of a Python function.
+PYTHON = "python:"
 
 __all__ = [
     "SOURCES",
@@ -42,14 +47,18 @@ class Source(NamedTuple):
     there, and it is the first argument of both functions.
 
     Attributes:
-        load: Makes a classifier with weights. Its last argument is a file of
-            weights, or None for the weights of the source.
-        build: Makes a classifier with random weights. Its last argument is the
-            number of pixels per side.
+        load: Makes a classifier with weights. It takes a file of weights, or
+            None for the weights of the source and, if `takes_facts`, the
+            `NetworkFacts`.
+        build: Makes a classifier with random weights. It takes the number of
+            pixels per side and, if `takes_facts`, the `NetworkFacts`.
+        takes_facts: Whether the networks have any classes, sizes and
+            normalizations.
     """
 
     load: Callable[..., Classifier]
     build: Any
+    takes_facts: bool = False
 
 
 def _efficientnet_lite(version: int) -> Source:
@@ -59,36 +68,59 @@ def _efficientnet_lite(version: int) -> Source:
     return Source(load, build)
 
 
+def _load_python(name: str, weights: Path | None) -> Classifier:
+    """Call a function of a user, which loads its own weights."""
+    if weights is not None:
+        fault = f"weights={weights} is not for python:{name}, which loads its own"
+        raise InputError(f"{fault}: leave it out", "weights")
+    return load_python(name)
+
+
 # `train.networks` adds "run:", the networks that this project trains.
 SOURCES = {
     "efficientnet_lite0": _efficientnet_lite(0),
     "efficientnet_lite1": _efficientnet_lite(1),
     "efficientnet_lite2": _efficientnet_lite(2),
     SQUEEZENET_CAFFE: Source(load_squeezenet_caffe, build_squeezenet_caffe),
-    "torchvision:": Source(load_torchvision, build_torchvision),
-    "timm:": Source(load_timm, build_timm),
+    "torchvision:": Source(load_torchvision, build_torchvision, takes_facts=True),
+    "timm:": Source(load_timm, build_timm, takes_facts=True),
     # The function of a user loads its own weights.
-    "python:": Source(load_python, lambda model, size: load_python(model)),
+    PYTHON: Source(_load_python, lambda model, size: load_python(model)),
 }
 
 
-def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
+def load_classifier(
+    name: str,
+    weights: str | Path | None = None,
+    classes: Sequence[str] | str | Path | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+) -> Classifier:
     """Load a classifier by name, on the CPU.
 
     Args:
         name: `efficientnet_lite0`, `efficientnet_lite1`, `efficientnet_lite2`,
-            `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME` or
-            `python:package.module:function`. The commands also take
-            `run:FOLDER`, which is `train.load_run(FOLDER)` in Python.
+            `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME`,
+            `python:package.module:function`, or the path of a file of
+            TorchScript, `torch.export` (.pt2) or ONNX (.onnx). The commands
+            also take `run:FOLDER`, which is `train.load_run(FOLDER)` in Python.
         weights: File of weights. None for the weights that the source contains
-            or downloads.
+            or downloads. The number of classes is read from the file.
+        classes: Names of the classes in the order of the outputs, or a text
+            file with a name in each line. None for the names that the source
+            knows or, if it knows none, for "0", "1" and so on.
+        size: Pixels per side of the images. None for the size of the source.
+        normalization: "imagenet", or mean and standard deviation of the
+            channels red, green and blue, in units of [0, 1]. None for the
+            normalization of the source.
 
     Returns:
         The classifier.
 
     Raises:
         InputError: If the name is unknown, if the weights are missing, damaged
-            or of another network, or if a package is not installed.
+            or of another network, if the classes are not as many as the
+            network has, or if a package is not installed.
 
     Example:
         >>> load_classifier("torchvision:squeezenet1_1", "absent.pt")
@@ -97,29 +129,46 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
+    facts = as_facts(classes, size, normalization)
     source, colon, model = name.partition(":")
-    if source + colon not in SOURCES:
-        choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
-        message = f"name={name} is not known: choose one of {', '.join(choices)}"
-        raise InputError(message, "name")
-    load = SOURCES[source + colon].load
-    with progress_message(f"loading {name}"):
-        return load(model, path) if colon else load(path)
+    if source + colon in SOURCES:
+        arguments: list[Any] = [model, path] if colon else [path]
+        load = SOURCES[source + colon].load
+        if SOURCES[source + colon].takes_facts:
+            arguments.append(facts)
+        else:
+            require_no_facts(name, facts)
+        with progress_message(f"loading {name}"):
+            return load(*arguments)
+    if Path(name).suffix.lower() in SUFFIXES:
+        if path is not None:
+            fault = f"weights={path} is not for the file {name}, which has its own"
+            raise InputError(f"{fault}: leave it out", "weights")
+        with progress_message(f"loading {name}"):
+            return load_file(name, facts)
+    choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]
+    choices.append(f"a file ({', '.join(SUFFIXES)})")
+    raise InputError(f"name={name} is not known: choose one of {', '.join(choices)}", "name")
 
 
-def build_classifier(name: str, size: int) -> Classifier:
+def build_classifier(name: str, size: int, classes: Sequence[str] | None = None) -> Classifier:
     """Build the network of `load_classifier` with random weights.
 
     The function of `python:package.module:function` keeps the weights and the
-    size that it chooses.
+    size that it chooses, and a file keeps its weights.
 
     Args:
         name: Name of a classifier, as for `load_classifier`.
         size: Pixels per side.
+        classes: Names of the classes. None for those of the source.
 
     Returns:
         The classifier.
     """
+    facts = as_facts(classes)
     source, colon, model = name.partition(":")
-    build = SOURCES[source + colon].build
-    return build(model, size) if colon else build(size)
+    if source + colon not in SOURCES:
+        return build_file(name, size, facts)
+    known = SOURCES[source + colon]
+    arguments: list[Any] = [model, size] if colon else [size]
+    return known.build(*arguments, *([facts] if known.takes_facts else []))

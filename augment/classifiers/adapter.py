@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -267,7 +267,44 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     )
 
 
-class Normalized(nn.Module):
+class Wrapper(nn.Module):
+    """A module around a network, whose weights have the names of the network's own file.
+
+    Attributes:
+        network: Module or function from images to logits.
+    """
+
+    def __init__(self, network: Callable[[Any], Any]):
+        super().__init__()
+        self.network: Any = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the logits (N, C) of images (N, 3, H, W)."""
+        return self.network(images)
+
+
+def unwrapped(network: Any) -> Any:
+    """Return the network inside all wrappers."""
+    while isinstance(network, Wrapper):
+        network = network.network
+    return network
+
+
+class ArrayFunction(Wrapper):
+    """A function from NumPy arrays to scores, for tensors. It has no gradients.
+
+    Args:
+        function: Function from images (N, 3, H, W), float32 in [0, 1], to
+            scores (N, C).
+    """
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
+        scores = self.network(images.detach().cpu().float().numpy())
+        return torch.as_tensor(np.asarray(scores)).to(images)
+
+
+class Normalized(Wrapper):
     """A network behind its own normalization: takes images (N, 3, H, W), RGB in [0, 1], as (x − mean) / std.
 
     mean, std: in units of [0, 1] and in the network's own order of channels. bgr: whether that order is blue first.
@@ -280,10 +317,9 @@ class Normalized(nn.Module):
     def __init__(
         self, network: nn.Module, mean: Sequence[float], std: Sequence[float], bgr: bool = False
     ):
-        super().__init__()
+        super().__init__(network)
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
-        self.network = network
         self.bgr = bgr
 
     def forward(self, images: Tensor) -> Tensor:
@@ -336,35 +372,40 @@ def nearest(name: str, choices: Sequence[str]) -> str:
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
-def load_python(name: str, weights: str | Path | None = None) -> Classifier:
-    """`package.module:function`, found from the current folder or installed, called without arguments.
-
-    The function returns (module, size, classes): a torch.nn.Module from images (N, 3, size, size), RGB in [0, 1], to
-    logits, and the names of its classes in order. InputError where there is no such function, where it or its module
-    raises or returns something else, and for weights=, since the function loads its own.
-    """
-    if weights is not None:
-        fault = f"weights={weights} is not for python:{name}, which loads its own"
-        raise InputError(f"{fault}: leave it out", "weights")
-    return Classifier(*call_python(name), f"python:{name}")
-
-
-def call_python(name: str) -> tuple[nn.Module, int, Sequence[str]]:
+def load_python(name: str) -> Classifier:
     """Call a function of a user that makes a network.
 
     Args:
-        name: "package.module:function", found from the current folder or
-            installed.
+        name: "package.module:function" or "package.module.function", see
+            `call_python`.
 
     Returns:
-        The network, the pixels per side of its images, and the names of its
-        classes in the order of its logits.
+        The classifier.
 
     Raises:
         InputError: If there is no such function, or if the function or its
             module raises or returns something else.
     """
-    module, _, function = name.partition(":")
+    return Classifier(*call_python(name), f"python:{name}")
+
+
+def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
+    """Call a function of a user that makes a network.
+
+    Args:
+        name: "package.module:function" or "package.module.function", found from
+            the current folder or installed.
+
+    Returns:
+        The network, which is a module or a function from images
+        (N, 3, size, size), RGB in [0, 1], to logits; the pixels per side of
+        its images; and the names of its classes in the order of its logits.
+
+    Raises:
+        InputError: If there is no such function, or if the function or its
+            module raises or returns something else.
+    """
+    module, _, function = name.partition(":") if ":" in name else name.rpartition(".")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
@@ -380,10 +421,7 @@ def call_python(name: str) -> tuple[nn.Module, int, Sequence[str]]:
         raise InputError(f"name=python:{name} fails ({reason}): give {expected}", "name") from error
     ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
     if not (
-        isinstance(network, nn.Module)
-        and type(size) is int
-        and ordered
-        and all(type(c) is str for c in classes)
+        callable(network) and type(size) is int and ordered and all(type(c) is str for c in classes)
     ):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
         expected = "return (torch.nn.Module, pixels per side, class names)"

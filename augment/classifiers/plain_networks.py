@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from augment.classifiers.adapter import Classifier, NetworkCall, Normalized, as_class_names
-from renderer.errors import InputError, describe
-from renderer.validation import as_list, require_kind
+from renderer.errors import InputError, describe, require_file, require_range
+from renderer.settings import MAX_SIZE
+from renderer.validation import as_list, require_kind, require_whole
 
 # Normalization of most networks that were trained on ImageNet.
 IMAGENET = "imagenet"
@@ -34,6 +37,71 @@ MEANS = frozenset({"mean", "image_mean", "pixel_mean"})
 Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 
 
+@dataclass(frozen=True)
+class NetworkFacts:
+    """What a user says about a network that is loaded by its name.
+
+    Attributes:
+        classes: Names of the classes in the order of the outputs. None for the
+            names that the source knows or, if it knows none, for "0", "1" and
+            so on.
+        size: Pixels per side of the images. None for the size of the source.
+        normalization: "imagenet", or mean and standard deviation of the
+            channels red, green and blue, in units of [0, 1]. None for the
+            normalization of the source.
+    """
+
+    classes: tuple[str, ...] | None = None
+    size: int | None = None
+    normalization: Normalization = None
+
+
+NO_FACTS = NetworkFacts()
+
+
+def as_facts(
+    classes: Sequence[str] | str | Path | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+) -> NetworkFacts:
+    """Check what a user says about a network.
+
+    Args:
+        classes: Names of the classes, or a text file with a name in each line.
+        size: Pixels per side of the images.
+        normalization: "imagenet", or mean and standard deviation.
+
+    Returns:
+        The facts.
+
+    Raises:
+        InputError: If the file is missing, or an argument is of another kind.
+    """
+    if isinstance(classes, str | Path):
+        require_file(classes, "give a text file with the name of a class in each line")
+        lines = Path(classes).read_text(encoding="utf-8").splitlines()
+        classes = [line.strip() for line in lines if line.strip()]
+    names = None if classes is None else as_class_names("classes", classes)
+    if size is not None:
+        require_whole("size", size)
+        require_range("size", size, 1, MAX_SIZE)
+    if normalization is not None:
+        mean_and_std(normalization)
+    return NetworkFacts(names, size, normalization)
+
+
+def require_no_facts(name: str, facts: NetworkFacts) -> None:
+    """Raise InputError if facts are given for the network `name`, which has its own."""
+    for key, value in vars(facts).items():
+        if value is not None:
+            raise InputError(f"{key} is not for {name}, which has its own: leave it out", key)
+
+
+def index_names(count: int) -> tuple[str, ...]:
+    """Return the names of classes that nobody has named: "0", "1" and so on."""
+    return tuple(str(index) for index in range(count))
+
+
 def as_classifier(
     network: Classifier | Callable[[Tensor], Tensor],
     size: int | None = None,
@@ -42,6 +110,7 @@ def as_classifier(
     value_range: tuple[float, float] = UNIT_RANGE,
     device: torch.device | str | None = None,
     argument: str = "network",
+    name: str | None = None,
 ) -> Classifier:
     """Make a classifier of a plain network, and check it on gray images.
 
@@ -59,6 +128,7 @@ def as_classifier(
             normalization, such as (0, 255) or (-1, 1).
         device: Device of the images. None for that of the network.
         argument: Name of the argument `network` of the caller, for errors.
+        name: Name for messages. None for the name of the network's class.
 
     Returns:
         The classifier. It contains the network itself.
@@ -98,8 +168,8 @@ def as_classifier(
         raise InputError(
             f"classes has {len(names)} names, and the network returns {count} outputs: give one name per output"
         )
-    name = type(network).__name__
-    return Classifier(function, size, names or [str(index) for index in range(count)], name)
+    name = name or type(network).__name__
+    return Classifier(function, size, names or index_names(count), name)
 
 
 def device_of(network: object) -> torch.device:
@@ -143,7 +213,7 @@ def _preprocessed(
 ) -> nn.Module:
     """Put the scaling and the normalization of images in front of a network."""
     module = network if isinstance(network, nn.Module) else _Function(network)
-    mean, std = _mean_and_std(normalization)
+    mean, std = mean_and_std(normalization)
     black, white = as_list("value_range", value_range, float | int, "the values of black and white")
     if not black < white:
         raise InputError(f"value_range is ({black}, {white}): give black before white")
@@ -163,7 +233,7 @@ def _preprocessed(
     return Normalized(module, scaled_mean, scaled_std).eval()
 
 
-def _mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
+def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequence[float]]:
     """Return the mean and the standard deviation of each channel."""
     if normalization is None:
         return (0.0,) * COLORS, (1.0,) * COLORS

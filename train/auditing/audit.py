@@ -25,6 +25,7 @@ from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.auditing import audit_page as page
 from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfer_success
+from train.class_names import class_name, class_of_meshes, simplified, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import OTHER_PREFIX, find_photographs
@@ -34,7 +35,7 @@ from train.evaluation.scores.scoring import evaluate_photographs
 from train.report.results import RESULTS, require_replaceable
 from train.runs.run_config import CONFIG, read_config, require_same, write_config
 from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import load_network
+from train.runs.saved_networks import load_chosen, load_network
 from train.settings import published, read_objects, solid_name
 from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
@@ -51,6 +52,19 @@ SETUPS = 6
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
 # Paths per pixel of the renders of the laboratory.
 SPP = 48
+# Generated things that stand for hard negatives which the user does not name.
+HARD_NEGATIVES = (
+    "solid:lemon",
+    "solid:apple",
+    "solid:peach",
+    "solid:pear",
+    "solid:sweet_pepper",
+    "solid:ball",
+)
+NO_HARD_NEGATIVES = (
+    "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
+    "name meshes of what the classifier may confuse with the class."
+)
 # Keys of settings that may be set when a stopped audit continues.
 ADDED = ("hardened", "photos")
 
@@ -73,13 +87,16 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
     is_named = networks is None
     if networks is None:
         networks = load_networks(settings)
+    caveats = _compare_sizes(networks.values())
+    if not (settings.hard_negatives or settings.laboratory):
+        caveats.append(NO_HARD_NEGATIVES)
+    settings = complete(settings, networks[page.CLASSIFIER])
     plan = _Plan(settings, networks)
     out = writable_folder(settings.out, "out")
     # An audit of networks that have no names does not continue.
     own = _own_results(out) if is_named else ()
     require_replaceable(out, "out", settings.overwrite, own=own)
     renders = out / "renders"
-    caveats = _compare_sizes(plan.networks.values())
     has_renders = renders.exists() and not settings.overwrite
     if page.LABORATORY not in plan.folders:
         try:
@@ -87,7 +104,7 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
             with nullcontext() if has_renders else mitsuba():
                 plan.folders = {page.LABORATORY: renders} | plan.folders
         except InputError as error:
-            caveats.append(f"The laboratory is left out, and look_alikes with it ({error}).")
+            caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
@@ -123,10 +140,10 @@ class _Plan:
         self.label = settings.label
         self.device = choose_device(settings.device)
         self.networks = {key: network.to(self.device) for key, network in networks.items()}
-        meshes, look_alikes = read_meshes(settings)
+        meshes, hard_negatives = read_meshes(settings)
         folders = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
         self.folders = {part: published(Path(folder)) for part, folder in folders.items() if folder}
-        items = [*meshes, *look_alikes]
+        items = [*meshes, *hard_negatives]
         _require_classes(self.networks.values(), items, self.folders.values(), self.label)
         # The hard negatives are loaded, too, so that an unreadable file is
         # reported at once.
@@ -163,6 +180,36 @@ class _Plan:
             _write_part(path, transfer_success, network, *others, self.attacked_views, own)
 
 
+def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
+    """Fill in what an audit derives from its classifier.
+
+    Args:
+        settings: Settings of the audit.
+        classifier: The audited classifier, which has the classes.
+
+    Returns:
+        Settings with the class by its name, and with hard negatives if they
+        are needed.
+
+    Raises:
+        InputError: If the classifier lacks a class, or if neither `label` nor
+            the names of the meshes tell the class.
+    """
+    if settings.label is None:
+        label = class_of_meshes(settings.meshes, classifier, "meshes")
+    else:
+        label = class_name(classifier, settings.label, "label")
+    negatives = [
+        with_class_name(item, classifier, "hard_negatives") for item in settings.hard_negatives
+    ]
+    if not (negatives or settings.laboratory):
+        negatives = [
+            solid for solid in HARD_NEGATIVES if simplified(solid_name(solid)) != simplified(label)
+        ]
+    meshes = [with_class_name(item, classifier, "meshes") for item in settings.meshes]
+    return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
+
+
 def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
     """Load the classifier and, if there is one, the hardened network.
 
@@ -176,7 +223,7 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
         InputError: If there is no such network.
     """
     with keyed(name="classifier"):
-        classifier = load_network(settings.classifier, settings.weights)
+        classifier = load_chosen(settings)
     networks = {page.CLASSIFIER: classifier}
     if settings.hardened:
         with keyed(name="hardened"):
@@ -234,12 +281,12 @@ def laboratory_settings(settings: AuditSettings, out: Path, size: int) -> LabSet
     Returns:
         Settings of pnb-lab.
     """
-    meshes, look_alikes = read_meshes(settings)
+    meshes, hard_negatives = read_meshes(settings)
     kind_count = len(PATTERNS) + len(settings.environments)
     return LabSettings(
         out=str(out),
         label=settings.label,
-        meshes=[asdict(item) for item in (*meshes, *look_alikes)],
+        meshes=[asdict(item) for item in (*meshes, *hard_negatives)],
         setups=settings.scale(SETUPS) * kind_count,
         patterns=[*PATTERNS],
         environments=settings.environments,
@@ -266,16 +313,16 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
             hard negative has this label.
     """
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
-    look_alikes = [*read_objects(settings.look_alikes, "", "look_alikes").values()]
-    for item in look_alikes:
+    hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
+    for item in hard_negatives:
         item.label = item.label or OTHER_PREFIX + (solid_name(item.mesh) or Path(item.mesh).stem)
     for item in meshes:
         if item.label != settings.label:
             raise _wrong_class("meshes", item, settings.label)
-    for item in look_alikes:
+    for item in hard_negatives:
         if item.label == settings.label:
-            raise _wrong_class("look_alikes", item, settings.label)
-    return meshes, look_alikes
+            raise _wrong_class("hard_negatives", item, settings.label)
+    return meshes, hard_negatives
 
 
 def _wrong_class(key: str, item: ObjectSettings, label: str) -> InputError:
@@ -286,7 +333,7 @@ def _wrong_class(key: str, item: ObjectSettings, label: str) -> InputError:
 def _own_results(out: Path) -> Collection[str]:
     """Return RESULTS if the folder is the folder of an audit, which may continue, else nothing."""
     with suppress(InputError):
-        if "look_alikes" in read_config(out / CONFIG):
+        if "hard_negatives" in read_config(out / CONFIG):
             return RESULTS
     return ()
 

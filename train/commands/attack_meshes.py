@@ -28,6 +28,7 @@ from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility.rasterizers import Rasterizer
+from train.class_names import class_name
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.report.attack_tables import (
@@ -43,7 +44,7 @@ from train.report.attack_tables import (
 from train.report.results import require_replaceable
 from train.runs.run_config import write_config
 from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import load_network
+from train.runs.saved_networks import load_chosen, load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, keys_of, writable_folder
@@ -114,7 +115,7 @@ def run(settings: AttackExperimentSettings) -> None:
             settings.attack.require_parameters()
     device = choose_device(settings.device)
     with keyed(name="classifier"):
-        classifier = load_network(settings.classifier, settings.weights).to(device)
+        classifier = load_chosen(settings).to(device)
     if adversary is not None:
         images = adversary.render(_start_rasterizer(settings)).to(device)
         print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
@@ -226,6 +227,7 @@ def attacks(
         return
     for index, item in enumerate(settings.scene.meshes):
         mesh = read_object(item, settings.label, f"scene.meshes[{index}]")
+        mesh.label = class_name(classifier, mesh.label, "label")
         yield _attack_mesh(settings, classifier, device, mesh)
 
 
@@ -342,6 +344,9 @@ def load_targets(
             classifier lacks a class that it is asked for.
     """
     label = settings.label
+    if settings.transfer.classifiers or settings.transfer.meshes:
+        # Another classifier may have the class at another index.
+        label = class_name(attacked, label, "label")
     classifiers = []
     for item in settings.transfer.classifiers:
         classifier = _load_classifier(item).to(device)

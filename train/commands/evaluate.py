@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from augment.classifiers import Classifier
+from augment.classifiers.plain_networks import as_facts, require_no_facts
 from train.command_settings import EvaluateSettings
 from train.evaluation.scores.scoring import format_scores
 from train.functions.evaluate import evaluate as evaluate_network
-from train.runs.saved_networks import load_network, load_run
+from train.runs.saved_networks import load_chosen, load_run
 from train.settings import label_names
 from train.system.device import choose_device
 from train.system.user_errors import keyed
@@ -43,5 +44,7 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
     """Load the network of a run, or any other classifier."""
     if settings.run is None:
         with keyed(name="classifier"):
-            return load_network(str(settings.classifier), settings.weights)
+            return load_chosen(settings)
+    facts = as_facts(settings.classes, settings.size, settings.normalization)
+    require_no_facts(f"run={settings.run}", facts)
     return load_run(settings.run, settings.weights, settings.model)

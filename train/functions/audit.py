@@ -55,7 +55,7 @@ def audit(
         label: Class of the meshes, a name or an index. None if a mesh is in a
             pair with its class, or is named by it.
         hard_negatives: Meshes of other things in the same lighting, also with a
-            class or without. They are needed unless `laboratory` is given.
+            class or without. Without any, generated fruit and balls.
         hardened: Another network of the same arguments to show beside it.
         classes: Names of the classes of plain networks, in the order of their
             outputs. None for "0", "1" and so on.
@@ -102,15 +102,12 @@ def audit(
             )
         negatives = as_mappings("hard_negatives", hard_negatives, classifier)
         require_others(negatives, positive_classes)
-        if not negatives and laboratory is None:
-            example = "name one mesh or more, such as 'solid:lemon', or give laboratory"
-            raise InputError(f"hard_negatives is empty: {example}")
         with folder_or_temporary(out) as folder:
             settings = AuditSettings(
                 classifier=classifier.name,
                 label=positive_classes[0],
                 meshes=items,
-                look_alikes=negatives,
+                hard_negatives=negatives,
                 photos=None if photographs is None else str(photographs),
                 laboratory=None if laboratory is None else str(laboratory),
                 environments=[*environments],

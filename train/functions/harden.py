@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from augment.classifiers import Classifier
-from augment.classifiers.adapter import Normalized
+from augment.classifiers.adapter import Normalized, unwrapped
 from augment.classifiers.plain_networks import (
     UNIT_RANGE,
     Normalization,
@@ -30,7 +30,6 @@ from train.functions.meshes import MeshItem, as_mappings, require_others, studie
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.runs.run_lock import sole_writer
-from train.runs.saved_networks import without_normalization
 from train.settings import (
     DataSettings,
     ExperimentSettings,
@@ -218,6 +217,6 @@ def _copy_with(network: nn.Module, classifier: Classifier, trained: nn.Module) -
         cast(nn.Module, copy.function).load_state_dict(trained.state_dict())
         return copy
     is_wrapped = type(classifier.function) is Normalized and type(network) is not Normalized
-    learned = without_normalization(trained) if is_wrapped else trained
+    learned = unwrapped(trained) if is_wrapped else trained
     copy.load_state_dict(learned.state_dict())
     return copy

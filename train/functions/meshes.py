@@ -9,6 +9,7 @@ from augment.classifiers import Classifier
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
 from renderer.validation import as_list
+from train.class_names import class_of_name
 from train.settings import solid_name
 
 # What a caller names a mesh by: a file or solid:NAME, a pair of it and its
@@ -106,8 +107,8 @@ def _class_of(mesh: dict[str, Any], classifier: Classifier) -> str:
     """Return the label of a mesh or, without a label, the class that its file is named after."""
     if mesh.get("label"):
         return str(mesh["label"])
-    name = _name_of(mesh)
-    if name not in classifier.classes:
+    name = class_of_name(_name_of(mesh), classifier)
+    if name is None:
         raise InputError(
             f"label is not given, and {mesh['mesh']} is not named by a class of the network: "
             "give label, or pairs of a mesh and its class"

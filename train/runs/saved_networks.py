@@ -3,7 +3,7 @@
 import io
 import json
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
-from augment.classifiers.adapter import Normalized
+from augment.classifiers.adapter import unwrapped
+from augment.classifiers.files import is_network_file
+from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
 from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
 from renderer.validation import as_path, require_kind
+from train.command_settings import ClassifierSettings
 from train.networks import PYTHON, WIDERESNET, build_network
 from train.runs.checkpoint import BEST, checked, load
 from train.settings import published
@@ -36,13 +39,22 @@ FACTS = ("version", "encoding", "validation")
 LONGEST_REASON = 300
 
 
-def load_network(name: str, weights: str | Path | None = None) -> Classifier:
+def load_network(
+    name: str,
+    weights: str | Path | None = None,
+    classes: Sequence[str] | str | None = None,
+    size: int | None = None,
+    normalization: Normalization = None,
+) -> Classifier:
     """Load a classifier by its name: a trained network, or one that was trained elsewhere.
 
     Args:
         name: "run:FOLDER" for the network of a run, or a name that `augment.load_classifier`
             takes.
         weights: A local file of weights, if the source brings none.
+        classes: Names of the classes, or a file of them, as for `augment.load_classifier`.
+        size: Pixels per side of the images, as there.
+        normalization: Normalization of the images, as there.
 
     Returns:
         The classifier.
@@ -52,8 +64,20 @@ def load_network(name: str, weights: str | Path | None = None) -> Classifier:
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(RUN):
+        require_no_facts(name, as_facts(classes, size, normalization))
         return load_run(name.removeprefix(RUN), weights)
-    return load_classifier(name, weights)
+    return load_classifier(name, weights, classes, size, normalization)
+
+
+def load_chosen(settings: ClassifierSettings) -> Classifier:
+    """Load the classifier that the settings of a command choose; see `load_network`."""
+    return load_network(
+        str(settings.classifier),
+        settings.weights,
+        settings.classes,
+        settings.size,
+        settings.normalization,
+    )
 
 
 def load_run(
@@ -135,7 +159,7 @@ def is_classifier(name: str) -> bool:
         Whether it is the name of a classifier that was trained elsewhere.
     """
     source, colon, _ = name.partition(":")
-    return source + colon in SOURCES
+    return source + colon in SOURCES or is_network_file(name)
 
 
 def selected_file(run: Path) -> Path | None:
@@ -214,16 +238,7 @@ def export(path: Path, network: nn.Module) -> None:
         path: The file, for `torch.load`. Its weights have the names of the classifier's own file.
         network: The network.
     """
-    state = without_normalization(network).state_dict()
+    state = unwrapped(network).state_dict()
     content = io.BytesIO()
     torch.save({name: value.cpu() for name, value in state.items()}, content)
     atomic_write(path, content.getbuffer(), durable=True)
-
-
-def without_normalization(network: nn.Module) -> nn.Module:
-    """Return the network whose parameters have the names of its own file.
-
-    Args:
-        network: The network, which may be wrapped in its normalization.
-    """
-    return network.network if isinstance(network, Normalized) else network

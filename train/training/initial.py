@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from augment.classifiers import Classifier, load_classifier
+from augment.classifiers.files import is_network_file
+from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
 from train import console
 from train.data.cache import TensorCache
@@ -112,21 +114,36 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     if not name:
         return None
     if is_classifier(name):
-        return _classifier(name, settings.weights, settings.data.size)
+        return _classifier(settings, name)
     if settings.weights is not None:
         given = f"weights={settings.weights} is not for train.init_from={name}"
         raise InputError(f"{given}, which has its own: leave it out", "weights")
+    require_no_facts(
+        f"train.init_from={name}", as_facts(settings.classes, None, settings.normalization)
+    )
     with keyed(run="train.init_from"):
         path, state = load_selected(Path(name))
     return Initial(path, state["architecture"], state["model"])
 
 
-def _classifier(name: str, weights: str | None, size: int | None) -> Initial:
+def _classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier that was trained elsewhere, for images of its own size or another one."""
-    with keyed(name="train.init_from"):
-        classifier = load_classifier(name, weights)
+    size = settings.data.size
+    is_file = is_network_file(name)
+    with keyed(name="train.init_from", size="data.size"):
+        # A file does not always record the size of its images.
+        known_size = size if is_file else None
+        classifier = load_classifier(
+            name, settings.weights, settings.classes, known_size, settings.normalization
+        )
     network = cast(nn.Module, classifier.function)
-    shape = {"name": name, CLASSIFIER: True}
+    if not list(network.parameters()):
+        fault = f"train.init_from={name} is a network without weights that can be trained"
+        raise InputError(
+            f"{fault}: give its file of TorchScript or of torch.export", "train.init_from"
+        )
+    # The network is built again from its file, also from another folder.
+    shape = {"name": str(Path(name).absolute()) if is_file else name, CLASSIFIER: True}
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     return Initial(Path(name), architecture, network.state_dict())
 

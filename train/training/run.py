@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from augment import distributed
+from augment.classifiers.adapter import unwrapped
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
@@ -29,7 +30,7 @@ from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.runs import checkpoint
 from train.runs.run_config import require_same_run, write_config
 from train.runs.run_log import BEFORE, RunLog, remove_run
-from train.runs.saved_networks import WEIGHTS, export, without_normalization
+from train.runs.saved_networks import WEIGHTS, export
 from train.settings import ExperimentSettings
 from train.system.device import (
     MixedPrecision,
@@ -406,7 +407,7 @@ def build_trainer(
         initial.copy_to(network, facts)
     if settings.train.freeze:
         with keyed(stage="train.freeze"):
-            freeze(without_normalization(network), settings.train.freeze)
+            freeze(unwrapped(network), settings.train.freeze)
     with keyed(**keys):
         precision = choose_precision(settings.train.precision, device, network)
     model = MixedPrecision(network.to(device), precision)

@@ -296,7 +296,7 @@ DAMAGES = {
     "pickle": (lambda state, path: path.write_bytes(pickle.dumps(state)), "cannot be read"),
     "code": (lambda state, path: torch.save(Harmful(), path), "cannot be read"),
     "checkpoint": (
-        lambda state, path: torch.save({"model": state}, path),
+        lambda state, path: torch.save({"weights": state}, path),
         "cannot be read (it holds other things",
     ),
     "ten classes": (

@@ -141,12 +141,13 @@ def given(monkeypatch, tmp_path) -> dict[str, Any]:
     monkeypatch.setattr(audit, "SETUPS", 1)
     monkeypatch.setattr(audit, "LIGHTS", 1)
     monkeypatch.setattr(patterns, "RESOLUTION", 32)
-    monkeypatch.setattr(audit, "load_network", lambda name, weights=None: CLASSIFIERS[name])
+    monkeypatch.setattr(audit, "load_network", CLASSIFIERS.__getitem__)
+    monkeypatch.setattr(audit, "load_chosen", lambda settings: CLASSIFIERS[settings.classifier])
     return {
         "classifier": "dark",
         "environments": [],
         "meshes": ["solid:orange:0"],
-        "look_alikes": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
+        "hard_negatives": ["solid:lemon:0", {"mesh": "solid:pear:0", "label": "other"}],
         "out": str(tmp_path / "audit"),
     }
 
@@ -237,7 +238,7 @@ class TestAnAuditWithoutMitsuba:
 
     def test_leaves_the_laboratory_out_and_says_so(self, given, tmp_path):
         report = run_audit(AuditSettings(**given))
-        assert "The laboratory is left out, and look_alikes with it" in report.read_text()
+        assert "The laboratory is left out, and hard_negatives with it" in report.read_text()
         assert not (tmp_path / "audit/renders").exists()
         assert not (tmp_path / "audit/classifier/laboratory").exists()
 
@@ -245,7 +246,7 @@ class TestAnAuditWithoutMitsuba:
         for label, color in {"orange": "black", "other": "white"}.items():
             (tmp_path / "lab" / label).mkdir(parents=True)
             Image.new("RGB", (8, 8), color).save(tmp_path / "lab" / label / "a.png")
-        given |= {"look_alikes": [], "laboratory": str(tmp_path / "lab")}
+        given |= {"hard_negatives": [], "laboratory": str(tmp_path / "lab")}
         settings = AuditSettings(**given, hardened="dark in larger images")
         report = run_audit(settings).read_text()
         assert "The laboratory is left out" not in report
@@ -263,8 +264,8 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
     [
         ({"label": "pear"}, "'pear' is not a class of the model"),
         ({"meshes": []}, "meshes is empty"),
-        ({"look_alikes": [ORANGE_PEAR]}, "look_alikes: solid:pear is of the class orange"),
-        ({"look_alikes": ["pear.glb"]}, "pear.glb"),
+        ({"hard_negatives": [ORANGE_PEAR]}, "hard_negatives: solid:pear is of the class orange"),
+        ({"hard_negatives": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),
         ({"laboratory": "nowhere"}, "laboratory=nowhere"),

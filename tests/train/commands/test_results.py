@@ -25,7 +25,7 @@ COMMANDS = {
     "audit": [
         "classifier=run:network",
         "meshes=['solid:orange']",
-        "look_alikes=['solid:lemon']",
+        "hard_negatives=['solid:lemon']",
         "device=cpu",
     ],
     "evaluate": ["run=network", "photos=photos", "device=cpu", "precision=float32"],

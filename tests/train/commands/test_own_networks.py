@@ -1,0 +1,205 @@
+"""The commands with a user's own network of ten classes, as it was trained and saved elsewhere."""
+
+import argparse
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+from torch import nn
+from torchvision.models import mobilenet_v3_small
+
+import augment
+from renderer.errors import InputError
+from renderer.image import to_bytes
+from tests.runs import completed_run
+from tests.train.own_networks import (
+    CLASSES,
+    MEAN,
+    NAME,
+    SIZE,
+    STD,
+    VIEWS,
+    renders,
+    trained_network,
+    trained_weights,
+)
+from train.__main__ import main as train_command
+from train.auditing import audit
+from train.runs.saved_networks import load_run
+
+OWN = [
+    f"classifier=torchvision:{NAME}",
+    "weights=mine.pth",
+    "classes=classes.txt",
+    f"size={SIZE}",
+    "device=cpu",
+]
+# Sums of some thousand products in another order.
+ROUNDING = {"rtol": 1e-4, "atol": 1e-4}
+
+
+@pytest.fixture
+def here(tmp_path) -> Path:
+    """A folder with the weights, the names of the classes and photographs: a render of each class."""
+    torch.save(trained_weights(), tmp_path / "mine.pth")
+    (tmp_path / "classes.txt").write_text("\n".join(CLASSES) + "\n")
+    for name, image in zip(CLASSES, renders()[0][::VIEWS], strict=True):
+        (tmp_path / "photos" / name).mkdir(parents=True)
+        pixels = to_bytes(image.permute(1, 2, 0)).numpy()
+        Image.fromarray(pixels).save(tmp_path / "photos" / name / "0.png")
+    return tmp_path
+
+
+def normalized_logits(network: nn.Module, images: torch.Tensor) -> torch.Tensor:
+    with torch.no_grad():
+        return network.eval()((images - MEAN) / STD)
+
+
+def test_a_state_dict_of_ten_classes_gives_the_networks_own_logits(here):
+    images = renders()[0][:4]
+    classifier = augment.load_classifier(
+        f"torchvision:{NAME}", here / "mine.pth", list(CLASSES), SIZE
+    )
+    torch.testing.assert_close(
+        classifier(images), normalized_logits(trained_network(), images), **ROUNDING
+    )
+    assert (classifier.classes, classifier.size) == (CLASSES, SIZE)
+    assert augment.load_classifier(f"torchvision:{NAME}", here / "mine.pth").classes == tuple(
+        "0123456789"
+    )
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda state: {"state_dict": state, "epoch": 3, "optimizer": {"state": {}}},
+        lambda state: {
+            "model": state,
+            "args": argparse.Namespace(batch_size=32),
+        },  # as torchvision's scripts save
+        lambda state: {f"module.{key}": value for key, value in state.items()},
+        lambda state: {
+            "model_state_dict": {f"module._orig_mod.{key}": value for key, value in state.items()}
+        },
+    ],
+    ids=["state_dict", "torchvision's", "DataParallel", "compiled"],
+)
+def test_weights_load_from_the_usual_wrappers(tmp_path, wrap):
+    torch.save(wrap(trained_weights()), tmp_path / "wrapped.pth")
+    classifier = augment.load_classifier(f"torchvision:{NAME}", tmp_path / "wrapped.pth")
+    for name, value in trained_weights().items():
+        torch.testing.assert_close(
+            classifier.function.network.state_dict()[name], value, rtol=0, atol=0
+        )
+
+
+def test_a_pickled_module_is_refused_with_lines_that_save_its_weights(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save(trained_network(), "whole.pth")
+    with pytest.raises(InputError) as caught:
+        augment.load_classifier(f"torchvision:{NAME}", "whole.pth")
+    first, second = str(caught.value).split("the two lines ")[1].split(" and ")
+    exec(f"{first}\n{second}", {"torch": torch})
+    augment.load_classifier(f"torchvision:{NAME}", "weights.pth")
+    with pytest.raises(InputError, match="contains a pickled module"):
+        augment.load_classifier("whole.pth")
+
+
+def test_names_and_weights_of_different_numbers_of_classes_are_counted_in_the_error(here):
+    with pytest.raises(InputError, match=r"classes has 9 names, and weights=.* has 10 classes"):
+        augment.load_classifier(f"torchvision:{NAME}", here / "mine.pth", CLASSES[:9])
+
+
+def test_an_attack_finds_the_class_by_its_name_or_index(call, here):
+    for label in ("Orange", CLASSES.index("Orange")):
+        words = [
+            f"label={label}",
+            "attack.max_steps=1",
+            "attack.checks=false",
+            "attack.verify=null",
+        ]
+        scene = ["scene.meshes=solid:orange:0", "renderer.shadows=false", f"out={label}"]
+        assert call("attack", *OWN, *words, *scene) == 0
+        (line,) = (here / str(label) / "0_solid_orange_0" / "attack.jsonl").read_text().splitlines()
+        assert json.loads(line)["label"] == ["Orange"]
+
+
+def test_an_audit_of_one_mesh_finds_its_class_and_has_hard_negatives(
+    call, here, monkeypatch, caplog
+):
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(audit, "SPP", 1)
+    assert (
+        call("audit", *OWN, "meshes=solid:orange", "environments=[]", "budget=0.01", "out=audit")
+        == 0
+    )
+    assert "hard_negatives is empty" in caplog.text
+    with (here / "audit" / "classifier" / "laboratory" / "predictions.csv").open() as file:
+        labels = {row["label"] for row in csv.DictReader(file)}
+    assert "Orange" in labels and len(labels) > 1
+
+
+def test_photographs_are_scored_in_the_users_classes(call, here):
+    for label in ("Orange", CLASSES.index("Orange")):
+        assert call("evaluate", *OWN, "photos=photos", f"label={label}", f"out={label}") == 0
+        scores = json.loads((here / str(label) / "summary.json").read_text())
+        assert scores["recall"]["value"] == 1
+
+
+@pytest.fixture
+def harden(here, monkeypatch) -> Callable[..., Path]:
+    """Harden a network in one short epoch; return the folder of the run."""
+
+    def run(*words: str) -> Path:
+        monkeypatch.chdir(here)
+        folder = here / "hardened"
+        recipe = [
+            "train.epochs=1",
+            "train.images_per_epoch=8",
+            "train.batch_size=8",
+            "train.precision=float32",
+        ]
+        scene = [
+            "scene.meshes=solid:orange",
+            "scene.hard_negatives=solid:lemon",
+            "scene.backgrounds=[0.2]",
+        ]
+        machine = [
+            "train.device=cpu",
+            "train.threads=1",
+            "train.cache=null",
+            "renderer.shadows=false",
+        ]
+        data = [
+            "data.path=photos",
+            "data.workers=0",
+            "data.validation=0.2",
+            "data.test_fraction=0.2",
+        ]
+        words = ("experiment=classifier", f"run={folder}", *recipe, *scene, *machine, *data, *words)
+        completed_run(train_command.read(list(words)), folder)
+        return folder
+
+    return run
+
+
+def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
+    start = [
+        f"train.init_from=torchvision:{NAME}",
+        "weights=mine.pth",
+        "classes=classes.txt",
+        f"data.size={SIZE}",
+    ]
+    folder = harden(*start, "label=Orange")
+    images = renders()[0][:4]
+    network = mobilenet_v3_small(num_classes=len(CLASSES))
+    network.load_state_dict(torch.load(folder / "weights.pt"))
+    hardened = normalized_logits(network, images)
+    torch.testing.assert_close(load_run(folder)(images), hardened, **ROUNDING)
+    again = augment.load_classifier(f"torchvision:{NAME}", folder / "weights.pt", CLASSES, SIZE)
+    torch.testing.assert_close(again(images), hardened, **ROUNDING)
+    assert not torch.allclose(hardened, normalized_logits(trained_network(), images))
