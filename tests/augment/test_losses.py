@@ -1,3 +1,5 @@
+"""Losses, costs and labels agree with scipy's softmax and with formulas."""
+
 import numpy as np
 import pytest
 import torch
@@ -15,104 +17,126 @@ from augment.losses import (
 )
 
 EPS = torch.finfo(torch.float64).eps
+ROWS = torch.arange(6)
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 CLASSES = torch.tensor([0, 1, 2, 3, 4, 0])
 EXCLUDED = torch.tensor([complementary_label(label) for label in CLASSES.tolist()])
+LOG_PROBABILITIES = torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))
+PROBABILITIES = softmax(LOGITS.numpy(), axis=1)
 
 
 def test_a_complementary_label_costs_the_negative_log_probability_of_all_other_classes():
-    others = 1 - softmax(LOGITS.numpy(), axis=1)[range(6), CLASSES]
-    torch.testing.assert_close(
-        label_loss(LOGITS, EXCLUDED), -torch.from_numpy(others).log(), rtol=0, atol=32 * EPS
-    )
+    others = 1 - PROBABILITIES[ROWS, CLASSES]
+    expected = -torch.from_numpy(others).log()
+    loss = label_loss(LOGITS, EXCLUDED)
+    torch.testing.assert_close(loss, expected, rtol=0, atol=32 * EPS)
+
+
+def test_label_smoothing_leaves_complementary_labels_as_they_are():
     smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
-    torch.testing.assert_close(smoothed, label_loss(LOGITS, EXCLUDED), rtol=0, atol=0)
+    assert torch.equal(smoothed, label_loss(LOGITS, EXCLUDED))
 
 
 def test_a_class_costs_the_cross_entropy_in_a_batch_with_complementary_labels():
-    mixed = torch.where(torch.arange(6) % 2 == 0, CLASSES, EXCLUDED)
-    expected = -torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))[torch.arange(6), CLASSES]
-    torch.testing.assert_close(
-        label_loss(LOGITS, mixed)[::2], expected[::2], rtol=16 * EPS, atol=16 * EPS
-    )
+    is_class = ROWS % 2 == 0
+    mixed = torch.where(is_class, CLASSES, EXCLUDED)
+    loss = label_loss(LOGITS, mixed)[is_class]
+    expected = -LOG_PROBABILITIES[ROWS, CLASSES][is_class]
+    torch.testing.assert_close(loss, expected, rtol=16 * EPS, atol=16 * EPS)
 
 
-def test_a_complementary_label_leaves_out_the_other_classes_under_study_too_and_changes_no_other_loss():
-    expected = -np.log1p(-softmax(LOGITS.numpy(), axis=1)[:, [1, 4]].sum(1))
+def test_a_complementary_label_excludes_the_other_studied_classes_too():
     labels = torch.full((6,), complementary_label(1))
-    torch.testing.assert_close(label_loss(LOGITS, labels, absent=[4]), torch.from_numpy(expected))
+    excluded = PROBABILITIES[:, [1, 4]].sum(1)
+    expected = torch.from_numpy(-np.log1p(-excluded))
+    torch.testing.assert_close(label_loss(LOGITS, labels, absent=[4]), expected)
+    predicted = torch.arange(5)
+    of_all = torch.full((5,), complementary_label(1))
+    assert is_correct(predicted, of_all, [4]).tolist() == [True, False, True, True, False]
+
+
+def test_other_studied_classes_change_no_label_of_a_class():
     assert torch.equal(label_loss(LOGITS, CLASSES, absent=[4]), label_loss(LOGITS, CLASSES))
-    assert is_correct(torch.arange(5), torch.full((5,), complementary_label(1)), [4]).tolist() == [
-        1,
-        0,
-        1,
-        1,
-        0,
-    ]
-    assert is_correct(torch.arange(5), torch.full((5,), 4), [4]).tolist() == [0, 0, 0, 0, 1]
+    right = is_correct(torch.arange(5), torch.full((5,), 4), [4])
+    assert right.tolist() == [False, False, False, False, True]
 
 
-def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
-    assert torch.autograd.gradcheck(
-        lambda logits: label_loss(logits, EXCLUDED), LOGITS.clone().requires_grad_(True)
-    )
+def test_the_gradient_of_complementary_labels_is_exact():
+    logits = LOGITS.clone().requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda values: label_loss(values, EXCLUDED), logits)
+
+
+def test_the_gradient_is_finite_if_the_excluded_class_is_certain():
     certain = torch.tensor([[100.0, 0.0, 0.0]], requires_grad=True)
     label_loss(certain, torch.tensor([complementary_label(0)])).sum().backward()
     torch.testing.assert_close(certain.grad, torch.tensor([[1.0, -0.5, -0.5]]))
 
 
 @pytest.mark.parametrize(
-    ("predicted", "label", "right"), [(2, 2, True), (1, 2, False), (2, -3, False), (0, -3, True)]
+    ("predicted", "label", "right"),
+    [
+        (2, 2, True),
+        (1, 2, False),
+        (2, complementary_label(2), False),
+        (0, complementary_label(2), True),
+    ],
 )
 def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others(
-    predicted, label, right
+    predicted,
+    label,
+    right,
 ):
     assert is_correct(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
 
 
 def test_log_odds_are_the_logit_of_the_probability():
-    expected = logit(softmax(LOGITS.numpy(), axis=1)[:, 2])
-    torch.testing.assert_close(
-        log_odds(LOGITS, 2), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS
-    )
+    expected = torch.from_numpy(logit(PROBABILITIES[:, 2]))
+    torch.testing.assert_close(log_odds(LOGITS, 2), expected, rtol=64 * EPS, atol=64 * EPS)
 
 
 def test_divergence_is_the_relative_entropy_of_the_predictions():
     predictions = LOGITS.flip(0) / 2
-    expected = rel_entr(softmax(predictions.numpy(), axis=1), softmax(LOGITS.numpy(), axis=1)).sum(
-        1
-    )
-    close = {"rtol": 64 * EPS, "atol": 64 * EPS}
-    torch.testing.assert_close(
-        kl_divergence(LOGITS, predictions), torch.from_numpy(expected), **close
-    )
+    terms = rel_entr(softmax(predictions.numpy(), axis=1), PROBABILITIES)
+    expected = torch.from_numpy(terms.sum(1))
+    found = kl_divergence(LOGITS, predictions)
+    torch.testing.assert_close(found, expected, rtol=64 * EPS, atol=64 * EPS)
 
 
 def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another():
-    labels = torch.tensor([2, 0, complementary_label(2), 2, complementary_label(2), 4])
+    other = complementary_label(2)
+    labels = torch.tensor([2, 0, other, 2, other, 4])
     odds = log_odds(LOGITS, 2).numpy()
-    pairs = [np.log1p(np.exp(odds[other] - odds[own])) for own in (0, 3) for other in (1, 2, 4, 5)]
-    assert float(ranking_loss(LOGITS, labels, 2)) == pytest.approx(np.mean(pairs), rel=64 * EPS)
+    pairs = []
+    for positive in (0, 3):
+        for negative in (1, 2, 4, 5):
+            pairs.append(np.log1p(np.exp(odds[negative] - odds[positive])))
+    loss = float(ranking_loss(LOGITS, labels, 2))
+    assert loss == pytest.approx(np.mean(pairs), rel=64 * EPS)
 
 
-def test_ranking_is_zero_with_a_zero_gradient_without_a_pair():
+@pytest.mark.parametrize("label", [2, complementary_label(2)])
+def test_ranking_without_a_pair_is_zero_with_a_zero_gradient(label):
     logits = LOGITS.clone().requires_grad_(True)
-    for labels in (torch.full((6,), 2), torch.full((6,), complementary_label(2))):
-        loss = ranking_loss(logits, labels, 2)
-        loss.backward()
-        assert loss == 0 and not logits.grad.any()
+    loss = ranking_loss(logits, torch.full((6,), label), 2)
+    loss.backward()
+    assert loss == 0
+    assert not logits.grad.any()
 
 
-def test_the_cost_is_the_log_probability_of_the_right_class_less_that_of_the_target():
-    """With a target the normalization cancels: the cost is the difference of the logits."""
-    rows, target = torch.arange(6), (CLASSES + 2) % 5
-    expected = torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))[rows, CLASSES]
-    torch.testing.assert_close(
-        adversarial_cost(LOGITS, CLASSES), expected, rtol=16 * EPS, atol=16 * EPS
-    )
-    difference = LOGITS[rows, CLASSES] - LOGITS[rows, target]
-    torch.testing.assert_close(
-        adversarial_cost(LOGITS, CLASSES, target), difference, rtol=0, atol=64 * EPS
-    )
-    nothing = torch.full_like(target, NO_CLASS)
-    assert NO_CLASS not in EXCLUDED and not adversarial_cost(LOGITS, nothing, nothing).any()
+def test_without_a_target_the_cost_is_the_log_probability_of_the_right_class():
+    expected = LOG_PROBABILITIES[ROWS, CLASSES]
+    cost = adversarial_cost(LOGITS, CLASSES)
+    torch.testing.assert_close(cost, expected, rtol=16 * EPS, atol=16 * EPS)
+
+
+def test_with_a_target_the_cost_is_the_difference_of_the_logits():
+    target = (CLASSES + 2) % 5
+    expected = LOGITS[ROWS, CLASSES] - LOGITS[ROWS, target]
+    cost = adversarial_cost(LOGITS, CLASSES, target)
+    torch.testing.assert_close(cost, expected, rtol=0, atol=64 * EPS)
+
+
+def test_the_cost_without_any_class_is_zero():
+    nothing = torch.full_like(CLASSES, NO_CLASS)
+    assert NO_CLASS not in EXCLUDED
+    assert not adversarial_cost(LOGITS, nothing, nothing).any()

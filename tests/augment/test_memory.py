@@ -1,6 +1,8 @@
-"""Memory is asked for before it is allocated."""
+"""Memory is required to be free before it is allocated."""
 
 import itertools
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,59 +16,96 @@ from augment.settings import CameraEffectSettings, TrainingAttackSettings
 from renderer.errors import InputError
 from renderer.image import to_bytes
 
+CPU = torch.device("cpu")
+ORANGE = [("solid:orange", "orange")]
 
-def test_more_than_the_free_memory_is_refused_before_it_is_allocated(tmp_path, monkeypatch):
+
+@pytest.fixture
+def system(tmp_path, monkeypatch) -> Path:
+    """Return the folder that stands for the system's files on memory, which is empty."""
     monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
     monkeypatch.setattr(memory, "GROUP", tmp_path)
-    device = torch.device("cpu")
-    require_memory("renders", 2**60, device)  # a system that does not say
-    (tmp_path / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    (tmp_path / "memory.current").write_text("5\n")
-    require_memory("renders", 2**32, device)
-    with pytest.raises(InputError, match=r"^renders need 8\.0 GB of memory and 4\.0 GB are free"):
-        require_memory("renders", 2**33, device)
-    (tmp_path / "memory.max").write_text(f"{2**30 + 5}\n")
-    with pytest.raises(InputError, match=r"and 1\.0 GB are free"):
-        require_memory("renders", 2**32, device)
+    return tmp_path
+
+
+@pytest.fixture
+def with_4_gigabytes(system) -> Path:
+    """Write that 4 GB of the system's memory are free, without a limit of the group."""
+    (system / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
+    (system / "memory.max").write_text("max\n")
+    (system / "memory.current").write_text("5\n")
+    return system
+
+
+def test_any_memory_is_granted_on_a_system_that_does_not_say_how_much_is_free(system):
+    require_memory("renders", 2**60, CPU)
+
+
+def test_more_than_the_free_memory_is_refused(with_4_gigabytes):
+    require_memory("renders", 2**32, CPU)
+    with pytest.raises(InputError, match=r"^renders .* 8\.0 GB .* 4\.0 GB"):
+        require_memory("renders", 2**33, CPU)
+
+
+def test_more_than_a_group_of_processes_may_use_is_refused(with_4_gigabytes):
+    (with_4_gigabytes / "memory.max").write_text(f"{2**30 + 5}\n")
+    with pytest.raises(InputError, match=r"1\.0 GB"):
+        require_memory("renders", 2**32, CPU)
+
+
+def peak_memory(function: Callable[[], object]) -> int:
+    """Return the peak of the bytes that a function allocates, by torch's profiler."""
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    with torch.profiler.profile(activities=activities, profile_memory=True) as profile:
+        function()
+    events = [e for e in profile.profiler.kineto_results.events() if e.name() == "[memory]"]
+    events.sort(key=lambda event: event.start_ns())
+    return max(itertools.accumulate(event.nbytes() for event in events))
 
 
 @pytest.mark.parametrize(
-    "at_once, camera", [(2**16, {}), (2**24, {}), (2**24, {"blur": 0.8, "pattern_fraction": 0.7})]
+    ("at_once", "camera"),
+    [
+        (2**16, CameraEffectSettings()),
+        (2**24, CameraEffectSettings()),
+        (2**24, CameraEffectSettings(blur=0.8, pattern_fraction=0.7)),
+    ],
+    ids=["few images", "all images", "camera effects"],
 )
 def test_an_attack_on_light_takes_half_to_all_of_the_memory_that_it_must_find_free(
-    monkeypatch, at_once, camera
+    monkeypatch,
+    at_once,
+    camera,
 ):
-    """By torch's profiler, for all images at once and for few; with the renders as bytes, as they are trained on."""
-    needed = []
+    """The renders are bytes, as they are in training."""
+    required = []
     monkeypatch.setattr(scene, "AT_ONCE", at_once)
-    monkeypatch.setattr(scene, "require_memory", lambda name, bytes_, device: needed.append(bytes_))
+    monkeypatch.setattr(scene, "require_memory", lambda *arguments: required.append(arguments[1]))
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=1))
-    settings.vary.camera = CameraEffectSettings(**camera)
-    grays = {
-        "views": 2,
-        "backgrounds": [row / 128 for row in range(128)],
-        "samples": 1,
-        "rasterizer": "numpy",
-    }
-    service = AugmentationService.from_meshes([("solid:orange:0", 0)], 32, settings, **grays)
-    with torch.profiler.profile(
-        activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
-    ) as recorded:
-        to_bytes(service.regenerate(nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 2)), 0).images)
-    events = [
-        event for event in recorded.profiler.kineto_results.events() if event.name() == "[memory]"
-    ]
-    changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
-    assert needed[-1] / 2 < max(itertools.accumulate(changes)) <= needed[-1]
+    settings.vary.camera = camera
+    service = AugmentationService.from_meshes(
+        [("solid:orange:0", 0)],
+        32,
+        settings,
+        views=2,
+        backgrounds=[row / 128 for row in range(128)],
+        samples=1,
+        rasterizer="numpy",
+    )
+    model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 2))
+    peak = peak_memory(lambda: to_bytes(service.regenerate(model, 0).images))
+    assert required[-1] / 2 < peak <= required[-1]
 
 
-def test_renders_and_their_views_need_their_memory_before_any_is_made(monkeypatch):
+def test_renders_need_their_memory_before_any_is_made(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: 2**26)
-    orange, grays = [("solid:orange", "orange")], (0, 0.25, 0.5, 0.75, 1)
-    with pytest.raises(InputError, match=r"^1000 renders of 64 pixels per side .* need 0\.4 GB"):
-        build_scene(orange, 64, 200, backgrounds=grays, rasterizer="numpy")
-    views = build_scene(orange, 64, 100, rasterizer="numpy", samples=1)
+    grays = (0, 0.25, 0.5, 0.75, 1)
+    with pytest.raises(InputError, match=r"^1000 renders of 64 pixels .* 0\.4 GB"):
+        build_scene(ORANGE, 64, 200, backgrounds=grays, rasterizer="numpy")
+
+
+def test_views_need_their_memory_before_any_is_made(monkeypatch):
+    shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**6)
-    with pytest.raises(InputError, match=r"^100 views of 64 pixels per side .* need "):
-        _ = views.stacks
+    with pytest.raises(InputError, match=r"^100 views of 64 pixels"):
+        _ = shown.stacks

@@ -1,4 +1,4 @@
-"""Progress of long work on a terminal and in a log."""
+"""The progress of long work is shown on a terminal and in a log."""
 
 import io
 import re
@@ -12,38 +12,68 @@ from augment.progress import progress
 
 
 class Terminal(io.StringIO):
+    """A stream that says it is a terminal."""
+
     def isatty(self):
         return True
 
 
-@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
-@pytest.mark.parametrize("seconds, ends", [(0.3, True), (0.3, False), (0.0, True)])
-def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(
-    monkeypatch, stream, seconds, ends
-):
-    """And leaves nothing on a terminal, also where the loop ends early."""
+@pytest.fixture
+def patience(monkeypatch) -> float:
+    """Show progress after a tenth of a second."""
     monkeypatch.setattr(progress_module, "PATIENCE", 0.1)
-    monkeypatch.setattr(sys, "stderr", stream())
-    done = []
-    for item in progress([1, 2], "attack"):
-        time.sleep(seconds)
-        done.append((item, "attack" in sys.stderr.getvalue()))
-        if not ends:
-            break
-    assert done == [(item, seconds > 0) for item in ([1, 2] if ends else [1])]
-    if stream is io.StringIO:
-        lines = sys.stderr.getvalue().splitlines()
-        assert (
-            lines[:1] == (["attack ..."] if seconds else []) and len(lines) < 5
-        )  # at 0.1, 0.3, 0.7 seconds ...
-    else:
-        assert sys.stderr.getvalue().rpartition("\r")[2].strip() == ""
+    return 0.1
 
 
-def test_lines_of_progress_say_how_much_time_is_left(monkeypatch):
-    monkeypatch.setattr(progress_module, "PATIENCE", 0.4)
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
+@pytest.fixture
+def shown(monkeypatch, patience):
+    """Return a function that works on items, and returns whether each saw progress shown."""
+
+    def work(stream: io.StringIO, seconds: float, items: list[int]) -> list[bool]:
+        monkeypatch.setattr(sys, "stderr", stream)
+        is_shown = []
+        for item in progress([1, 2], "attack"):
+            time.sleep(seconds)
+            is_shown.append("attack" in stream.getvalue())
+            if item == items[-1]:
+                break
+        return is_shown
+
+    return work
+
+
+@pytest.mark.parametrize("items", [[1], [1, 2]], ids=["ends early", "ends"])
+@pytest.mark.parametrize("kind", [Terminal, io.StringIO], ids=["terminal", "log"])
+def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(shown, kind, items):
+    assert shown(kind(), 0.3, items) == [True] * len(items)
+
+
+@pytest.mark.parametrize("kind", [Terminal, io.StringIO], ids=["terminal", "log"])
+def test_no_progress_is_shown_of_short_work(shown, kind):
+    assert shown(kind(), 0.0, [1, 2]) == [False, False]
+
+
+@pytest.mark.parametrize("items", [[1], [1, 2]], ids=["ends early", "ends"])
+def test_nothing_is_left_on_a_terminal(shown, items):
+    stream = Terminal()
+    shown(stream, 0.3, items)
+    assert stream.getvalue().rpartition("\r")[2].strip() == ""
+
+
+def test_a_log_has_few_lines(shown):
+    """They come after 0.1, 0.3, 0.7 seconds and so on."""
+    stream = io.StringIO()
+    shown(stream, 0.3, [1, 2])
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "attack ..."
+    assert len(lines) < 5
+
+
+def test_lines_of_progress_say_how_much_time_is_left(monkeypatch, patience):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
     for _ in progress([1, 2, 3], "attack", 1000, 10):
-        time.sleep(0.3)
-    (minutes, seconds), *_ = re.findall(r"11 of 1000\D* (\d+):(\d+) left", sys.stderr.getvalue())
-    assert 0.3 * 989 <= 60 * int(minutes) + int(seconds) < 0.6 * 989
+        time.sleep(0.2)
+    minutes, seconds = re.search(r"11 of 1000\D* (\d+):(\d+) left", stream.getvalue()).groups()
+    left = 60 * int(minutes) + int(seconds)
+    assert 0.2 * 989 <= left < 0.4 * 989

@@ -1,7 +1,9 @@
-"""The files of an attack: its numbers, its figure, and light, shape and normals as they are read back."""
+"""The files of an attack hold its numbers, its figure, and its light and shape to the bit."""
 
 import json
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,179 +23,278 @@ from renderer.mitsuba_scene import mitsuba_map
 
 CLASSES = ("orange", "lime", "sky", "night")
 
-# ------------------------------------------------------------------------------------- numbers
+# --------------------------------------------------------------- numbers
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.5, 100.0])
-def test_each_example_has_a_line_and_a_last_one_holds_the_checks(
-    attacked, by_color, tmp_path, margin
-):
-    result = attacked(
-        "lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=4, margin=margin
-    )
+@dataclass
+class Saved:
+    """A saved attack on two examples, with the target lime."""
+
+    result: AttackResult
+    checks: dict
+    margin: float
+    lines: list[dict]
+    """One for each example."""
+    last_line: dict
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.5, 100.0])
+def saved(request, attacked, tmp_path_factory) -> Saved:
+    """Save an attack with a margin."""
+    scene = {"backgrounds": [0.4, 0.6]}
+    options = {"target": "lime", "max_steps": 4, "margin": request.param}
+    result = attacked("lighting", scene, **options)
     checks = augment.check(result)
-    augment.save(result, tmp_path, checks)
-    *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
-    assert last == json.loads(json.dumps({"checks": checks, "warnings": warnings(checks)}))
-    for example, line in enumerate(lines):
-        assert line["example"] == example and line["label"] == ["orange"]
+    folder = tmp_path_factory.mktemp("saved")
+    augment.save(result, folder, checks)
+    *lines, last_line = [json.loads(line) for line in (folder / LINES).read_text().splitlines()]
+    assert len(lines) == 2
+    return Saved(result, checks, request.param, lines, last_line)
+
+
+def test_the_last_line_holds_the_checks(saved):
+    expected = {"checks": saved.checks, "warnings": warnings(saved.checks)}
+    assert saved.last_line == json.loads(json.dumps(expected))
+
+
+def test_each_example_has_a_line_with_the_numbers_of_its_descent(saved):
+    result = saved.result
+    for example, line in enumerate(saved.lines):
+        assert line["example"] == example
+        assert line["label"] == ["orange"]
         for name in ("success", "success_before", "steps", "cost", "cost_before"):
             assert line[name] == getattr(result.descent, name)[example].item()
-        for suffix, logits in (("_before", result.logits_before), ("", result.logits)):
-            probabilities = logits[example].softmax(1)
+        change = result.descent.values[example] - result.problem.start[example]
+        assert line["largest_change"] == {"lighting": change.abs().max().item()}
+        assert line["largest_change"]["lighting"] > 0
+
+
+def test_each_line_has_the_predictions_before_and_after(saved):
+    for suffix, logits in (
+        ("_before", saved.result.logits_before),
+        ("", saved.result.logits),
+    ):
+        for line, probabilities in zip(saved.lines, logits[:, 0].softmax(1), strict=True):
             assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
             assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
-        lead = result.logits[example, 0, 1] - result.logits[example, 0, [0, 2, 3]].max()
-        assert (
-            line["success_with_margin"]
-            is bool(lead >= margin)
-            is result.success_with_margin[example].item()
-        )
+    for line in saved.lines:
         assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
-        change = (result.descent.values[example] - result.problem.start[example]).abs().max().item()
-        assert line["largest_change"] == {"lighting": change} and change > 0
-        assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
-        rounded = (result.images[example] * 255).round() / 255
-        predicted = CLASSES[by_color(rounded)[0].argmax()]
-        differences = (rounded - result.images[example]).abs()
+
+
+def test_a_success_with_margin_leads_all_other_classes_by_the_margin(saved):
+    for example, line in enumerate(saved.lines):
+        logits = saved.result.logits[example, 0]
+        lead = logits[1] - logits[[0, 2, 3]].max()
+        expected = bool(lead >= saved.margin)
+        assert line["success_with_margin"] is expected
+        assert saved.result.success_with_margin[example].item() is expected
+
+
+def test_each_line_tells_how_the_image_of_8_bits_is_classified(saved, by_color):
+    for images, line in zip(saved.result.images, saved.lines, strict=True):
+        rounded = (images * 255).round() / 255
+        probabilities = by_color(rounded).softmax(1)[0]
+        predicted = CLASSES[probabilities.argmax()]
+        differences = (rounded - images).abs()
         assert line["versions"]["8 bits"] == {
             "success": predicted == "lime",
             "success_without_noise": predicted == "lime",
             "predicted": [predicted],
-            "confidence": [pytest.approx(by_color(rounded).softmax(1).max().item(), abs=1e-5)],
+            "confidence": [pytest.approx(probabilities.max().item(), abs=1e-5)],
             "largest_difference": pytest.approx(differences.max().item(), abs=1e-7),
             "mean_difference": pytest.approx(differences.mean().item(), abs=1e-7),
         }
+
+
+def test_each_line_has_the_usual_versions_of_the_image(saved):
+    for line in saved.lines:
+        assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
         assert line["versions"]["reload"]["largest_difference"] < 1e-5
 
 
-# ------------------------------------------------------------------------------------- light and shape
+# --------------------------------------------------------------- light and shape
 
 
-@pytest.mark.parametrize(("light", "positive"), [("st_peters", True), ("grace", False)])
-def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_positive(
-    attacked, tmp_path, light, positive
-):
-    """`st_peters` is positive all round and stays so within a small ball; `grace` is negative in places."""
-    steps = {"lighting": augment.StepSettings(radius=0.001)}
-    result = attacked(steps, {"light": light, "exposure": 2.0}, force=True, max_steps=2)
-    (line,) = augment.save(result, tmp_path)
-    folder, values = tmp_path / "example_000", result.descent.values[0].unflatten(0, (49, 3))
-    assert torch.equal(load_light(str(folder / "light.json")), values)
-    assert torch.equal(load_light(str(folder / "light_before.json")), 2 * load_light(light))
-    assert (
-        (line["negative_light"] < 1e-6)
-        == positive
-        == (to_map(values, MAP_HEIGHT).min() >= 0).item()
-    )
-    assert (folder / "light.hdr").is_file() == (folder / "light.exr").is_file() == positive
-    in_mitsuba = mitsuba_map(values, MAP_HEIGHT).float().clamp(min=0)
-    torch.testing.assert_close(
-        read_map(folder / "mitsuba" / "light.exr"), in_mitsuba, rtol=0, atol=0
-    )
-    if positive:
-        rgbe, exact = (read_map(folder / f"light.{suffix}") for suffix in ("hdr", "exr"))
-        # A channel has 8 bits of the texel's largest.
-        assert ((rgbe - exact).abs() <= exact.amax(2, keepdim=True) / 128).all()
+@dataclass
+class SavedLight:
+    """The folder of an attack on light, its final coefficients (49, 3), and its line."""
+
+    folder: Path
+    light: torch.Tensor
+    line: dict
+    name: str
+
+
+@pytest.fixture(scope="module")
+def save_light_of(attacked, tmp_path_factory):
+    """Return a function that attacks a named light within a small ball."""
+
+    def save(name: str) -> SavedLight:
+        steps = {"lighting": augment.StepSettings(radius=0.001)}
+        scene = {"light": name, "exposure": 2.0}
+        result = attacked(steps, scene, force=True, max_steps=2)
+        folder = tmp_path_factory.mktemp(name)
+        (line,) = augment.save(result, folder)
+        light = result.descent.values[0].unflatten(0, (49, 3))
+        return SavedLight(folder / "example_000", light, line, name)
+
+    return save
+
+
+@pytest.fixture(scope="module")
+def positive_light(save_light_of) -> SavedLight:
+    """Return an attack on a light that is positive all round."""
+    return save_light_of("st_peters")
+
+
+@pytest.fixture(scope="module")
+def negative_light(save_light_of) -> SavedLight:
+    """Return an attack on a light that is negative in places."""
+    return save_light_of("grace")
+
+
+@pytest.mark.parametrize("kind", ["positive_light", "negative_light"])
+def test_the_light_is_read_back_to_the_bit(request, kind):
+    saved = request.getfixturevalue(kind)
+    assert torch.equal(load_light(str(saved.folder / "light.json")), saved.light)
+    before = load_light(str(saved.folder / "light_before.json"))
+    assert torch.equal(before, 2 * load_light(saved.name))
+
+
+@pytest.mark.parametrize("kind", ["positive_light", "negative_light"])
+def test_the_light_of_mitsubas_scene_is_clipped_at_zero(request, kind):
+    saved = request.getfixturevalue(kind)
+    expected = mitsuba_map(saved.light, MAP_HEIGHT).float().clamp(min=0)
+    assert torch.equal(read_map(saved.folder / "mitsuba" / "light.exr"), expected)
+
+
+def test_positive_light_is_written_as_maps(positive_light):
+    assert to_map(positive_light.light, MAP_HEIGHT).min() >= 0
+    assert positive_light.line["negative_light"] < 1e-6
+    rgbe = read_map(positive_light.folder / "light.hdr")
+    exact = read_map(positive_light.folder / "light.exr")
+    # A channel has 8 bits of the texel's largest channel.
+    assert ((rgbe - exact).abs() <= exact.amax(2, keepdim=True) / 128).all()
+
+
+def test_negative_light_is_told_and_not_written_as_a_map(negative_light):
+    assert to_map(negative_light.light, MAP_HEIGHT).min() < 0
+    assert negative_light.line["negative_light"] > 1e-6
+    for suffix in ("hdr", "exr"):
+        assert not (negative_light.folder / f"light.{suffix}").exists()
 
 
 def test_the_shape_is_read_back_where_the_attack_left_it(attacked, tmp_path):
     result = attacked("geometry", max_steps=2)
     augment.save(result, tmp_path)
-    mesh, moved = result.problem.scene.mesh(0), result.conditions.vertices[0].double().numpy()
+    faces = result.problem.scene.mesh(0).faces
+    moved = result.conditions.vertices[0].double().numpy()
     found = load_mesh(tmp_path / "example_000" / "mesh.glb")
-    np.testing.assert_array_equal(found.vertices[found.faces], moved[mesh.faces])
+    np.testing.assert_array_equal(found.vertices[found.faces], moved[faces])
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_the_meshs_file_has_the_normals_that_the_renderer_shades_with(attacked, tmp_path, normals):
     augment.save(attacked("geometry", {"normals": normals}, force=True, max_steps=1), tmp_path)
-    (part,) = trimesh.load(tmp_path / "example_000" / "mesh.glb", process=False).geometry.values()
-    turns = np.linalg.norm(part.vertex_normals[part.faces] - part.face_normals[:, None], axis=2)
-    assert (turns.max() < 1e-4) == (normals == "flat")
+    path = tmp_path / "example_000" / "mesh.glb"
+    (part,) = trimesh.load(path, process=False).geometry.values()
+    corner_normals = part.vertex_normals[part.faces]
+    differences = np.linalg.norm(corner_normals - part.face_normals[:, None], axis=2)
+    assert (differences.max() < 1e-4) == (normals == "flat")
 
 
-# ------------------------------------------------------------------------------------- figure
+# --------------------------------------------------------------- figure
+
+SHARED = {"views": 2, "shared": True}
+COLUMN_WIDTH = SIDE + GAP
 
 
 @pytest.fixture(scope="module")
 def result(attacked) -> AttackResult:
-    """Two views, which share one light that is not attacked."""
-    return attacked("geometry", {"views": 2, "shared": True}, force=True, max_steps=1)
+    """Return an attack on the shape in two views, which share one light."""
+    return attacked("geometry", SHARED, force=True, max_steps=1)
 
 
-def drawn(result: AttackResult) -> np.ndarray:
+def sheet_of(result: AttackResult) -> np.ndarray:
+    """Draw the figure (H, W, 3) of the only example."""
     return np.asarray(figure(result, 0))
 
 
 def random_images(size: int, seed: int) -> torch.Tensor:
-    """Values of eight bits, and no pixel as white as the paper."""
+    """Return images of 8 bits, in which no pixel is as white as the paper."""
     draws = torch.Generator().manual_seed(seed)
     return torch.randint(0, 250, (1, 2, 3, size, size), generator=draws).float() / 255
 
 
-def found(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
-    """(row, column) of everywhere that an image (3, H, W), enlarged to at least SIDE, stands on the sheet."""
+def places_of(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
+    """Return the (row, column) of every place of the sheet that shows an image (3, H, W).
+
+    Images that are smaller than SIDE are enlarged by a whole number.
+    """
     pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
-    scale = -(-SIDE // pixels.shape[1])
-    return positions(sheet, pixels.repeat(scale, axis=0).repeat(scale, axis=1))
-
-
-def positions(sheet: np.ndarray, part: np.ndarray) -> list[tuple[int, int]]:
-    """(row, column) of everywhere that a part (H, W, 3) stands on the sheet. Few windows have its diagonal."""
+    scale = math.ceil(SIDE / pixels.shape[1])
+    part = pixels.repeat(scale, axis=0).repeat(scale, axis=1)
     height, width, _ = part.shape
-    corners = sheet[: len(sheet) - height + 1, : sheet.shape[1] - width + 1]
-    rows, columns = np.nonzero((corners == part[0, 0]).all(axis=2))
-    for at in range(1, min(height, width)):
-        same = (sheet[rows + at, columns + at] == part[at, at]).all(axis=1)
-        rows, columns = rows[same], columns[same]
-    candidates = zip(rows.tolist(), columns.tolist(), strict=True)
-    return [
-        (y, x) for y, x in candidates if np.array_equal(sheet[y : y + height, x : x + width], part)
-    ]
+    last_row = len(sheet) - height
+    last_column = sheet.shape[1] - width
+    is_corner = (sheet[: last_row + 1, : last_column + 1] == part[0, 0]).all(axis=2)
+    rows, columns = np.nonzero(is_corner)
+    # The diagonal leaves few candidates.
+    for step in range(1, min(height, width)):
+        is_same = (sheet[rows + step, columns + step] == part[step, step]).all(axis=1)
+        rows = rows[is_same]
+        columns = columns[is_same]
+    places = []
+    for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
+        window = sheet[row : row + height, column : column + width]
+        if np.array_equal(window, part):
+            places.append((row, column))
+    return places
 
 
 @pytest.mark.parametrize("size", [32, 200])
 def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they_are(result, size):
-    before, after = random_images(size, 0), random_images(size, 1)
-    sheet, side = (
-        drawn(replace(result, images_before=before, images=after)),
-        -(-SIDE // size) * size,
-    )
-    row_height = side + 2 + 2 * LINE_HEIGHT + GAP  # the captions of the differences have two lines
+    before = random_images(size, 0)
+    after = random_images(size, 1)
+    sheet = sheet_of(replace(result, images_before=before, images=after))
+    side = math.ceil(SIDE / size) * size
+    # The captions of the differences have two lines.
+    row_height = side + 2 + 2 * LINE_HEIGHT + GAP
     for column, images in enumerate((before[0], after[0])):
         for view, image in enumerate(images):
-            assert found(sheet, image) == [
-                (MARGIN + TITLE_HEIGHT + view * row_height, MARGIN + column * (side + GAP))
-            ]
+            top = MARGIN + TITLE_HEIGHT + view * row_height
+            left = MARGIN + column * (side + GAP)
+            assert places_of(sheet, image) == [(top, left)]
 
 
 def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(result):
-    """One view changes by +0.2 in red at one pixel, the other by -0.1: a fifth of the range is the whole of it."""
+    """The largest change of all views, 0.2, is shown as half of the range."""
     before = torch.full((1, 2, 3, 4, 4), 0.5)
-    after, expected = before.clone(), torch.full((2, 3, 4, 4), 128.0)
+    after = before.clone()
     after[0, 0, 0, 1, 2] += 0.2
     after[0, 1, :, 3, 0] -= 0.1
     after[0, :, 1, 0, 0] += 0.05
-    expected[0, 0, 1, 2], expected[1, :, 3, 0], expected[:, 1, 0, 0] = 255, 64, 159
-    sheet = drawn(replace(result, images_before=before, images=after))
-    assert [column for image in expected for _, column in found(sheet, image / 255)] == [
-        MARGIN + 2 * (SIDE + GAP)
-    ] * 2
+    expected = torch.full((2, 3, 4, 4), 128.0)
+    expected[0, 0, 1, 2] = 255
+    expected[1, :, 3, 0] = 64
+    expected[:, 1, 0, 0] = 159
+    sheet = sheet_of(replace(result, images_before=before, images=after))
+    for image in expected / 255:
+        [(_, column)] = places_of(sheet, image)
+        assert column == MARGIN + 2 * COLUMN_WIDTH
 
 
-def test_captions_are_the_predicted_class_and_the_right_one_where_it_is_another(result):
-    logits = torch.tensor([[[0.123, 0.0004, 0.8766, 1e-6], [0.85, 0.1, 0.05, 1e-6]]]).log()
-    assert _captions(result, logits, 0) == [("87.7% sky", "12.3% orange"), ("85.0% orange",)]
+def test_captions_are_the_predicted_class_and_the_right_one_if_it_is_another(result):
+    probabilities = torch.tensor([[0.123, 0.0004, 0.8766, 1e-6], [0.85, 0.1, 0.05, 1e-6]])
+    captions = _captions(result, probabilities.log()[None], 0)
+    assert captions == [("87.7% sky", "12.3% orange"), ("85.0% orange",)]
 
 
-def test_the_light_is_shown_where_the_attack_has_changed_it(attacked, result):
-    """All of it, a pattern included."""
-    column = SIDE + GAP
-    sheets = [
-        drawn(result),
-        drawn(attacked("projector", {"views": 2, "shared": True}, force=True, max_steps=1)),
-    ]
-    assert sheets[1].shape[1] - sheets[0].shape[1] == 2 * column
-    spheres = [sheets[1][:, MARGIN + number * column :][:, :SIDE] for number in (3, 4)]
-    assert (spheres[0][100:200] != spheres[1][100:200]).any()
+def test_the_light_is_shown_if_the_attack_has_changed_it(attacked, result):
+    """The pattern of a projector is a part of the light."""
+    without_light = sheet_of(result)
+    with_light = sheet_of(attacked("projector", SHARED, force=True, max_steps=1))
+    assert with_light.shape[1] - without_light.shape[1] == 2 * COLUMN_WIDTH
+    lefts = [MARGIN + column * COLUMN_WIDTH for column in (3, 4)]
+    before, after = (with_light[100:200, left : left + SIDE] for left in lefts)
+    assert (before != after).any()

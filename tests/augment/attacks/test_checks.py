@@ -12,82 +12,107 @@ from augment.attacks.checks import warnings
 from augment.parameter_settings import StepSettings
 from renderer.errors import InputError
 
-# ------------------------------------------------------------------------------------- checks
+SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
+
+# --------------------------------------------------------------- checks
 
 
-def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(attacked):
-    light = {"lighting": StepSettings(step_size=0.02)}
-    result = attacked(light, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
-    checks = augment.check(result)
-    assert checks["cost_before"] == pytest.approx(float(result.descent.cost_before.mean()))
-    assert (
-        checks["cost"] == pytest.approx(float(result.descent.cost.mean()))
-        and checks["cost"] < checks["cost_before"]
-    )
-    assert (
-        checks["cost_fell"] == 1
-        and checks["zero_gradient"] == 0
-        and 0 <= checks["random_search"] <= 1
-    )
+@pytest.fixture(scope="module")
+def slow_attack(attacked) -> AttackResult:
+    """Return an attack on three examples that needs more than its three steps."""
+    return attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
+
+
+def test_checks_tell_that_the_cost_falls(slow_attack):
+    checks = augment.check(slow_attack)
+    descent = slow_attack.descent
+    assert checks["cost_before"] == pytest.approx(float(descent.cost_before.mean()))
+    assert checks["cost"] == pytest.approx(float(descent.cost.mean()))
+    assert checks["cost"] < checks["cost_before"]
+    assert checks["cost_fell"] == 1
+    assert checks["zero_gradient"] == 0
+    assert 0 <= checks["random_search"] <= 1
+
+
+def test_more_steps_succeed_more_often(slow_attack):
+    """Nothing is drawn, so that a longer descent repeats the shorter one."""
+    checks = augment.check(slow_attack)
     assert list(checks["success_by_steps"]) == [3, 9, 30]
     rates = list(checks["success_by_steps"].values())
-    # A longer descent repeats the shorter one: nothing here is drawn.
-    assert rates == sorted(rates) and rates[0] == checks["success"] < rates[-1] == 1
-    assert checks == augment.check(result)
+    assert rates == sorted(rates)
+    assert rates[0] == checks["success"] < 1
+    assert rates[-1] == 1
 
 
-def test_a_success_within_the_steps_counts_also_where_a_margin_sends_it_on(attacked):
-    checks = augment.check(
-        attacked({"lighting": StepSettings(step_size=0.2)}, margin=100, max_steps=3)
-    )
-    assert checks["success"] == 1 and checks["success_by_steps"] == {3: 1, 9: 1, 30: 1}
+def test_checks_are_the_same_when_they_are_repeated(slow_attack):
+    assert augment.check(slow_attack) == augment.check(slow_attack)
+
+
+def test_a_success_within_the_steps_counts_even_if_a_margin_sends_it_on(attacked):
+    light = {"lighting": StepSettings(step_size=0.2)}
+    checks = augment.check(attacked(light, margin=100, max_steps=3))
+    assert checks["success"] == 1
+    assert checks["success_by_steps"] == {3: 1, 9: 1, 30: 1}
 
 
 def test_a_success_at_the_very_last_step_counts_among_those_of_as_many_steps(attacked):
-    light = {"lighting": StepSettings(step_size=0.02)}
-    [last] = attacked(light, max_steps=60).steps.tolist()
+    [last] = attacked(SMALL_STEPS, max_steps=60).steps.tolist()
     assert 1 < last < 60
-    checks = augment.check(attacked(light, max_steps=last))
-    assert checks["success"] == 1 and checks["success_by_steps"][last] == 1
-    assert augment.check(attacked(light, max_steps=last - 1))["success"] == 0
+    checks = augment.check(attacked(SMALL_STEPS, max_steps=last))
+    assert checks["success"] == 1
+    assert checks["success_by_steps"][last] == 1
+    assert augment.check(attacked(SMALL_STEPS, max_steps=last - 1))["success"] == 0
 
 
 def test_random_search_that_does_as_well_is_a_warning(attacked):
-    """Any change is a success against a classifier that knows images of almost exactly one brightness alone."""
-    brightness, width = attacked("lighting", max_steps=0).images_before.mean(), 1e-4
+    """The classifier knows images of almost exactly one brightness alone."""
+    brightness = attacked("lighting", max_steps=0).images_before.mean()
+    width = 1e-4
 
     def narrow(images: Tensor) -> Tensor:
-        margin = width - (images.mean((1, 2, 3)) - brightness - width / 2).abs()
+        distance = (images.mean((1, 2, 3)) - brightness - width / 2).abs()
+        margin = width - distance
         return torch.stack([margin, 0 * margin], dim=1)
 
     light = {"lighting": StepSettings(radius=0.1)}
-    checks = augment.check(
-        attacked(light, classifier=augment.Classifier(narrow, 8, ("orange", "other")))
-    )
+    classifier = augment.Classifier(narrow, 8, ("orange", "other"))
+    checks = augment.check(attacked(light, classifier=classifier))
     assert checks["success"] == checks["random_search"] == 1
-    assert warnings(checks) == ["random search does as well or better"]
+    assert len(warnings(checks)) == 1
 
 
-def test_warnings_follow_from_the_numbers():
-    good = {
-        "cost_fell": 1.0,
-        "zero_gradient": 0.0,
-        "success": 0.8,
-        "random_search": 0.5,
-        "success_without_noise": 0.9,
-    }
-    none = {"random_search": 0.0, "success": 0.0, "success_without_noise": 0.0}
-    assert warnings(good) == warnings(good | none) == []
-    assert len(warnings(good | {"success": 0.4, "random_search": 0.0})) == 1
-    assert len(warnings(good | {"cost_fell": 0.9, "zero_gradient": 0.1})) == 2
+GOOD = {
+    "cost_fell": 1.0,
+    "zero_gradient": 0.0,
+    "success": 0.8,
+    "random_search": 0.5,
+    "success_without_noise": 0.9,
+}
+NO_SUCCESS = {"random_search": 0.0, "success": 0.0, "success_without_noise": 0.0}
 
 
-# ------------------------------------------------------------------------------------- success by radius
+@pytest.mark.parametrize(
+    ("changes", "count"),
+    [
+        ({}, 0),
+        (NO_SUCCESS, 0),
+        ({"success": 0.4, "random_search": 0.0}, 1),
+        ({"cost_fell": 0.9, "zero_gradient": 0.1}, 2),
+    ],
+)
+def test_warnings_follow_from_the_numbers(changes, count):
+    assert len(warnings(GOOD | changes)) == count
 
 
-@pytest.fixture
+# --------------------------------------------------------------- success by radius
+
+
+@pytest.fixture(scope="module")
 def linear(make_scene, make_linear) -> AttackResult:
-    """Three examples of pixels, whose logits are linear in what is added: class 0 against 1, far from any clamp."""
+    """Return an attack on the pixels of three examples.
+
+    The logits are linear in what is added, and no pixel is clamped.
+    """
     classifier = augment.Classifier(make_linear(2, bias=3.0), 6, ("stone", "other"))
     shown = make_scene()
     shown.objects[0] = replace(shown.objects[0], label="stone")
@@ -97,101 +122,134 @@ def linear(make_scene, make_linear) -> AttackResult:
 
 
 def test_a_ball_holds_an_adversary_from_the_radius_on_at_which_a_linear_classifier_errs(linear):
-    """By hand: within L∞ of ε, the gap of two logits w₀, w₁ falls by ε |w₀ - w₁|₁ at most."""
+    """Within ε in every pixel, the gap of two logits falls by at most ε times |w₀ - w₁|₁.
+
+    Each view has pixels of its own, and the worse of both decides.
+    """
     weight = linear.classifier.function[1].weight
     gap = linear.logits_before[..., 0] - linear.logits_before[..., 1]
-    # The worse of two views, each of which has pixels of its own, decides.
-    needed = (gap / (weight[0] - weight[1]).abs().sum()).amax(1)
-    scales = [factor * float(radius) / 0.05 for radius in needed for factor in (0.98, 1.02)]
+    slope = (weight[0] - weight[1]).abs().sum()
+    needed_radii = (gap / slope).amax(1)
+    scales = []
+    for radius in needed_radii.tolist():
+        scales += [0.98 * radius / 0.05, 1.02 * radius / 0.05]
     for row in augment.success_by_radius(linear, scales):
-        assert torch.equal(row["adversarial"], row["radii"]["pixels"] > needed)
+        assert torch.equal(row["adversarial"], row["radii"]["pixels"] > needed_radii)
 
 
 def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_draws_find(linear):
-    rows = augment.success_by_radius(linear, [0.3, 0.05, 1.0, 0.1])  # scales of its radius
-    assert [row["radii"]["pixels"] for row in rows] == pytest.approx([0.0025, 0.005, 0.015, 0.05])
-    adversarial, random = (
-        torch.stack([row[method] for row in rows]) for method in ("adversarial", "random")
-    )
+    rows = augment.success_by_radius(linear, [0.3, 0.05, 1.0, 0.1])
+    radii = [row["radii"]["pixels"] for row in rows]
+    assert radii == pytest.approx([0.0025, 0.005, 0.015, 0.05])
+    adversarial = torch.stack([row["adversarial"] for row in rows])
+    random = torch.stack([row["random"] for row in rows])
     for success in (adversarial, random):
-        assert success.shape == (4, 3) and (success[1:] >= success[:-1]).all()
+        assert success.shape == (4, 3)
+        assert (success[1:] >= success[:-1]).all()
     assert (adversarial >= random).all()
 
 
-# ------------------------------------------------------------------------------------- transfer
+# --------------------------------------------------------------- transfer
 
 CLASSES = ("orange", "lime", "sky")
+TWO_VIEWS = {"views": 2, "backgrounds": [0.4]}
+BOTH = torch.arange(2)
 
 
 def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Classifier:
-    """The brightest channel of the mean color, whatever the order of the classes."""
-    order = [CLASSES.index(name) for name in classes]
-    return augment.Classifier(
-        lambda images: 30 * images.mean((2, 3))[:, order], size, classes, f"{classes[0]}{size}"
-    )
+    """Return a classifier by the brightest channel, with classes in any order."""
+    channels = [CLASSES.index(name) for name in classes]
+
+    def logits(images: Tensor) -> Tensor:
+        return 30 * images.mean((2, 3))[:, channels]
+
+    return augment.Classifier(logits, size, classes, f"{classes[0]}{size}")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def result(attacked) -> AttackResult:
-    """Of two views, each an example, before gray."""
-    found = attacked("lighting", {"views": 2, "backgrounds": [0.4]}, network(), max_steps=20)
+    """Return an attack on two views, each of which is an example."""
+    found = attacked("lighting", TWO_VIEWS, network(), max_steps=20)
     assert found.success.all()
     return found
 
 
 def confidence(logits: Tensor) -> list[list[float]]:
+    """Return the largest probability of each view of each example."""
     return [pytest.approx(views, abs=1e-4) for views in logits.softmax(2).amax(2).tolist()]
 
 
 @pytest.mark.parametrize("parameters", ["lighting", "lighting+geometry+albedo", "pixels"])
 def test_the_attacked_network_itself_predicts_the_same(attacked, parameters):
-    result = attacked(parameters, {"views": 2, "backgrounds": [0.4]}, network(), max_steps=20)
+    result = attacked(parameters, TWO_VIEWS, network(), max_steps=20)
     (row,) = augment.transfer(result, [network()])
     chosen = result.success
-    assert (
-        row["network"] == "orange12" and all(row["clean_correct"] + row["success"]) and chosen.any()
-    )
+    assert chosen.any()
+    assert row["network"] == "orange12"
+    assert all(row["clean_correct"])
+    assert all(row["success"])
     assert row["confidence_before"] == confidence(result.logits_before[chosen])
     assert row["confidence"] == confidence(result.logits[chosen])
 
 
-def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_classes(attacked):
-    result = attacked(
-        {"lighting": StepSettings(step_size=0.2)}, {"views": 2}, network(), "sky", max_steps=60
-    )
+@pytest.fixture(scope="module")
+def sky_attack(attacked) -> AttackResult:
+    """Return an attack on two views with the target sky."""
+    light = {"lighting": StepSettings(step_size=0.2)}
+    return attacked(light, {"views": 2}, network(), "sky", max_steps=60)
+
+
+def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_classes(sky_attack):
     other = network(("sky", "orange", "lime"), size=36)
-    (row,) = augment.transfer(result, [other])
-    assert row["predicted"] == [["sky"]] * 2 and all(row["clean_correct"] + row["success"])
-    scene = result.problem.scene
-    behind = scene.backgrounds[..., :1, :1].expand(-1, -1, 36, 36)
-    finer = scene.changed(settings=replace(scene.settings, size=36), backgrounds=behind)
-    images = finer.render(result.conditions, torch.arange(2))
+    (row,) = augment.transfer(sky_attack, [other])
+    assert row["predicted"] == [["sky"]] * 2
+    assert all(row["clean_correct"])
+    assert all(row["success"])
+    scene = sky_attack.problem.scene
+    backgrounds = scene.backgrounds[..., :1, :1].expand(-1, -1, 36, 36)
+    settings = replace(scene.settings, size=36)
+    finer = scene.changed(settings=settings, backgrounds=backgrounds)
+    images = finer.render(sky_attack.conditions, BOTH)
     assert row["confidence"] == confidence(other(images[:, 0])[:, None])
-    with pytest.raises(InputError, match="'sky' is not a class of the model"):
-        augment.transfer(result, [network(("orange", "lime"))])
 
 
-def test_other_azimuths_and_other_meshes_are_those_of_a_scene_with_them(result):
+def test_a_network_without_the_target_class_is_refused(sky_attack):
+    with pytest.raises(InputError, match="'sky'"):
+        augment.transfer(sky_attack, [network(("orange", "lime"))])
+
+
+def test_a_transfer_to_other_azimuths_is_to_a_scene_with_turned_cameras(result):
+    (row,) = augment.transfer(result, azimuths=[-30.0])
+    assert row["azimuth"] == "-30°"
     scene = result.problem.scene
-    apple = scene.changed(objects=augment.build_scene([("solid:apple", "lime")], 12).objects)
-    turned, other = augment.transfer(result, azimuths=[-30.0], objects=apple.objects)
-    assert (turned["azimuth"], other["mesh"]) == ("-30°", "solid:apple")
-    cameras = [
-        replace(row.cameras[0], azimuth=row.cameras[0].azimuth - 30) for row in scene.examples
-    ]
-    rows = [
-        replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)
-    ]
-    for row, shown in ((turned, scene.changed(examples=rows)), (other, apple)):
-        logits = network()(shown.render(result.conditions, torch.arange(2))[:, 0])[:, None]
-        assert row["confidence"] == confidence(logits)
-    assert not any(other["clean_correct"])  # a lime by its label, and none by its color
+    examples = []
+    for example in scene.examples:
+        [camera] = example.cameras
+        turned = replace(camera, azimuth=camera.azimuth - 30)
+        examples.append(replace(example, cameras=(turned,)))
+    images = scene.changed(examples=examples).render(result.conditions, BOTH)
+    assert row["confidence"] == confidence(network()(images[:, 0])[:, None])
 
 
-def test_only_clean_correct_examples_with_success_are_transferred(result):
-    before = result.logits_before.clone()
-    before[0] = -before[0]  # as if the first had been misclassified
-    (row,) = augment.transfer(replace(result, logits_before=before), [network()])
+def test_a_transfer_to_another_mesh_is_to_a_scene_with_it(result):
+    """The apple has the label lime, but not its color."""
+    objects = augment.build_scene([("solid:apple", "lime")], 12).objects
+    (row,) = augment.transfer(result, objects=objects)
+    assert row["mesh"] == "solid:apple"
+    images = result.problem.scene.changed(objects=objects).render(result.conditions, BOTH)
+    assert row["confidence"] == confidence(network()(images[:, 0])[:, None])
+    assert not any(row["clean_correct"])
+
+
+def test_only_clean_correct_examples_are_transferred(result):
+    logits_before = result.logits_before.clone()
+    logits_before[0] *= -1  # The first example becomes misclassified.
+    (row,) = augment.transfer(replace(result, logits_before=logits_before), [network()])
     assert row["confidence"] == confidence(result.logits[1:])
-    (none,) = augment.transfer(replace(result, logits_before=-result.logits_before), [network()])
-    assert none["confidence"] == none["success"] == []
+
+
+def test_nothing_is_transferred_if_every_example_was_misclassified(result):
+    misclassified = replace(result, logits_before=-result.logits_before)
+    (row,) = augment.transfer(misclassified, [network()])
+    assert row["confidence"] == []
+    assert row["success"] == []

@@ -28,11 +28,14 @@ def images() -> Tensor:
 
 
 def scene(label: str | int) -> augment.Scene:
+    """Build the scene of an orange under any label."""
     return augment.build_scene([("solid:orange", label)], SIZE)
 
 
-def light(steps: int = 2) -> augment.AttackSettings:
-    return augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=steps)
+def light() -> augment.AttackSettings:
+    """Return settings of an attack on light of two steps."""
+    lighting = augment.StepSettings(step_size=0.5)
+    return augment.AttackSettings(lighting=lighting, max_steps=2)
 
 
 def test_classes_without_names_are_indices(network):
@@ -58,10 +61,9 @@ def test_values_are_scaled_to_the_range_of_the_network(network, images):
 def test_a_plain_network_is_attacked_like_its_classifier(network):
     classifier = augment.Classifier(network, SIZE, CLASSES)
     expected = augment.attack(classifier, scene("orange"), settings=light(), force=True)
-    by_name = augment.attack(
-        network, scene("orange"), settings=light(), classes=CLASSES, force=True
-    )
-    by_index = augment.attack(network, scene(0), settings=light(), force=True)
+    options = {"settings": light(), "force": True}
+    by_name = augment.attack(network, scene("orange"), classes=CLASSES, **options)
+    by_index = augment.attack(network, scene(0), **options)
     for result in (by_name, by_index):
         assert torch.equal(result.images, expected.images)
         assert torch.equal(result.logits, expected.logits)

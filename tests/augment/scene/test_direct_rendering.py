@@ -1,3 +1,5 @@
+"""Images of changed light, shape, albedo and pixels are those of a scene built so."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -15,162 +17,208 @@ from renderer.settings import ENCODINGS
 from renderer.transport.operators import build_operators
 from renderer.visibility.rasterizers import choose
 
-EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+EPS = torch.finfo(torch.float64).eps
+EPS32 = torch.finfo(torch.float32).eps
 RASTERIZER = choose("numpy")
 EVERY = torch.arange(3)
-# Sums of 31 products below 1 in another order, and the slope of 12.92 of the sRGB curve near black.
+# Sums of 31 products below 1 are in another order, and the sRGB curve has a slope of 12.92.
 ROUNDING = 13 * 8 * EPS
 
 
-def own_lights(scene: Scene, seed: int = 0) -> Tensor:
-    """(E, 49, 3), a light for each example."""
-    draws = torch.Generator().manual_seed(seed)
-    return scene.lights + 0.01 * torch.randn(len(scene), 49, 3, generator=draws).to(scene.lights)
+def own_lights(scene: Scene) -> Tensor:
+    """Return a light (E, 49, 3) for each example."""
+    draws = torch.Generator().manual_seed(0)
+    offsets = torch.randn(len(scene), 49, 3, generator=draws)
+    return scene.lights + 0.01 * offsets.to(scene.lights)
+
+
+def images_of_operators(scene: Scene, lights: Tensor) -> Tensor:
+    """Render all views (E, V, 3, H, W) by the operator of each."""
+    item = scene.objects[0]
+    images = []
+    for row, cameras in enumerate(scene.cameras):
+        operators = build_operators(
+            item.mesh,
+            cameras,
+            scene.settings,
+            RASTERIZER,
+            albedo_scale=item.albedo_scale,
+            dtype=lights.dtype,
+        )
+        background = scene.backgrounds[row]
+        images.append(torch.stack([each.image(lights[row], background) for each in operators]))
+    return torch.stack(images)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(
-    ("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)]
-)
-def test_images_equal_the_operators_of_each_view(make_scene, dtype, rounding, encoding):
-    """In the dtype of the light. Unchanged vertices and albedo are shaded by code that operators do not use."""
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("unchanged", ["light alone", "vertices", "albedo"])
+def test_images_equal_the_operators_of_each_view(make_scene, dtype, encoding, unchanged):
+    """Given vertices and albedo are shaded by other code, even if they are unchanged."""
     scene = make_scene(dtype=dtype, encoding=encoding, albedo_scale=1.2)
-    lights, item = own_lights(scene), scene.objects[0]
-    still = (
-        {"vertices": scene.vertices.expand(3, -1, -1)},
-        {"albedo": torch.zeros(3, 20, 3, dtype=dtype)},
-    )
-    for change in ({}, *still):
-        images = scene.render(Conditions(lights, **change), EVERY)
-        assert images.shape == (3, 2, 3, 6, 6) and images.dtype == dtype
-        assert images.min() > 0 and images.max() < 1  # nothing clamps here
-        for shown, light, cameras, behind in zip(
-            images, lights, scene.cameras, scene.backgrounds, strict=True
-        ):
-            scale_and_dtype = {"albedo_scale": item.albedo_scale, "dtype": dtype}
-            operators = build_operators(
-                item.mesh, cameras, scene.settings, RASTERIZER, **scale_and_dtype
-            )
-            expected = torch.stack([operator.image(light, behind) for operator in operators])
-            torch.testing.assert_close(shown, expected, rtol=0, atol=rounding)
+    lights = own_lights(scene)
+    changes = {
+        "light alone": {},
+        "vertices": {"vertices": scene.vertices.expand(3, -1, -1)},
+        "albedo": {"albedo": torch.zeros(3, 20, 3, dtype=dtype)},
+    }
+    images = scene.render(Conditions(lights, **changes[unchanged]), EVERY)
+    assert images.shape == (3, 2, 3, 6, 6)
+    assert images.dtype == dtype
+    assert images.min() > 0
+    assert images.max() < 1
+    expected = images_of_operators(scene, lights)
+    rounding = ROUNDING / EPS * torch.finfo(dtype).eps
+    torch.testing.assert_close(images, expected, rtol=0, atol=rounding)
 
 
-@pytest.mark.parametrize("part", ["light", "vertices", "albedo", "pixels"])
-def test_examples_in_any_order_have_the_same_images(make_scene, part):
-    scene, draws = make_scene(), torch.Generator().manual_seed(1)
-    shape = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
-    change = (
-        {}
-        if part == "light"
-        else {part: 0.05 * torch.randn(3, *shape[part], generator=draws).double()}
-    )
+SHAPES = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
+
+
+@pytest.mark.parametrize("part", [None, *SHAPES])
+@pytest.mark.parametrize("examples", [[1], [2, 0], [0, 2, 2, 1, 0]])
+def test_examples_in_any_order_have_the_same_images(make_scene, part, examples):
+    scene = make_scene()
+    changes = {}
+    if part:
+        draws = torch.Generator().manual_seed(1)
+        changes[part] = 0.05 * torch.randn(3, *SHAPES[part], generator=draws).double()
     if part == "vertices":
-        change[part] += scene.vertices
-    conditions = Conditions(own_lights(scene), **change)
-    everything = scene.render(conditions, EVERY)
-    for examples in ([1], [2, 0], [0, 2, 2, 1, 0]):
-        chosen = torch.tensor(examples)
-        some = Conditions(
-            conditions.light[chosen], **{name: value[chosen] for name, value in change.items()}
-        )
-        torch.testing.assert_close(
-            scene.render(some, chosen), everything[chosen], rtol=0, atol=ROUNDING
-        )
+        changes[part] += scene.vertices
+    lights = own_lights(scene)
+    rows = torch.tensor(examples)
+    chosen = {name: value[rows] for name, value in changes.items()}
+    images = scene.render(Conditions(lights[rows], **chosen), rows)
+    expected = scene.render(Conditions(lights, **changes), EVERY)[rows]
+    torch.testing.assert_close(images, expected, rtol=0, atol=ROUNDING)
 
 
 def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
-    """Its outline too: half of the pixels change at least a little."""
-    scene, draws = make_scene(), np.random.default_rng(0)
-    moved = stone.vertices + 0.1 * draws.normal(size=(3, *stone.vertices.shape))
-    images = scene.render(Conditions(own_lights(scene), vertices=torch.from_numpy(moved)), EVERY)
+    """The outline moves too."""
+    scene = make_scene()
+    lights = own_lights(scene)
+    offsets = np.random.default_rng(0).normal(size=(3, *stone.vertices.shape))
+    moved = stone.vertices + 0.1 * offsets
+    images = scene.render(Conditions(lights, vertices=torch.from_numpy(moved)), EVERY)
     for row in range(3):
         other = make_scene(mesh=replace(stone, vertices=moved[row]))
-        expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
+        expected = other.render(Conditions(lights), EVERY)[row]
         torch.testing.assert_close(images[row], expected, rtol=0, atol=ROUNDING)
-    assert (
-        (images - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3
-    ).double().mean() > 0.3
+    is_changed = (images - scene.render(Conditions(lights), EVERY)).abs() > 1e-3
+    assert is_changed.double().mean() > 0.3
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, encoding):
-    """The linear albedo changes, whatever the encoding, and keeps to [0, 1]."""
+    """The linear albedo changes, whatever the encoding, and stays in [0, 1]."""
     scene = make_scene(encoding=encoding)
-    offset = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
-    images = scene.render(Conditions(own_lights(scene), albedo=offset), EVERY)
-    own = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
-    assert ((own + offset[:, :, None]) < 0).any()
+    lights = own_lights(scene)
+    draws = torch.Generator().manual_seed(0)
+    offsets = torch.rand(3, 20, 3, generator=draws).double() - 0.5
+    images = scene.render(Conditions(lights, albedo=offsets), EVERY)
+    linear = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
+    changed = linear + offsets[:, :, None]  # (3, 20, 3 corners, 3)
+    assert (changed < 0).any()
     for row in range(3):
-        color = encode((own + offset[row][:, None]).clamp(0, 1), encoding)
-        other = make_scene(
-            mesh=replace(stone, corner_colors=color.float().numpy()), encoding=encoding
-        )
-        expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
+        colors = encode(changed[row].clamp(0, 1), encoding).float().numpy()
+        other = make_scene(mesh=replace(stone, corner_colors=colors), encoding=encoding)
+        expected = other.render(Conditions(lights), EVERY)[row]
         # The color is stored in float32.
         torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
 
 
-def test_pixel_changes_are_added_last_and_clamped_and_keep_their_gradient(make_scene):
-    """At its bounds `torch.clamp` has none or half of a gradient, and an attack could not start there."""
-    backgrounds = torch.zeros(3, 3, 6, 6)
-    backgrounds[1:] = 1
-    scene = make_scene(backgrounds=backgrounds)
-    change = 2 * torch.rand(3, 2, 3, 6, 6, generator=torch.Generator().manual_seed(0)).double() - 1
-    pixels = torch.zeros_like(change, requires_grad=True)
-    images, changed = (
-        scene.render(Conditions(scene.lights, pixels=added), EVERY) for added in (pixels, change)
-    )
-    assert (
-        torch.equal(changed, (images + change).clamp(0, 1))
-        and (images == 0).any()
-        and (images == 1).any()
-    )
-    assert torch.equal(torch.autograd.grad(images.sum(), pixels)[0], torch.ones_like(pixels))
+@pytest.fixture
+def black_and_white(make_scene) -> Scene:
+    """Return a scene before one black and two white backgrounds."""
+    backgrounds = torch.ones(3, 3, 6, 6)
+    backgrounds[0] = 0
+    return make_scene(backgrounds=backgrounds)
 
 
-def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone):
-    sums = []
-    for color in (0.0, 0.5, 1.0):
-        colored = replace(stone, corner_colors=np.full_like(stone.corner_colors, color))
-        scene = make_scene(mesh=colored)
-        albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
-        images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
-        sums.append(torch.autograd.grad(images.sum(), albedo)[0])
-    torch.testing.assert_close(sums[0], sums[1], rtol=0, atol=ROUNDING)
-    torch.testing.assert_close(sums[2], sums[1], rtol=0, atol=ROUNDING)
+def test_pixel_changes_are_added_last_and_clamped(black_and_white):
+    draws = torch.Generator().manual_seed(0)
+    change = 2 * torch.rand(3, 2, 3, 6, 6, generator=draws).double() - 1
+    lights = black_and_white.lights
+    images = black_and_white.render(Conditions(lights), EVERY)
+    changed = black_and_white.render(Conditions(lights, pixels=change), EVERY)
+    assert torch.equal(changed, (images + change).clamp(0, 1))
 
 
-def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):
+def test_pixels_at_their_bounds_keep_their_gradient(black_and_white):
+    """At its bounds `torch.clamp` has none or half of a gradient, and no attack could start."""
+    pixels = torch.zeros(3, 2, 3, 6, 6, dtype=torch.float64, requires_grad=True)
+    images = black_and_white.render(Conditions(black_and_white.lights, pixels=pixels), EVERY)
+    assert (images == 0).any()
+    assert (images == 1).any()
+    (gradient,) = torch.autograd.grad(images.sum(), pixels)
+    assert torch.equal(gradient, torch.ones_like(pixels))
+
+
+def albedo_gradient(scene: Scene) -> Tensor:
+    """Return the gradient (3, 20, 3) of the sum of all images by the albedo."""
+    albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
+    images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
+    return torch.autograd.grad(images.sum(), albedo)[0]
+
+
+@pytest.mark.parametrize("bound", [0.0, 1.0])
+def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone, bound):
+    gradients = []
+    for gray in (bound, 0.5):
+        colors = np.full_like(stone.corner_colors, gray)
+        gradients.append(albedo_gradient(make_scene(mesh=replace(stone, corner_colors=colors))))
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("part", ["light", "vertices", "albedo"])
+def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
+    make_scene,
+    stone,
+    part,
+):
     scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
-    for part, value in (
-        ("light", scene.lights[0]),
-        ("vertices", scene.vertices[0]),
-        ("albedo", torch.zeros(20, 3).double()),
-    ):
-        values = value.expand(3, -1, -1).clone().requires_grad_(True)
-        images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
-        behind = scene.backgrounds[:, None].expand_as(images)
-        torch.testing.assert_close(images.detach(), behind, rtol=0, atol=0)
-        assert not torch.autograd.grad(images.sum(), values)[0].any()
+    starts = {
+        "light": scene.lights[0],
+        "vertices": scene.vertices[0],
+        "albedo": torch.zeros(20, 3).double(),
+    }
+    values = starts[part].expand(3, -1, -1).clone().requires_grad_(True)
+    images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
+    backgrounds = scene.backgrounds[:, None].expand_as(images)
+    assert torch.equal(images.detach(), backgrounds)
+    assert not torch.autograd.grad(images.sum(), values)[0].any()
+
+
+def cup_image(gray: float, added: float, shadows: bool) -> Tensor:
+    """Render a cup, which shades itself inside.
+
+    Args:
+        gray: Its color.
+        added: A change of its albedo.
+        shadows: Whether it shades itself.
+    """
+    cup = solid("cup")
+    mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
+    scene = augment.build_scene(
+        [(mesh, "cup")],
+        24,
+        1,
+        encoding="linear",
+        normals="flat",
+        rasterizer="numpy",
+        width=2.4,
+        polar=35.0,
+        shadows=shadows,
+        backgrounds=[0.0],
+    )
+    albedo = torch.full((1, len(mesh.faces), 3), added)
+    return scene.render(Conditions(scene.lights, albedo=albedo), torch.arange(1))
 
 
 def test_frozen_shadows_darken_with_the_color():
-    """A cup shades itself inside. Painted half as bright, it looks like a cup of that color."""
-    cup, images = solid("cup"), []
-    options = {
-        "encoding": "linear",
-        "normals": "flat",
-        "rasterizer": "numpy",
-        "width": 2.4,
-        "polar": 35.0,
-    }
-    for gray, added, shadows in ((0.6, -0.3, True), (0.3, 0.0, True), (0.3, 0.0, False)):
-        mesh = Mesh.plain(cup.vertices, cup.faces, (gray, gray, gray))
-        scene = augment.build_scene(
-            [(mesh, "cup")], 24, 1, **options, shadows=shadows, backgrounds=[0.0]
-        )
-        albedo = torch.full((1, len(mesh.faces), 3), added)
-        images.append(scene.render(Conditions(scene.lights, albedo=albedo), torch.arange(1)))
-    painted, expected, without_shadows = images
+    """A cup that is painted half as bright looks like a cup of that color."""
+    painted = cup_image(gray=0.6, added=-0.3, shadows=True)
+    expected = cup_image(gray=0.3, added=0.0, shadows=True)
+    without_shadows = cup_image(gray=0.3, added=0.0, shadows=False)
     assert (without_shadows - expected).abs().max() > 0.02
     torch.testing.assert_close(painted, expected, rtol=0, atol=1e-5)

@@ -1,4 +1,7 @@
+"""Tables and walls that have no triangles are lit and shadowed as meshes are."""
+
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -15,103 +18,182 @@ from renderer.light.presets import ambient, probe
 from renderer.settings import ImageSettings
 from renderer.transport.rays import Rays
 
-SIZE, FAR = 32, 1000.0
+SIZE = 32
+FAR = 1000.0
 BALL = normalize(renderer.solid("ball"))
-CAMERAS = (
-    PerspectiveCamera(63.0, 22.9, 3.0, 0.1, -0.2, distance=7.0),
-    OrthographicCamera(63.0, 22.9, 3.0, 0.1, -0.2),
-)
-LAMP = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
-SKY, NONE = probe("grace").double() / 5, torch.zeros(3).double()
+CAMERAS = {
+    "perspective": PerspectiveCamera(63.0, 22.9, 3.0, 0.1, -0.2, distance=7.0),
+    "parallel": OrthographicCamera(63.0, 22.9, 3.0, 0.1, -0.2),
+}
+each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 
 
 def square(middle: list[float], first: list[float], second: list[float]) -> Mesh:
-    corners = [
-        np.add(middle, 6 * (a * np.array(first) + b * np.array(second)))
-        for a, b in [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    ]
+    """Return a square with sides of length 12 along two unit vectors."""
+    x = 6 * np.array(first)
+    y = 6 * np.array(second)
+    corners = np.add(middle, [-x - y, x - y, x + y, y - x])
     return Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
-@pytest.mark.parametrize("surface", ["table", "wall"])
-def test_table_and_wall_are_lit_and_shadowed_as_meshes_are(camera, surface):
-    towards = [math.cos(math.radians(camera.azimuth)), math.sin(math.radians(camera.azimuth)), 0.0]
+@dataclass
+class Place:
+    """A table or a wall, as a room has it and as a mesh."""
+
+    height: float
+    """Of the table; -50 is out of sight."""
+    wall: float
+    """Distance of the wall behind the object; 50 is out of sight."""
+    mesh: Mesh
+
+
+def place(surface: str, camera: PerspectiveCamera | OrthographicCamera) -> Place:
+    """Return a table below the ball, or a wall behind it."""
+    azimuth = math.radians(camera.azimuth)
+    towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     aside = [-towards[1], towards[0], 0.0]
     if surface == "table":
-        height, wall, mesh = -1.0, 50.0, square([0, 0, -1], [1, 0, 0], [0, 1, 0])
-    else:
-        height, wall, mesh = -50.0, 1.5, square([-1.5 * x for x in towards], aside, [0, 0, 1])
-    options = {
-        "size": SIZE,
-        "samples": 3,
-        "normals": "flat",
-        "shadows": True,
-        "background": 0.0,
-        "rasterizer": "numpy",
-    }
-    even, camera = ambient(torch.full((3,), 0.2)), camera.seeing(9.0)
-    ball, flat = (renderer.render(part, camera, even, **options)[0, 0] for part in (BALL, mesh))
-    compared = (ball == 0) & (flat > 0.999 * flat.max())
-    lamp = [
-        (Lamps((tuple((FAR * LAMP).tolist()),), 1e5), torch.full((1, 3), 0.1 * FAR**2).double())
-    ]
-    both, image = concatenate([BALL, mesh]), ImageSettings(SIZE, samples=3)
-    around = tabletop.Room(Rays(BALL), 1.8, height, wall)
-    for light, lights, ours in [(SKY, [], (SKY, NONE)), (None, lamp, (0 * SKY, LAMP))]:
-        there = renderer.render(both, camera, light, lights=lights, **options)[0].double()
-        seen = tabletop.irradiance(around, camera, image, *ours) * (0.1 if lights else 1)
-        seen, expected = seen[:, compared], there[:, compared]
-        most, errors = expected.max(), (seen - expected).abs()
-        assert most < 1 and expected.min() < 0.6 * most  # a shadow is in sight
-        mean, typical = (
-            (0.01, 0.02) if lights else (0.02, 0.07)
-        )  # an edge; 48 directions, at every second pixel
-        assert errors.mean() < mean * most and errors.quantile(0.98) < typical * most
+        return Place(-1.0, 50.0, square([0, 0, -1], [1, 0, 0], [0, 1, 0]))
+    return Place(-50.0, 1.5, square(list(-1.5 * towards), aside, [0, 0, 1]))
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=["perspective", "parallel"])
+RENDERED = {
+    "size": SIZE,
+    "samples": 3,
+    "normals": "flat",
+    "shadows": True,
+    "background": 0.0,
+    "rasterizer": "numpy",
+}
+
+
+@dataclass
+class Comparison:
+    """The irradiance of a table or a wall by both ways, at the pixels that show it."""
+
+    found: torch.Tensor
+    expected: torch.Tensor
+
+    def require_close(self, mean: float, typical: float) -> None:
+        """Require a mean error and an error of 98 % of the pixels below these limits.
+
+        Args:
+            mean: Limit of the mean error, as a fraction of the largest irradiance.
+            typical: Limit of the errors of 98 % of the pixels, likewise.
+        """
+        largest = self.expected.max()
+        assert largest < 1
+        assert self.expected.min() < 0.6 * largest  # A shadow is in sight.
+        errors = (self.found - self.expected).abs()
+        assert errors.mean() < mean * largest
+        assert errors.quantile(0.98) < typical * largest
+
+
+def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -> Comparison:
+    """Compute the irradiance of a surface behind or below a ball.
+
+    Args:
+        surface: "table" or "wall".
+        camera: The camera.
+        sky: Light of the mesh's scene.
+        lamps: Local lights of the mesh's scene.
+        light: Sky and direction of the room's light.
+        scale: Factor of the room's irradiance.
+    """
+    placed = place(surface, camera)
+    camera = camera.seeing(9.0)
+    even = ambient(torch.full((3,), 0.2))
+    ball = renderer.render(BALL, camera, even, **RENDERED)[0, 0]
+    flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0, 0]
+    is_surface = (ball == 0) & (flat > 0.999 * flat.max())
+    both = concatenate([BALL, placed.mesh])
+    expected = renderer.render(both, camera, sky, lights=list(lamps), **RENDERED)[0].double()
+    around = tabletop.Room(Rays(BALL), 1.8, placed.height, placed.wall)
+    image = ImageSettings(SIZE, samples=3)
+    found = scale * tabletop.irradiance(around, camera, image, *light)
+    return Comparison(found[:, is_surface], expected[:, is_surface])
+
+
+@each_camera
+@pytest.mark.parametrize("surface", ["table", "wall"])
+def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(camera, surface):
+    """The room has 48 directions of the sky, at every second pixel."""
+    sky = probe("grace").double() / 5
+    no_direction = torch.zeros(3).double()
+    compared = compare(surface, camera, sky=sky, light=(sky, no_direction))
+    compared.require_close(mean=0.02, typical=0.07)
+
+
+@each_camera
+@pytest.mark.parametrize("surface", ["table", "wall"])
+def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(camera, surface):
+    """Only the edge of the shadow differs."""
+    direction = torch.nn.functional.normalize(torch.tensor([0.5, 0.1, 0.8]).double(), dim=0)
+    position = tuple((FAR * direction).tolist())
+    power = torch.full((1, 3), 0.1 * FAR**2).double()
+    compared = compare(
+        surface,
+        camera,
+        lamps=[(Lamps((position,), 1e5), power)],
+        light=(torch.zeros(49, 3).double(), direction),
+        scale=0.1,
+    )
+    compared.require_close(mean=0.01, typical=0.02)
+
+
+@each_camera
 def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera):
-    """In closed form: with the height of the unit sphere or of the table there, the camera sees the pixel's middle."""
-    ball, image = Mesh.plain(*sphere(5)), ImageSettings(SIZE)
+    """The camera sees the middle of the pixel at the height of the unit sphere or the table."""
+    ball = Mesh.plain(*sphere(5))
     around = tabletop.Room(Rays(ball), 1.0, -1.0, 50.0)
-    placed = tabletop.project_along_light(
-        around, ball, camera, image, torch.tensor([0.0, 0.0, 1.0]).double()
-    )
-    y, x = np.array([1, -1])[:, None, None] * placed.numpy() * camera.width / 2
-    bulge = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
-    on_ball = (
-        renderer.render(ball, camera, ambient(torch.ones(3)), SIZE, 0.0, samples=1)[0, 0].numpy()
-        > 0
-    )
+    down = torch.tensor([0.0, 0.0, 1.0]).double()
+    placed = tabletop.project_along_light(around, ball, camera, ImageSettings(SIZE), down).numpy()
+    y = placed[0] * camera.width / 2
+    x = -placed[1] * camera.width / 2
+
     middles = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
-    pixels, off = np.stack(np.meshgrid(middles, -middles), axis=-1), []
-    for height in (bulge, -bulge, np.full_like(x, -1.0)):
-        seen = camera.project(np.stack([x, y, height], axis=-1).reshape(-1, 3))[:, :2].reshape(
-            SIZE, SIZE, 2
-        )
-        off.append(np.abs(seen - pixels).max(axis=-1))
-    assert 0.2 < on_ball.mean() < 0.8 and off[2][~on_ball].max() < 1e-6
-    assert (
-        np.minimum(off[0], off[1])[on_ball].max() < 0.5 / SIZE
-    )  # a quarter of a pixel: the sphere has faces
+    pixels = np.stack(np.meshgrid(middles, -middles), axis=-1)
+
+    def distance_to_pixel(height: np.ndarray) -> np.ndarray:
+        """Return how far from its pixel (H, W) each point is seen."""
+        points = np.stack([x, y, height], axis=-1).reshape(-1, 3)
+        seen = camera.project(points)[:, :2].reshape(SIZE, SIZE, 2)
+        return np.abs(seen - pixels).max(axis=-1)
+
+    even = ambient(torch.ones(3))
+    shown = renderer.render(ball, camera, even, SIZE, 0.0, samples=1)[0, 0].numpy()
+    is_ball = shown > 0
+    assert 0.2 < is_ball.mean() < 0.8
+    on_table = distance_to_pixel(np.full_like(x, -1.0))
+    assert on_table[~is_ball].max() < 1e-6
+    bulge = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
+    on_ball = np.minimum(distance_to_pixel(bulge), distance_to_pixel(-bulge))
+    # The sphere has faces, so that points are off by up to a quarter of a pixel.
+    assert on_ball[is_ball].max() < 0.5 / SIZE
 
 
-def test_an_even_sky_stays_even_on_a_white_table_and_loses_its_lower_half_on_a_black_one():
-    """White reflects what it gets. In closed form, a surface tilted by an angle gets (1 + cos) / 2 of the sky."""
-    light, tilts = ambient(torch.ones(3)).double(), torch.tensor([0.0, 0.5, 1.5, 2.5, 3.1]).double()
-    normals = torch.stack([tilts.sin(), 0 * tilts, tilts.cos()], dim=1)
-    white, black = tabletop.above_table(
-        light.expand(2, -1, -1), torch.zeros(2, 3), torch.tensor([1.0, 0.0])[:, None].expand(2, 3)
-    )
-    for lights, expected in [
-        (white, 0 * tilts + math.pi),
-        (black, math.pi * (1 + tilts.cos()) / 2),
-    ]:
-        arriving = HARMONICS.irradiance(normals) @ lights[HARMONICS.nonzero]
-        torch.testing.assert_close(arriving, expected[:, None].expand(-1, 3), rtol=0, atol=0.03)
-    lit = tabletop.above_table(
-        0 * light[None], torch.tensor([[0.6, 0.0, 0.8]]), torch.full((1, 3), 0.5)
-    )[0]
-    down = HARMONICS.irradiance(torch.tensor([[0.0, 0.0, -1.0]]).double()) @ lit[HARMONICS.nonzero]
-    torch.testing.assert_close(down, torch.full((1, 3), 0.5 * 0.8).double(), rtol=0, atol=0.01)
+TILTS = torch.tensor([0.0, 0.5, 1.5, 2.5, 3.1]).double()
+
+
+@pytest.mark.parametrize(
+    ("albedo", "expected"),
+    [(1.0, math.pi * torch.ones_like(TILTS)), (0.0, math.pi * (1 + TILTS.cos()) / 2)],
+    ids=["white", "black"],
+)
+def test_an_even_sky_above_a_table_lights_tilted_surfaces_as_in_closed_form(albedo, expected):
+    """A surface tilted by an angle sees (1 + cos) / 2 of the sky. White reflects all it gets."""
+    sky = ambient(torch.ones(3)).double()[None]
+    light = tabletop.above_table(sky, torch.zeros(1, 3), torch.full((1, 3), albedo))[0]
+    normals = torch.stack([TILTS.sin(), torch.zeros_like(TILTS), TILTS.cos()], dim=1)
+    irradiance = HARMONICS.irradiance(normals) @ light[HARMONICS.nonzero]
+    torch.testing.assert_close(irradiance, expected[:, None].expand(-1, 3), rtol=0, atol=0.03)
+
+
+def test_a_table_reflects_directional_light_by_its_albedo_and_the_cosine():
+    no_sky = torch.zeros(1, 49, 3).double()
+    direction = torch.tensor([[0.6, 0.0, 0.8]])
+    light = tabletop.above_table(no_sky, direction, torch.full((1, 3), 0.5))[0]
+    down = torch.tensor([[0.0, 0.0, -1.0]]).double()
+    irradiance = HARMONICS.irradiance(down) @ light[HARMONICS.nonzero]
+    expected = torch.full((1, 3), 0.5 * 0.8).double()
+    torch.testing.assert_close(irradiance, expected, rtol=0, atol=0.01)
