@@ -83,12 +83,12 @@ def without_jpeg(monkeypatch) -> None:
 
 
 def test_exposures_change_by_up_to_the_number_of_stops(without_jpeg):
-    images = 0.25 + 0.5 * random_images(8, 3, 32, 32)
+    images = 0.25 + 0.4 * random_images(64, 3, 8, 8)
     _, (_, brighter) = transformed(images, exposure=0.5)
     stops = (brighter.mean((1, 2, 3)) / images.mean((1, 2, 3))).log2()
-    assert stops.abs().max() < 0.52
-    assert stops.min() < -0.1
-    assert stops.max() > 0.1
+    assert stops.abs().max() < 0.51
+    assert stops.min() < -0.4
+    assert stops.max() > 0.4
 
 
 def test_noise_has_its_standard_deviation(without_jpeg):
@@ -123,7 +123,7 @@ SMALL_STEPS = augment.StepSettings(step_size=0.02)
 
 @pytest.mark.parametrize("margin", [0.0, 2.0])
 @pytest.mark.parametrize("quantized", [False, True])
-def test_an_attack_stops_when_the_images_exceed_the_margin(attacked, by_color, rounded, margin):
+def test_an_attack_stops_when_the_images_exceed_the_margin(attacked, by_color, quantized, margin):
     result = attacked(
         {"lighting": SMALL_STEPS},
         {"views": 2, "shared": True},
@@ -132,7 +132,7 @@ def test_an_attack_stops_when_the_images_exceed_the_margin(attacked, by_color, r
         quantized=quantized,
     )
     images = result.images
-    if rounded:
+    if quantized:
         images = (images * 255).round() / 255
     logits = by_color(images[0])[None]
     torch.testing.assert_close(result.logits, logits, rtol=0, atol=1e-4)

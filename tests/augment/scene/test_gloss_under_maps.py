@@ -212,7 +212,7 @@ def two_lamps(tmp_path_factory) -> Path:
     """Write a map of two lamps, 3,000 times as bright as the dim room around them."""
     directions = equirectangular(64, 128)[0]
     room = 1 + 0.5 * directions[..., 2:]
-    radiance = tabletop.expand(-1, -1, 3)
+    radiance = room.expand(-1, -1, 3)
     color = torch.tensor([1.0, 0.8, 0.6])
     for axis, width in (((0.6, 0.0, 0.8), 0.02), ((-0.6, 0.64, 0.48), 0.01)):
         off_axis = 1 - directions @ torch.tensor(axis, dtype=torch.float64)
