@@ -398,7 +398,8 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     options = parser.parse_args(arguments)
     if options.device != "cpu" and not torch.cuda.is_available():
         parser.error(
-            "torch finds no GPU here, which this benchmark needs: --device cpu rehearses what needs none"
+            "torch finds no GPU here, which this benchmark needs: "
+            "--device cpu rehearses what needs none"
         )
     return record(answers(options.questions, options.device), options.out, options.device)
 

@@ -138,7 +138,7 @@ class ByHand:
         reaching = light.index_select(0, self.coefficients).mT
         values = (reaching @ self.transfer).mul_(self.albedo).add_(self.background_part)
         clamped = values.clamp(0, 1)
-        # In-place operations reuse the memory of the values.
+        # Operations in place reuse the memory of the values.
         is_unclamped = values.eq_(clamped)
         image = self.empty_image.clone().scatter_(1, self.pixels_of_channels, clamped)
         image = image.view(self.shape)

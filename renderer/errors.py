@@ -131,7 +131,8 @@ def as_device(device: torch.device | str) -> torch.device:
     except (RuntimeError, AssertionError, TypeError) as error:
         # torch without CUDA raises AssertionError.
         raise InputError(
-            f"device={_short(device)} is not available here: use cpu, or cuda on a machine with a GPU",
+            f"device={_short(device)} is not available here: "
+            "use cpu, or cuda on a machine with a GPU",
             "device",
         ) from error
 
@@ -228,7 +229,8 @@ def require_bounded(**tensors: Tensor) -> None:
         # The comparison is False for NaN.
         if not _largest_magnitude(tensor) <= MAX_MAGNITUDE:
             raise InputError(
-                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}: give finite values",
+                f"{name} holds NaN, infinity or magnitudes beyond {MAX_MAGNITUDE:g}: "
+                "give finite values",
                 name,
             )
 

@@ -322,7 +322,8 @@ def fit_scene(
     if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
         raise InputError(
-            f"photograph and mask of shapes {given} do not fit: give (3, size, size) and (size, size)"
+            f"photograph and mask of shapes {given} do not fit: "
+            "give (3, size, size) and (size, size)"
         )
     covered = float(mask.sum())
     if covered < MIN_COVERED_PIXELS:

@@ -41,7 +41,7 @@ def attach(
             return version("parametric-norm-balls")
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        # As `from module import name` does, where the name may be a module, too.
+        # The name may be a module, too, as in `from module import name`.
         return getattr(__import__(modules[name], fromlist=[name]), name)
 
     return get_attribute, lambda: names, names

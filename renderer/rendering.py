@@ -1,4 +1,8 @@
-"""Meshes to images in one call: `render`, differentiable, and `precompute_transfer` for images under many lights."""
+"""Images of meshes in one call.
+
+`render` returns differentiable images. `precompute_transfer` returns operators,
+which give images under many lights.
+"""
 
 from __future__ import annotations
 
@@ -179,7 +183,7 @@ def render(
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Return a local light with coefficients (size, 3), which by default are white of full power."""
+    """Return a local light with its coefficients (size, 3): by default white, at full power."""
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
         raise InputError(f"lights holds {describe(pair)}: give {_LOCAL_LIGHTS}")
@@ -210,15 +214,38 @@ def precompute_transfer(
     bounces: int = 0,
     rasterizer: str = "auto",
 ) -> TransferOperators:
-    """One operator per camera: images and gradients under any number of lights, without rasterizing again.
+    """Compute a transfer operator for each camera.
 
-    `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there. The operators are
-    a sequence whose own method `image` renders all views in one call.
+    An operator gives images, and their gradients by the light, without rasterizing
+    again. `operator.image(light, background)` equals the image of `render` up to
+    rounding.
 
-    >>> operators = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(2, 2.2), size=16)
-    >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
-    >>> operators[0].image(lights).shape, operators.image(lights).shape
-    (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
+    Args:
+        mesh: The mesh.
+        cameras: One camera or several.
+        size: Width and height of the images in pixels.
+        albedo_scale: Factor of the albedo.
+        gloss: Gloss instead of the mesh's.
+        samples: Samples per side of a pixel.
+        encoding: Encoding of the image values, "linear" or "srgb".
+        normals: "smooth" for interpolated normals, "flat" for a normal per face.
+        shadows: Whether the mesh casts shadows of environment light on itself.
+        bounces: Number of bounces of light between the surfaces of the mesh, which
+            include shadows.
+        rasterizer: "auto", "opengl", "numba" or "numpy".
+
+    Returns:
+        The operators, a sequence. Its method `image` renders all views in one call.
+
+    Raises:
+        InputError: If an argument is out of range, or if there is no camera.
+
+    Example:
+        >>> cameras = renderer.orbit_cameras(2, 2.2)
+        >>> operators = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
+        >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
+        >>> operators[0].image(lights).shape, operators.image(lights).shape
+        (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     require_mesh("mesh", mesh)
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
@@ -310,18 +337,20 @@ def _as_albedo(albedo: object) -> Tensor:
     if values.numel() and not (values.min() >= 0 and values.max() <= WHITE):
         extremes = f"{values.min().item():g} to {values.max().item():g}"
         raise InputError(
-            f"albedo holds values from {extremes}: give 0 to 1, and albedo_scale for brighter surfaces"
+            f"albedo holds values from {extremes}: "
+            "give 0 to 1, and albedo_scale for brighter surfaces"
         )
     return values
 
 
 def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
-    """(S, 3) linear albedo at a view's samples."""
+    """Return the linear albedo (S, 3) at the samples of a view."""
     if albedo is None:
         return surface_albedo(mesh, view, encoding)
     if albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
     if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
         return surface_albedo(mesh, view, encoding, [albedo])
-    advice = f"give {tuple(mesh.faces.shape)}, a color per face, or (H, W, 3) for a mesh that has one texture"
+    per_face = tuple(mesh.faces.shape)
+    advice = f"give {per_face}, a color per face, or (H, W, 3) for a mesh that has one texture"
     raise InputError(f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: {advice}")

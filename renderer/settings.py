@@ -44,7 +44,7 @@ MAX_DEGREE = 40  # spherical-harmonic degree of lighting, enough for reflections
 MIN_ROUGHNESS = 0.2  # below it, lighting of degree 40 is too smooth for the highlights
 MAX_VIEWS = 10**5
 MAX_VERTICES = 10**7  # some 5 GB
-TURBIDITY = (2.0, 10.0)  # of the air, from clear to hazy; pure air would have 1
+TURBIDITY = (2.0, 10.0)  # range of the haze of the air, from clear to hazy (pure air has 1)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The radiance of one view of a shape: everything that its samples are shaded with, composed in one place."""
+"""Radiance of one view of a shape, with everything that its samples are shaded with."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class ShadedView:
         return PixelRadiance(self.fragments.pixels, coverage, shade)
 
     def _shade_environment(self, fragments: Fragments) -> Iterator[Tensor]:
-        """Yield the radiance (3, P) in environment light of the samples in the pixels of fragments."""
+        """Yield the radiance (3, P) of pixels of fragments in environment light."""
         environment = self.light.environment
         if environment is None:
             return
@@ -129,7 +129,7 @@ class ShadedView:
             yield self.indirect(self.albedo, environment)
 
     def _shade_lamps(self, fragments: Fragments) -> Iterator[Tensor]:
-        """Yield the radiance (3, P) in each local light of the samples in the pixels of fragments."""
+        """Yield the radiance (3, P) of pixels of fragments in each local light."""
         for basis, coefficients in self.light.local_lights:
             yield self._view_of_lamps.radiance(
                 basis, self.albedo, coefficients, self.lamp_positions, fragments
@@ -142,9 +142,9 @@ class ShadedView:
         return reduce(torch.add, parts)
 
     def _with_outlines(self, camera: Camera, background: Tensor) -> PixelRadiance:
-        """Compute radiance that is differentiable in outlines (see `renderer.visibility.silhouettes`).
+        """Compute radiance that is differentiable in outlines.
 
-        What shadows and bounces add to a pixel is divided among its samples by
+        See `renderer.visibility.silhouettes`. What shadows and bounces add to a pixel is divided among its samples by
         albedo, where outlines move. The background is linear, (3, size²).
         """
         fragments = self.fragments
@@ -171,12 +171,12 @@ class ShadedView:
 
     @cached_property
     def _faces(self) -> Tensor:
-        """Faces (F, 3) of the mesh, on the device of the vertices."""
+        """Vertex indices of the faces (F, 3), on the device of the vertices."""
         return torch.from_numpy(self.mesh.faces).to(self.vertices.device)
 
     @cached_property
     def _normals(self) -> Tensor | None:
-        """Normals (V, 3) to interpolate, None for a normal per face."""
+        """Normals (V, 3) to interpolate, or None for a normal per face."""
         if self.settings.normals == "flat":
             return None
         if self.vertex_normals is not None:
@@ -185,12 +185,12 @@ class ShadedView:
 
     @cached_property
     def _sample_gloss(self) -> SampleGloss | None:
-        """The gloss at the samples, None for a matte shape."""
+        """Gloss at the samples, or None for a matte shape."""
         return sample_gloss(self.mesh, self.fragments, self.gloss)
 
     @cached_property
     def _view_of_lamps(self) -> LocalLightView:
-        """The view in local light, made where none was given."""
+        """View in local light, which is made if none was given."""
         if self.lamp_view is not None:
             return self.lamp_view
         assert self.rays is not None

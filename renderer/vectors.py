@@ -26,7 +26,7 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """
     largest = vectors.abs().amax(0)
     scaled = vectors / largest.masked_fill(largest == 0, 1)
-    # At least 1, unless the vector is zero.
+    # The norm is at least 1, unless the vector is zero.
     norm = scaled.square().sum(0).sqrt()
     return scaled / norm.clamp(min=1), norm * largest
 

@@ -357,7 +357,8 @@ def clean_correct_views(
         if len(correct) < MIN_CORRECT_FRACTION * drawn_count - BATCH_SIZE:
             images_text = f"{len(correct)} of {drawn_count} images of {subject.name}"
             raise InputError(
-                f"{classifier.name} classifies only {images_text} correctly. Choose another mesh, label or classifier."
+                f"{classifier.name} classifies only {images_text} correctly. "
+                "Choose another mesh, label or classifier."
             )
     return correct[:count]
 

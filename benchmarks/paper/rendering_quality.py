@@ -55,11 +55,12 @@ def measure_confidences(
     correct_count = 0
     while correct_count < renders:
         made_count = len(rows) * len(common.GRAYS)
-        # At least 5,000 renders are made before the search is given up.
+        # The search makes at least 5,000 renders before it gives up.
         if made_count > max(100, renders) / common.MIN_CORRECT_FRACTION:
             counts = f"{correct_count} of {made_count} renders of {subject.name}"
             raise InputError(
-                f"{classifier.name} classifies only {counts} correctly. Choose another mesh, label or classifier."
+                f"{classifier.name} classifies only {counts} correctly. "
+                "Choose another mesh, label or classifier."
             )
         azimuth = 360 * float(torch.rand((), generator=draws))
         width = common.WIDTHS[len(rows) % len(common.WIDTHS)]

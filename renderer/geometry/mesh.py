@@ -113,7 +113,8 @@ class Mesh:
         object.__setattr__(self, "gloss_textures", factors)
         if self.texture_ids.max() >= len(self.textures):
             raise InputError(
-                f"texture_ids name textures that are not there: give indices below {len(self.textures)}"
+                "texture_ids name textures that are not there: "
+                f"give indices below {len(self.textures)}"
             )
 
     def _require_shapes(self) -> None:

@@ -86,7 +86,7 @@ def orange(rng: np.random.Generator) -> Mesh:
 
 
 def apple(rng: np.random.Generator) -> Mesh:
-    """Create an apple: broad, with a dimple at both ends, a stalk, and red streaks on yellow or green."""
+    """Create an apple with a dimple at both ends, a stalk, and red streaks on yellow or green."""
     latitude = np.linspace(-np.pi / 2, 0.49 * np.pi, 40)
     radius = np.cos(latitude) * (1 + rng.uniform(0.1, 0.16) * np.sin(latitude))
     height = rng.uniform(0.85, 0.95) * np.sin(latitude)
@@ -354,7 +354,7 @@ def fruit(rng: np.random.Generator) -> Mesh:
 
 
 def _random_shade(rng: np.random.Generator, hue: float) -> np.ndarray:
-    """Draw saturation and value of a color, RGB (3,). The hue is clipped to that of made-up fruit."""
+    """Draw a color, RGB (3,), by its saturation and value. Its hue is clipped to that of fruit."""
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
     value = rng.uniform(0.3, 0.95)

@@ -103,7 +103,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     # The nodes of a scene may move vertices out of range. NaN fails the comparison.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
         raise InputError(
-            f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: export it again"
+            f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: "
+            "export it again"
         )
     if not mesh.face_areas().sum() > 0:
         raise InputError(
@@ -368,7 +369,8 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
     for texture in used_textures:
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
             raise ValueError(
-                "a texture has a second set of coordinates or is transformed, which is not supported"
+                "a texture has a second set of coordinates or is transformed, "
+                "which is not supported"
             )
     return bool(color_textures)
 

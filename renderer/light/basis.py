@@ -1,7 +1,11 @@
-"""Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators.
+"""Bases of light: functions whose weighted sums are the lights of one kind.
 
-Environment light has one basis, `Harmonics`. Lights within the scene are frozen dataclasses of `LocalBasis`, a module
-each: see light/lamps.py and light/projector.py, and CONTRIBUTING.md for a new one.
+The weights are the coefficients of a light. If its position is fixed, an image
+is linear in them, so that operators can be computed for each basis.
+
+Environment light has one basis, `Harmonics`. Each kind of light within the scene
+is a subclass of `LocalBasis` in a module of its own, such as light/lamps.py and
+light/projector.py. CONTRIBUTING.md describes how to add one.
 """
 
 from __future__ import annotations
@@ -53,26 +57,26 @@ class LocalPart(NamedTuple):
 
 
 class Basis(ABC):
-    """Functions that any light of one kind is a sum of, with RGB coefficients of shape (size, 3)."""
+    """Functions whose sums, weighted with RGB coefficients (size, 3), are lights of one kind."""
 
     @property
     @abstractmethod
     def size(self) -> int:
-        """How many functions there are."""
+        """Number of functions."""
 
     @property
     def environment(self) -> EnvironmentPart | None:
-        """The environment light, None without one."""
+        """Environment light of this basis, or None."""
         return None
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        """The lights within the scene, in the order of their coefficients."""
+        """Lights within the scene, in the order of their coefficients."""
         return []
 
     @property
     def movable_light(self) -> LocalPart | None:
-        """The first of the lights within the scene that can be moved, None without one."""
+        """First light within the scene that can be moved, or None."""
         return next((part for part in self.local_lights if part.basis.is_movable), None)
 
     @abstractmethod
@@ -84,17 +88,29 @@ class Basis(ABC):
         return self
 
     def picture(self, coefficients: Tensor) -> Tensor | None:
-        """Return coefficients (size, 3) as an image (H, W, 3) of values in [0, 1], if they are one."""
+        """Return the image (H, W, 3) in [0, 1] that coefficients (size, 3) show, or None."""
         return None
 
 
 @dataclass(frozen=True)
 class Harmonics(Basis):
-    """Environment light as real spherical harmonics: from infinitely far away, the same at each point of a scene.
+    """Environment light as a sum of real spherical harmonics.
 
-    `size` functions, of which a light has a coefficient (size, 3) each, RGB. name: in files and messages.
-    allow_negative: any coefficients render, negative radiance included (the paper's), though only light exists whose
-    radiance is nowhere negative. InputError: a degree beyond 40.
+    The light comes from infinitely far away, so it is the same at each point of a
+    scene. The number of functions is (degree + 1)².
+
+    Attributes:
+        degree: Degree of the harmonics, from 0 to 40.
+        name: Name of this kind of light in files and messages.
+        allow_negative: True, because coefficients with negative radiance are
+            rendered, too, as in the paper. Such a light does not exist.
+
+    Raises:
+        InputError: If the degree is out of range.
+
+    Example:
+        >>> Harmonics(degree=2).size
+        9
     """
 
     degree: int = 6
@@ -119,48 +135,85 @@ class Harmonics(Basis):
 
     @property
     def nonzero(self) -> Tensor:
-        """(K,) ascending indices of the functions that reach a diffuse surface under an open sky."""
+        """Ascending indices (K,) of the functions that a diffuse surface under an open sky reflects."""
         return nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Tensor) -> Tensor:
-        """(N, K) at unit normals (N, 3), per unit of each nonzero coefficient."""
+        """Compute the irradiance of surfaces per unit of each coefficient in `nonzero`.
+
+        Args:
+            normals: Unit normals of the surfaces, shape (N, 3).
+
+        Returns:
+            The irradiance, shape (N, K).
+
+        Raises:
+            InputError: If a normal is not finite.
+        """
         require_finite(normals=normals)
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
         rows = select_rows(unit(normals.double().T), self.nonzero.tolist())
         by_function = torch.stack(rows).to(normals.dtype) * factors[:, None]
-        return (
-            by_function.T.contiguous()
-        )  # Transposed last, since rows are what a processor fills fastest.
+        # A processor fills rows fastest, so that the matrix is transposed last.
+        return by_function.T.contiguous()
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """(N, size) from unit directions (N, 3), per unit of each coefficient."""
+        """Compute the radiance (N, size) from unit directions (N, 3) per unit of each coefficient."""
         return basis(directions, self.degree)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Coefficients (..., size, 3) of light that can be emitted, of the same mean and the most alike irradiance."""
-        from renderer.light.nonnegative import (
-            project_nonnegative,  # scipy's optimizers take long to import
-        )
+        """Project coefficients to light without negative radiance and with the same mean.
+
+        Of such lights, the result has the most similar irradiance.
+
+        Args:
+            coefficients: Coefficients, shape (..., size, 3).
+
+        Returns:
+            Coefficients, shape (..., size, 3).
+        """
+        # The import of the optimizers of SciPy takes long.
+        from renderer.light.nonnegative import project_nonnegative
 
         return project_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """The nearest coefficients (..., size, 3) of light that can be emitted, whose mean may be another.
-        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted."""
+        """Find the nearest coefficients of light without negative radiance.
+
+        The mean radiance may change.
+
+        Args:
+            coefficients: Coefficients, shape (..., size, 3), or (A, size, 3) if
+                `within` is given.
+            within: Ball in which the result lies. Its centers must have no
+                negative radiance.
+
+        Returns:
+            Coefficients of the same shape.
+        """
         from renderer.light.nonnegative import nearest_nonnegative
 
         return nearest_nonnegative(coefficients, within)
 
 
 HARMONICS = Harmonics()
-DEGREE = HARMONICS.degree  # of environment light, unless a degree is given
-COEFFICIENTS = HARMONICS.size  # of environment light of that degree
+# Degree and number of coefficients of environment light by default.
+DEGREE = HARMONICS.degree
+COEFFICIENTS = HARMONICS.size
 
 
 class LightPaths(NamedTuple):
-    """E connections from lights to surface points. point, function: (E,) int64, the surface point and the function of
-    the basis. source: (E, 3), where the light starts. irradiance: (E,) per unit of the function's coefficient,
-    differentiable in the points and normals; which connections there are is fixed."""
+    """Straight paths of light from local lights to surface points.
+
+    Attributes:
+        point: Index of the surface point at the end of each path, int64, shape (E,).
+        function: Index of the function of the basis that each path belongs to,
+            int64, shape (E,).
+        source: Position at which each path starts, shape (E, 3).
+        irradiance: Irradiance per unit of the function's coefficient, shape (E,).
+            It is differentiable in the points and normals. The choice of paths
+            is not.
+    """
 
     point: Tensor
     function: Tensor
@@ -249,7 +302,7 @@ class LocalBasis(Basis):
         return self.nearest_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """Same as `Harmonics.nearest_nonnegative`."""
+        """Find the nearest coefficients from 0 to `power`, as `Harmonics.nearest_nonnegative`."""
         return nearest_in_box(coefficients, 0, self.power, within)
 
 
@@ -338,7 +391,7 @@ class SplitLight(NamedTuple):
 
     @property
     def basis(self) -> SumBasis:
-        """The basis of all lights, that of the environment light first."""
+        """Basis of all lights, with that of the environment light first."""
         environment = [] if self.environment is None else [Harmonics(degree_of(self.environment))]
         return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
 

@@ -161,7 +161,8 @@ def read_panorama(path: str | Path) -> Tensor:
     minimum = radiance.min()
     if minimum < -NEGATIVE * radiance.max():
         raise InputError(
-            f"environment map {path} has negative radiance, down to {minimum:.3g}: clip the map at 0 and save it again"
+            f"environment map {path} has negative radiance, down to {minimum:.3g}: "
+            "clip the map at 0 and save it again"
         )
     return radiance.clamp(min=0)
 

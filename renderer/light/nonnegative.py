@@ -109,8 +109,8 @@ class _NodeLimits:
 
 
 _ALL_CANDIDATES = _NodeLimits(above_zero=0.04, above_neighbors=1e-3)
-# Only nodes that are lower than all neighbors are candidates with these limits. This
-# is faster, and may miss dips, which the next exchange step finds.
+# With these limits, a candidate must be lower than all its neighbors. This is
+# faster, and may miss dips, which the next exchange step finds.
 _LOWEST_NODES = _NodeLimits(above_zero=0.04, above_neighbors=0.0)
 
 

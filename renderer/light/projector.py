@@ -85,7 +85,7 @@ class Projector(LocalBasis):
         return self.pixels**2
 
     def picture(self, coefficients: Tensor) -> Tensor:
-        """Return coefficients (size, 3) as an image (pixels, pixels, 3), in which 1 is the power."""
+        """Return coefficients (size, 3) as an image (pixels, pixels, 3). Its 1 is the power."""
         return coefficients.view(self.pixels, self.pixels, 3) / self.power
 
     def connect(

@@ -130,7 +130,8 @@ class Gloss:
             has_shape = values.shape in ((), (1,), (faces,))
             if not has_shape or not (values.min() >= 0 and values.max() <= 1):
                 raise InputError(
-                    f"gloss: {name} of shape {tuple(values.shape)}: give one number or {faces}, in [0, 1]"
+                    f"gloss: {name} of shape {tuple(values.shape)}: "
+                    f"give one number or {faces}, in [0, 1]"
                 )
             checked.append(values.reshape(-1))
         return checked

@@ -1,4 +1,4 @@
-"""Transfer operators of many views, stacked so that images and gradients are one batched product."""
+"""Transfer operators of many views, stacked so that one batched product gives all images."""
 
 from __future__ import annotations
 

@@ -226,7 +226,8 @@ class TransferOperator:
             given = tuple(radiance_gradient.shape)
             expected = tuple(self.albedo.shape)
             raise InputError(
-                f"radiance_gradient of shape {given} is not of the operator's pixels: give {expected}"
+                f"radiance_gradient of shape {given} is not of the operator's pixels: "
+                f"give {expected}"
             )
         return self._light_gradient(radiance_gradient)
 
@@ -412,7 +413,7 @@ class TransferOperator:
 
     @cached_property
     def _kept_background(self) -> dict[str, Any]:
-        """Return the prepared background of the last gray value, and the key that it is kept for."""
+        """Return the prepared background of the last gray value, and its key in the cache."""
         return {}
 
     @cached_property
@@ -508,7 +509,8 @@ def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
     if not is_tensor or image_gradient.shape != images.shape:
         given = tuple(image_gradient.shape) if is_tensor else type(image_gradient).__name__
         raise InputError(
-            f"loss_gradient returned {given}: return a tensor of the images' shape {tuple(images.shape)}"
+            f"loss_gradient returned {given}: "
+            f"return a tensor of the images' shape {tuple(images.shape)}"
         )
 
 

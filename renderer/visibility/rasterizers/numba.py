@@ -1,4 +1,6 @@
-"""Compiled rasterizer: the arithmetic of `renderer.visibility.rasterizers.numpy`, one triangle after another.
+"""Compiled rasterizer, which draws one triangle after another.
+
+The arithmetic is that of `renderer.visibility.rasterizers.numpy`.
 
 The results are equal to those of `renderer.visibility.rasterizers.numpy`. numba stores the
 machine code in __pycache__ or, if that folder is read-only, below ~/.cache.
