@@ -76,6 +76,10 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
     network = content.network
     if batch_size is not None:
         network = InBatches(network, batch_size)
+    if isinstance(network, nn.Module):
+        # A network of torch.export refuses `eval`, and has the mode of its export.
+        for part in network.modules():
+            part.training = False
     size = facts.size or height or DEFAULT_SIZE
     return as_classifier(network, size, facts.classes, facts.normalization, name=name)
 
@@ -125,10 +129,6 @@ def _read_exported(path: Path) -> Content:
 
 class Exported(Wrapper):
     """Network of `torch.export`, which has only the mode in which it was exported."""
-
-    def __init__(self, network: nn.Module):
-        super().__init__(network)
-        self.training = False
 
     def train(self, mode: bool = True) -> Self:
         """Leave the network as it is, because it refuses `train` and `eval`."""
