@@ -229,7 +229,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
     monkeypatch,
     capsys,
 ):
-    fit = sweep.Run.fit
+    fit = Run.fit
 
     def broken(run):
         if run.settings.train.learning_rate == 0.5:
@@ -241,7 +241,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
     right = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.05")
     unlucky = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.5")
     with monkeypatch.context() as patch:
-        patch.setattr(sweep.Run, "fit", broken)
+        patch.setattr(Run, "fit", broken)
         assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
     assert "1 of 3 runs are finished\n" in printed
