@@ -24,6 +24,7 @@ from train.runs.run_lock import FAILURE, LOCK, locked
 from train.runs.run_log import read_metrics
 from train.runs.run_names import run_name
 from train.training import loop
+from train.training.run import Run
 
 ROOT = Path(__file__).parents[3]
 SMALL = [
