@@ -85,6 +85,9 @@ PLUGIN_TAGS = {
 }
 # Smallest albedo scale by which the specular_factor of a coat is divided.
 SMALLEST_SCALE = 1e-6
+# Smallest parameter `specular`. Without any, metals of `principled` reflect
+# nothing. F0 is then 8e-6.
+SMALLEST_SPECULAR = 1e-4
 
 
 @contextmanager
@@ -479,11 +482,11 @@ class _PartWriter:
         roughness, metallic, specular_factor = (gloss / [1, self._kept, 1]).tolist()
         # F0 is 0.08 · specular, and 0.04 for a refractive index of 1.5. The
         # lights contain the albedo scale, which the coat must not have.
-        specular = min(specular_factor / 2 / max(self._albedo_scale, SMALLEST_SCALE), 1.0)
+        specular = specular_factor / 2 / max(self._albedo_scale, SMALLEST_SCALE)
         return {
             "type": "principled",
             "base_color": albedo,
-            "specular": specular,
+            "specular": min(max(specular, SMALLEST_SPECULAR), 1.0),
             "roughness": self._gloss_value("roughness", roughness, minimum=MIN_ROUGHNESS),
             "metallic": self._gloss_value("metallic", metallic, minimum=0.0),
         }

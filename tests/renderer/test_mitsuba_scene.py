@@ -136,6 +136,8 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
         gloss_textures=(gloss_texture,),
     )
     varnished = Gloss(0.4).on(textured)
+    # The strength of the dielectric part does not matter for a metal.
+    metal_of_no_strength = Gloss(0.4, metallic=1.0, specular_factor=0.0).on(textured)
     write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
 
     def render(mesh: Mesh) -> Tensor:
@@ -145,6 +147,7 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     matte_image = render(textured)
     for name, mesh, largest_error in (
         ("metal", metal, 0.05),
+        ("metal of no strength", metal_of_no_strength, 0.05),
         ("varnish", varnished, 0.1),
     ):
         write_mitsuba_scene(

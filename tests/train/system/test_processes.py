@@ -197,8 +197,14 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
         "renderer.samples=2",
         "augment.examples=10",
     ]
+    small += [
+        "scene.meshes=['solid:orange','solid:pear']",
+        "scene.hard_negatives=[]",
+        "scene.views=1",
+    ]
     data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
     overrides = [
+        "experiment=paper",
         *small,
         *data,
         "train.device=cpu",

