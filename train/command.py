@@ -46,7 +46,6 @@ from renderer.errors import InputError
 from renderer.settings import Settings
 from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
-from train.system.user_errors import user_message
 
 # Exit status after an error of the user.
 USER_ERROR = 2
@@ -97,8 +96,13 @@ class Command:
     def __post_init__(self) -> None:
         store = ConfigStore.instance()
         store.store(f"{self.name}_settings", self.settings)
-        if not (CONF / f"{self.name}.yaml").exists():
+        if not self.has_file:
             store.store(self.name, {"defaults": [f"{self.name}_settings", "command"]})
+
+    @property
+    def has_file(self) -> bool:
+        """Whether a file of conf/ says what the settings are composed of."""
+        return (CONF / f"{self.name}.yaml").exists()
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -111,6 +115,7 @@ class Command:
             set_up_process()
             if not HELP_FLAGS.isdisjoint(sys.argv):
                 print(self.format_help([word for word in sys.argv[1:] if word not in HELP_FLAGS]))
+                skip_last_collection()
                 return
             sys.argv[1:] = self.words(sys.argv[1:])
             start = hydra.main(version_base="1.3", config_path="pkg://conf", config_name=self.name)
@@ -184,6 +189,8 @@ class Command:
             if any(isinstance(cause, KeyboardInterrupt) for cause in causes(error)):
                 print(INTERRUPTED, file=sys.stderr)
                 sys.exit(128 + signal.SIGINT)
+            from train.system.user_errors import user_message  # --help does not need it
+
             sentence = explain(error, self.keys, sys.argv[1:]) or user_message(error)
             if sentence is None:
                 raise
@@ -192,6 +199,9 @@ class Command:
 
     def format_help(self, overrides: Sequence[str] = ()) -> str:
         """Return the text of --help, with the values that overrides give to the settings."""
+        if not overrides and not self.has_file:
+            # To compose the defaults takes twice as long as all else.
+            return self.help.format(OmegaConf.structured(self.settings))
         # Hydra's own --help lists all groups, which takes longer than to compose the settings.
         return self.help.format(self.compose(overrides))
 
@@ -263,10 +273,16 @@ def import_function(path: str) -> Callable[..., Any]:
         if is_main:
             signal.signal(signal.SIGINT, before)
     if is_first:
-        # Otherwise, Python would look for cycles among all imported objects at
-        # its end, which takes seconds.
-        gc.freeze()
+        skip_last_collection()
     return cast(Callable[..., Any], function)
+
+
+def skip_last_collection() -> None:
+    """Keep Python from looking for cycles among all present objects at its end.
+
+    That takes seconds after PyTorch is imported, and a fifth of the time of --help.
+    """
+    gc.freeze()
 
 
 def _end_at_once(number: int, frame: object) -> None:

@@ -26,9 +26,10 @@ from renderer.errors import (
     single_line,
 )
 from renderer.image import to_bytes
+from renderer.io.arrays import read_numbers, write_numbers
 from renderer.io.export import export_mesh
 from renderer.io.files import atomic_write
-from renderer.io.images import gray_or_image, read_numbers, write_image, write_numbers
+from renderer.io.images import gray_or_image, write_image
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.light_files import read_light, save_light

@@ -1,4 +1,4 @@
-"""Image files as a classifier sees them, and arrays of numbers as .npy files."""
+"""Image files as a classifier sees them."""
 
 import io
 import math
@@ -170,41 +170,3 @@ def write_image(path: Path, image: Image.Image, **options: object) -> None:
     image_format = Image.registered_extensions()[path.suffix.lower()]
     image.save(content, image_format, **options)
     atomic_write(path, content.getbuffer())
-
-
-def write_numbers(path: Path, numbers: np.ndarray) -> None:
-    """Write an array as an .npy file, as a whole.
-
-    Args:
-        path: File to replace or to create.
-        numbers: Array to write.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    content = io.BytesIO()
-    np.save(content, numbers)
-    atomic_write(path, content.getbuffer())
-
-
-def read_numbers(path: Path) -> np.ndarray:
-    """Read real numbers from an .npy file.
-
-    The file is mapped into memory first. A damaged header can therefore not
-    request more memory than the file has.
-
-    Args:
-        path: .npy file.
-
-    Returns:
-        Numbers, float32. Larger numbers become infinite.
-
-    Raises:
-        ValueError: If the file holds no real numbers.
-        Exception: If the header is damaged. NumPy decides about the class.
-    """
-    array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
-    if array.dtype.kind not in "fiu" or not array.size:
-        raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
-    with np.errstate(over="ignore"):
-        return array.astype(np.float32)

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from renderer.errors import MAX_MAGNITUDE, InputError, require_file
+from renderer.io.arrays import read_numbers, write_numbers
 from renderer.io.files import replacing
-from renderer.io.images import read_numbers, write_numbers
 from renderer.light.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")

@@ -15,13 +15,14 @@ from PIL import Image
 
 import renderer
 from renderer.errors import InputError
+from renderer.io.arrays import write_numbers
 from renderer.io.files import (
     TEMPORARY,
     atomic_write,
     remove_unfinished,
     replacing,
 )
-from renderer.io.images import write_image, write_numbers
+from renderer.io.images import write_image
 from renderer.light.environment import write_map
 from renderer.light.projector import Projector
 from train.runs import checkpoint

@@ -70,6 +70,12 @@ def test_help_shows_each_setting_with_its_value_and_explanation(name):
     assert choices.get(name, "") in printed
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_help_shows_the_settings_that_the_command_would_run_with(name):
+    command = command_of(name)
+    assert command.format_help() == command.help.format(command.compose())
+
+
 def test_help_shows_the_values_that_the_given_choices_have():
     assert "  train.epochs=8 " in help_of("train", "experiment=cpu")
 

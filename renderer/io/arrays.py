@@ -1,0 +1,46 @@
+"""Arrays of numbers as .npy files."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from renderer.io.files import atomic_write
+
+
+def write_numbers(path: Path, numbers: np.ndarray) -> None:
+    """Write an array as an .npy file, as a whole.
+
+    Args:
+        path: File to replace or to create.
+        numbers: Array to write.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    content = io.BytesIO()
+    np.save(content, numbers)
+    atomic_write(path, content.getbuffer())
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """Read real numbers from an .npy file.
+
+    The file is mapped into memory first. A damaged header can therefore not
+    request more memory than the file has.
+
+    Args:
+        path: .npy file.
+
+    Returns:
+        Numbers, float32. Larger numbers become infinite.
+
+    Raises:
+        ValueError: If the file holds no real numbers.
+        Exception: If the header is damaged. NumPy decides about the class.
+    """
+    array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
+    if array.dtype.kind not in "fiu" or not array.size:
+        raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32)
