@@ -85,6 +85,7 @@ def write_audit_page(
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
+        screen=None,
         caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
         agreement=_agreement(scored),
         config=read_config(out / CONFIG),

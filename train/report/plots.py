@@ -16,9 +16,10 @@ from train.evaluation.scores.sheet import Pair, draw_roc
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# The colors of Okabe and Ito (2008) for color-blind readers, without yellow, which is faint on
-# white. The styles and markers of lines repeat the distinction.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# The first two colors are those of the original and of the hardened network on all pages. Their
+# contrast to a white and to a dark page is above 3. The others are from Okabe and Ito (2008), for
+# color-blind readers. The styles and markers of lines repeat the distinction.
+COLORS = ("#7d8590", "#2f81f7", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 LINES = ("--", "-", ":", "-.")
 MARKERS = "osD^vP"
 # The size of a plot in inches, and its width on the page in CSS pixels.

@@ -1,5 +1,7 @@
 """The page report.html, which shows runs and attacks. It loads no other file."""
 
+import base64
+import hashlib
 import shlex
 import traceback
 from collections.abc import Mapping, Sequence
@@ -16,17 +18,26 @@ from augment.progress import progress_message
 from augment.settings import MODES
 from renderer.errors import InputError
 from renderer.io.files import atomic_write
-from train.evaluation.scores.metrics import metric_title
 from train.evaluation.scores.scoring import CONTACT_SHEET
 from train.evaluation.scores.sheet import evenly_spaced
 from train.evaluation.tables import Table, as_text, format_fraction, format_interval, fraction
 from train.report import comparison as compare
 from train.report import plots, summary
+from train.report.first_screen import (
+    NETWORKS,
+    Compared,
+    FirstScreen,
+    compare_networks,
+    contrasts,
+    in_words,
+    place_of,
+)
 from train.report.plots import Picture
 from train.report.summary import Methods, RunSummary, Scored
 from train.runs.epoch_metrics import attack_success
 from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import RENDERS
+from train.settings import PHOTOGRAPHS, published
 from train.system.user_errors import user_message
 
 # Name of the file.
@@ -47,8 +58,6 @@ FOLDER_NAME_LENGTH = 24
 GRID_WIDTH = 720
 # Largest width of a contact sheet and of an image of an attack, in pixels.
 SHEET_WIDTH = 1100
-# Metrics in `METRICS` that the first sentences compare.
-HEADLINES = ("auc", "recall_at/0.10", "false_positive_rate")
 # Titles of the plots of metrics by epoch.
 CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 
@@ -84,6 +93,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         about=_about(found, folders),
         methods=methods,
         title=_title(found, methods),
+        screen=_first_screen(groups),
         lead=_accuracy_sentences(methods),
         tables=[table for table in summary.run_tables(methods, {}) if table.rows],
         captions=MODES,
@@ -129,6 +139,8 @@ def _title(found: summary.Findings, methods: Methods) -> str:
         for scores in runs[0].photographs.values():
             labels.update(scores.labels)
     trained = [method for method, runs in methods.items() if runs[0].method != summary.INITIAL]
+    if labels and len(trained) < len(methods):
+        return f"Hardened against unusual lighting: {', '.join(map(in_words, sorted(labels)))}"
     subject = " and ".join(sorted(labels)) or "Networks"
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
@@ -147,12 +159,13 @@ def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> E
     return epochs
 
 
-def write_page(out: Path, body: str, **content: Any) -> Path:
+def write_page(out: Path, body: str, script: str = "", **content: Any) -> Path:
     """Render a template inside the frame that all pages share, and write it to report.html.
 
     Args:
         out: Folder of the page. If it does not exist, it is made.
         body: File name of the template with the sections of the page.
+        script: JavaScript of the page, the only one that a browser runs in it.
         **content: Values of the template. All pages need `title`, and `about`,
             the line below the title.
 
@@ -174,12 +187,18 @@ def write_page(out: Path, body: str, **content: Any) -> Path:
     environment.filters["fraction"] = fraction
     environment.filters["hits"] = format_fraction
     environment.filters["interval"] = format_interval
+    environment.filters["sha256"] = _sha256
     environment.filters["yaml"] = OmegaConf.to_yaml
-    page = environment.get_template("page.html.jinja").render(body=body, **content)
+    page = environment.get_template("page.html.jinja").render(body=body, script=script, **content)
     out.mkdir(parents=True, exist_ok=True)
     path = out / PAGE
     atomic_write(path, page)
     return path
+
+
+def _sha256(script: str) -> str:
+    """Return the hash by which the content security policy of a page allows its script."""
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
@@ -257,9 +276,18 @@ def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
 
 
 def _accuracy_sentences(methods: Methods) -> list[str]:
-    """Compare the mean test accuracy of each method before and after training, in sentences."""
+    """Compare each method with the network that it began with on the test images, in sentences."""
     sentences = []
     for method, runs in methods.items():
+        agreements = [run.scores.get("test/agreement") for run in runs]
+        agreements_known = [agreement for agreement in agreements if agreement is not None]
+        if agreements_known:
+            agreement = fmean(agreements_known)
+            sentences.append(
+                f"{method}: on images of any kind that training did not use, its agreement with "
+                f"the original network is {agreement:.1%}."
+            )
+            continue
         initial = [run.before.accuracy for run in runs if run.before]
         known = [accuracy for accuracy in initial if accuracy is not None]
         if not known:
@@ -270,6 +298,70 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
         change = f"accuracy went from {before:.1%} to {after:.1%}"
         sentences.append(f"{method}: {change}, on {images}.")
     return sentences
+
+
+def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
+    """Compare the last method with its reference, on the first images with both networks."""
+    screens = []
+    for group in groups.values():
+        with suppress(InputError):
+            screens.append(_compare_on(group))
+    known = [screen for screen in screens if screen is not None]
+    return known[0] if known else None
+
+
+def _compare_on(group: Scored) -> FirstScreen | None:
+    """Compare the last method that began with another network on its images. None without one."""
+    evaluations = compare.read_evaluations(group)
+    pairs = compare.choose_pairs(evaluations)
+    if not pairs:
+        return None
+    initial = [pair for pair in pairs if group[pair[1]][0].run.method == summary.INITIAL]
+    method, base = (initial or pairs)[-1]
+    scored = group[method][0]
+    names = ("before hardening", "after hardening") if initial else (base, method)
+    subjects = NETWORKS if initial else (f"the network “{base}”", f"the network “{method}”")
+    label = " or ".join(map(in_words, scored.scores.labels))
+    images = images_folder(scored.run, scored.name)
+    rows = {}
+    if images is not None and len(scored.scores.labels) == 1:
+        rows = contrasts(
+            group[base][0].folder,
+            scored.folder,
+            images,
+            scored.scores.labels[0],
+            subjects,
+        )
+    compared = Compared(
+        label=label,
+        before=evaluations[base],
+        after=evaluations[method],
+        names=names,
+        subjects=subjects,
+        place=place_of(images, scored.name),
+    )
+    return compare_networks(compared, rows)
+
+
+def images_folder(run: RunSummary, name: str) -> Path | None:
+    """Find the folder of the images that a run was scored on.
+
+    Args:
+        run: A finished run.
+        name: Name of the folder of its scores.
+
+    Returns:
+        Folder of the images. None if the configuration does not name it, or if
+        it has been moved.
+    """
+    photos = OmegaConf.select(run.config, "evaluate.photos")
+    named = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
+    folder = named.get(name)
+    if not folder:
+        return None
+    start = run.config.get("working_folder") or ""
+    candidates = (published(Path(folder)), Path(start) / folder)
+    return next(filter(Path.is_dir, candidates), None)
 
 
 def scores_section(title: str, group: Scored) -> dict[str, Any]:
@@ -286,7 +378,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         - "sheets": contact sheet of the first run of each method;
         - "rocs": plots of ROC curves;
         - "tables": tables of metrics and of their differences;
-        - "sentences": differences in words, or why they are unknown.
+        - "problem": why the differences are unknown, or an empty text.
     """
     sheets = {}
     for method, scored_runs in group.items():
@@ -295,21 +387,20 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         sheets[method] = plots.from_file(path, alt, SHEET_WIDTH)
     tables = [summary.score_table("", group)]
     rocs: list[Picture | None] = []
-    sentences: list[str] = []
+    problem = ""
     try:
         evaluations = compare.read_evaluations(group)
         if evaluations:
             rocs = _rocs(evaluations)
-            sentences = _difference_sentences(evaluations, title)
             tables += _evaluation_tables(evaluations)
     except InputError as error:
-        sentences = [str(error)]
+        problem = str(error)
     return {
         "name": title,
         "sheets": sheets,
         "rocs": rocs,
         "tables": [table.known for table in tables],
-        "sentences": sentences,
+        "problem": problem,
     }
 
 
@@ -334,29 +425,6 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
     if len(first_evaluation.pools) > 1:
         tables.append(compare.group_table(methods))
     return tables
-
-
-def _difference_sentences(methods: compare.Evaluations, images: str) -> list[str]:
-    """Compare the metrics in `HEADLINES` of each pair of methods in a sentence."""
-    sentences = []
-    for method, base in compare.choose_pairs(methods):
-        parts = []
-        for name in HEADLINES:
-            result = compare.difference(methods[method], methods[base], compare.ALL, name)
-            if result is not None:
-                parts.append(f"{metric_title(name)} {_compared(result)}")
-        if parts:
-            sentences.append(f"{images}, {base} and {method}: {'; '.join(parts)}.")
-    return sentences
-
-
-def _compared(result: compare.Difference) -> str:
-    """Write both means, and their difference if its interval does not contain zero."""
-    assert result.low is not None and result.high is not None
-    text = format_interval(result, sign="+")
-    if result.low <= 0 <= result.high:
-        text = "no difference is shown"
-    return f"{result.before:.2f} and {result.after:.2f} ({text})"
 
 
 def _attack(attack: summary.AttackSummary) -> dict[str, Any]:

@@ -1,0 +1,362 @@
+"""The first screen of a page: the answer in sentences, three numbers, and pictures of both networks."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from PIL import Image
+
+from renderer.io.images import read_square
+from train.data.photographs import DESCRIPTION, OTHER_PREFIX
+from train.evaluation.scores.metrics import AreaUnderCurve
+from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
+from train.evaluation.tables import Estimate
+from train.report import comparison as compare
+from train.report import plots
+from train.report.plots import Picture
+
+# False-positive rate at which the recall of both networks is compared.
+EQUAL_RATE = "recall_at/0.10"
+# Both networks in sentences.
+NETWORKS = ("the original network", "the hardened network")
+# Number of pictures in a row.
+PICTURES = 6
+# Largest number of pixels per side of a picture.
+SIDE = 200
+
+
+@dataclass(frozen=True)
+class Number:
+    """A metric before and after hardening.
+
+    Attributes:
+        title: Metric in words.
+        note: Which values are good.
+        before: Metric of the original network. None if there is one network.
+        after: Metric of the hardened network, or of the only network.
+        is_percentage: Whether the metric is shown in percent.
+    """
+
+    title: str
+    note: str
+    before: Estimate | None
+    after: Estimate
+    is_percentage: bool = True
+
+    def text(self, value: float) -> str:
+        """Write a value in percent, or with two decimals."""
+        return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
+
+
+class Answer(NamedTuple):
+    """Class that a network gives an image, with its probability.
+
+    Attributes:
+        text: Class and probability.
+        verdict: "right", "wrong", or "" for another object that the network
+            takes for neither itself nor the class under study.
+    """
+
+    text: str
+    verdict: str
+
+
+class Contrast(NamedTuple):
+    """An image that both networks classify.
+
+    Attributes:
+        picture: The image.
+        subject: What it shows, and its light if that is known.
+        before: Answer of the original network.
+        after: Answer of the hardened network.
+    """
+
+    picture: Picture
+    subject: str
+    before: Answer
+    after: Answer
+
+
+@dataclass(frozen=True)
+class FirstScreen:
+    """What the first screen of a page shows.
+
+    Attributes:
+        answer: Answer in a few words.
+        sentences: Reasons of the answer.
+        numbers: Three metrics.
+        rows: Pictures by the title of their row.
+        names: Names of both networks, or of the only one.
+        images: How many images were scored, of how many objects.
+    """
+
+    answer: str
+    sentences: Sequence[str]
+    numbers: Sequence[Number]
+    rows: dict[str, list[Contrast]]
+    names: Sequence[str]
+    images: str
+
+
+class Compared(NamedTuple):
+    """Evaluations of two networks on the same images.
+
+    Attributes:
+        label: Classes under study in words.
+        before: Evaluations of the original network, one for each seed.
+        after: Evaluations of the hardened network, one for each seed.
+        names: Names of both networks in the legend.
+        subjects: The same two networks in sentences.
+        place: Where the images are from, to begin a sentence.
+    """
+
+    label: str
+    before: Sequence[compare.Evaluation]
+    after: Sequence[compare.Evaluation]
+    names: tuple[str, str]
+    subjects: tuple[str, str]
+    place: str
+
+    def difference(self, name: str) -> compare.Difference | None:
+        """Subtract a metric of the original network from that of the hardened network."""
+        return compare.difference(self.after, self.before, compare.ALL, name)
+
+    def number(self, title: str, note: str, name: str) -> Number | None:
+        """Return a metric of both networks. None if it is unknown."""
+        before = compare.mean_metric(self.before, compare.ALL, name)
+        after = compare.mean_metric(self.after, compare.ALL, name)
+        if before is None or after is None:
+            return None
+        return Number(title, note, before, after, is_percentage=name != "auc")
+
+
+def place_of(folder: Path | None, name: str) -> str:
+    """Say where images are from, to begin a sentence.
+
+    Args:
+        folder: Folder of the images. None if it is unknown.
+        name: Name of the folder of scores.
+
+    Returns:
+        Words such as "Under unusual lighting".
+    """
+    if folder is not None and (folder / DESCRIPTION).is_file():
+        return "Under unusual lighting"
+    return f"In the images of “{name}”"
+
+
+def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> FirstScreen | None:
+    """Say whether hardening helped, and at what price.
+
+    Args:
+        compared: Evaluations of both networks.
+        rows: Pictures by the title of their row.
+
+    Returns:
+        The first screen. None if recall, false-positive rate or AUC is unknown.
+    """
+    label = compared.label
+    asked = (
+        ("recall", f"Images of {label} recognized", "higher is better"),
+        ("false_positive_rate", f"Other objects called {label}", "lower is better"),
+        ("auc", "Ranking quality (AUC)", "higher is better; 0.5 is chance"),
+    )
+    numbers = []
+    for name, title, note in asked:
+        number = compared.number(title, note, name)
+        if number is not None:
+            numbers.append(number)
+    recall = compared.difference("recall")
+    false_positives = compared.difference("false_positive_rate")
+    auc = compared.difference("auc")
+    if recall is None or false_positives is None or auc is None:
+        return None
+    return FirstScreen(
+        answer=_answer(recall, false_positives, auc),
+        sentences=_sentences(compared, recall, false_positives),
+        numbers=numbers,
+        rows=rows,
+        names=compared.names,
+        images=describe_images(compared.label, compared.after[0].pools[compare.ALL].metrics.auc),
+    )
+
+
+def describe_images(label: str, auc: AreaUnderCurve) -> str:
+    """Say how many images were scored, of how many objects.
+
+    Args:
+        label: Classes under study in words.
+        auc: The area under the curve, with the numbers of images and objects.
+
+    Returns:
+        A sentence.
+    """
+    return (
+        f"Scored on {auc.positives:,} images of {label} ({auc.positive_objects:,} objects) and "
+        f"{auc.negatives:,} of other things ({auc.negative_objects:,} objects)."
+    )
+
+
+def _direction(change: compare.Difference) -> int:
+    """Return 1 for a proven increase, -1 for a proven decrease, and otherwise 0."""
+    assert change.low is not None and change.high is not None
+    return int(change.low > 0) - int(change.high < 0)
+
+
+def _answer(
+    recall: compare.Difference,
+    false_positives: compare.Difference,
+    auc: compare.Difference,
+) -> str:
+    """Say in a few words whether hardening helped."""
+    match _direction(auc):
+        case 1 if _direction(false_positives) > 0:
+            return "Hardening helped, at a price."
+        case 1:
+            return "Hardening helped."
+        case -1:
+            return "Hardening did harm."
+    if _direction(recall) > 0 and _direction(false_positives) > 0:
+        return "Hardening finds more, and mistakes more; a gain is not proven."
+    return "It is not proven that hardening helped."
+
+
+def _sentences(
+    compared: Compared,
+    recall: compare.Difference,
+    false_positives: compare.Difference,
+) -> list[str]:
+    """Say what changed: recall, the rate of false positives, and recall at an equal rate."""
+    label = compared.label
+    original, hardened = compared.subjects
+    sentences = [
+        f"{compared.place}, {original} recognizes {recall.before:.0%} of the images of {label}; "
+        f"{hardened}, {recall.after:.0%}."
+    ]
+    before = f"{false_positives.before:.0%}"
+    after = f"{false_positives.after:.0%}"
+    if _direction(false_positives) > 0:
+        price = f"The price: {hardened} calls {after} of the images of other things “{label}”"
+        sentences.append(f"{price}, instead of {before}.")
+    else:
+        sentences.append(
+            f"Of the images of other things, {original} calls {before} “{label}”; "
+            f"{hardened}, {after}."
+        )
+    equal = compared.difference(EQUAL_RATE)
+    if equal is not None:
+        sentences.append(_equal_rate_sentence(equal))
+    return sentences
+
+
+def _equal_rate_sentence(equal: compare.Difference) -> str:
+    """Compare the recall at an equal rate of false positives."""
+    assert equal.low is not None and equal.high is not None
+    verdicts = {1: "a proven gain", -1: "a proven loss", 0: "a difference is not proven"}
+    verdict = verdicts[_direction(equal)]
+    interval = f"95% interval: {_points(equal.low)} to {_points(equal.high)} points"
+    return (
+        f"At an equal rate of 10% false positives, recall is {equal.after:.0%} instead of "
+        f"{equal.before:.0%}; {verdict} ({interval})."
+    )
+
+
+def _points(value: float) -> str:
+    """Write a difference of fractions in percentage points, with its sign."""
+    points = round(100 * value)
+    return f"{points:+d}".replace("-", "−") if points else "0"
+
+
+def contrasts(
+    before: Path,
+    after: Path,
+    images: Path,
+    label: str,
+    subjects: tuple[str, str] = NETWORKS,
+) -> dict[str, list[Contrast]]:
+    """Choose the images that only one of two networks gets right.
+
+    An image counts as right if it is predicted as the class under study exactly
+    if it shows this class.
+
+    Args:
+        before: Folder of the scores of the original network.
+        after: Folder of the scores of the hardened network on the same images.
+        images: Folder of the images.
+        label: Class under study.
+        subjects: Both networks in words.
+
+    Returns:
+        At most PICTURES images in each row, by the title of the row. They are
+        of different objects and lights, if there are enough.
+    """
+    pairs = list(
+        zip(
+            read_predictions(before / PREDICTIONS, label),
+            read_predictions(after / PREDICTIONS, label),
+            strict=True,
+        )
+    )
+    gained = [pair for pair in pairs if _is_right(pair[1]) and not _is_right(pair[0])]
+    lost = [pair for pair in pairs if _is_right(pair[0]) and not _is_right(pair[1])]
+    original, hardened = subjects
+    return {
+        f"Only {hardened} is right": _draw(gained, images),
+        f"Only {original} is right": _draw(lost, images),
+    }
+
+
+# Predictions of the original network and of the hardened network for an image.
+Pair = tuple[Prediction, Prediction]
+
+
+def _is_right(prediction: Prediction) -> bool:
+    """Return whether a network tells the class under study from other things in an image."""
+    return (prediction.predicted == prediction.label) == prediction.positive
+
+
+def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:
+    """Draw the images whose scores differ most, of different labels and sources if possible."""
+    ordered = sorted(pairs, key=lambda pair: -abs(pair[1].log_odds - pair[0].log_odds))
+    first_of_group: dict[tuple[str, str | None], Pair] = {}
+    for pair in ordered:
+        photograph = pair[0].photograph
+        first_of_group.setdefault((photograph.label, photograph.source), pair)
+    chosen = list(first_of_group.values())
+    chosen += [pair for pair in ordered if pair not in chosen]
+    return [_contrast(pair, images) for pair in chosen[:PICTURES]]
+
+
+def _contrast(pair: Pair, images: Path) -> Contrast:
+    """Draw an image with the answers of both networks."""
+    photograph = pair[0].photograph
+    subject = in_words(photograph.label)
+    if photograph.source:
+        subject += f", {in_words(photograph.source)}"
+    answers = [answer_of(prediction) for prediction in pair]
+    alt = f"{subject}; original network: {answers[0].text}; hardened network: {answers[1].text}"
+    pixels = Image.fromarray(read_square(images / photograph.path, SIDE))
+    return Contrast(plots.encoded(pixels, alt), subject, *answers)
+
+
+def answer_of(prediction: Prediction) -> Answer:
+    """Describe the class that a network gives an image.
+
+    Args:
+        prediction: Prediction for an image.
+
+    Returns:
+        The class with its probability, and whether it is right.
+    """
+    verdict = ""
+    if prediction.predicted == prediction.photograph.label:
+        verdict = "right"
+    elif prediction.positive or prediction.predicted == prediction.label:
+        verdict = "wrong"
+    return Answer(f"{in_words(prediction.predicted)} {prediction.probability:.0%}", verdict)
+
+
+def in_words(label: str) -> str:
+    """Write the name of a class in words, such as "sweet pepper" for "other_sweet_pepper"."""
+    return label.removeprefix(OTHER_PREFIX).replace("_", " ")
