@@ -8,8 +8,10 @@ from augment.parameter_settings import PARAMETER_NAMES, ParameterSettings
 from renderer.errors import MAX_SCALE, InputError
 from renderer.settings import Settings, setting
 
-MAX_NOISE = 255.0  # steps of 8 bits, the whole range of values
-NOISE_MARGIN = 2.0  # in units of the range of the leads with noise and without
+# Largest standard deviation of noise, in units of 1/255.
+MAX_NOISE = 255.0
+# Default of `AttackSettings.noise_margin`.
+NOISE_MARGIN = 2.0
 
 
 @dataclass
@@ -24,8 +26,9 @@ class EOTSettings(Settings):
     )
     jitter: float = setting(
         0.03,
-        "Largest motion of the camera: its shift as a fraction of the width of the image, and its approach as a "
-        "fraction of the distance. It also rolls by up to 57 degrees times this number, which is 1.7 degrees for 0.03.",
+        "Largest motion of the camera: its shift as a fraction of the width of the image, and its "
+        "approach as a fraction of the distance. It also rolls by up to 57 degrees times this "
+        "number, which is 1.7 degrees for 0.03.",
         minimum=0,
         maximum=0.5,
     )
@@ -36,7 +39,7 @@ class EOTSettings(Settings):
 
 @dataclass
 class AttackSettings(ParameterSettings):
-    """What an attack changes, and how it descends.
+    """Attacked parameters, and the steps, restarts and checks of an attack.
 
     The defaults are careful: the lighting stays physically possible, and a success survives the
     noise of a camera and its 8 bits. The paper has allow_negative=True, margin=0, quantized=False
@@ -86,7 +89,8 @@ class AttackSettings(ParameterSettings):
     )
     allow_negative: bool = setting(
         False,
-        "Permit lighting with negative radiance, as in the paper. Otherwise the lighting stays physically possible.",
+        "Permit lighting with negative radiance, as in the paper. Otherwise the lighting stays "
+        "physically possible.",
     )
     batch_size: int = setting(
         32,
@@ -106,7 +110,7 @@ class AttackSettings(ParameterSettings):
 
     @property
     def lead_over_noise(self) -> float:
-        """The `noise_margin` in use: 0 if there is no noise."""
+        """Return the `noise_margin` to apply, which is 0 without noise."""
         if not self.sensor_noise:
             return 0.0
         if self.noise_margin is not None:

@@ -1,4 +1,4 @@
-"""Memory: how much of it is free, and how much renders, operators and attacks take."""
+"""Measures free memory, and estimates the memory that renders, operators and attacks need."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import torch
 
 from renderer.errors import InputError
 
-MEMORY = Path("/proc/meminfo")  # Where Linux says how much memory is free.
-GROUP = Path("/sys/fs/cgroup")  # Where Linux says what a container may use (cgroup v2).
+MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine here.
+GROUP = Path("/sys/fs/cgroup")  # Linux writes the memory limit of a container here (cgroup v2).
 GIB = 2**30
 
 # Numbers that an attack on the light holds beside the operators: for each
@@ -25,28 +25,31 @@ OPERATOR_BYTES = 8
 
 
 def require_memory(name: str, needed: int, device: torch.device) -> None:
-    """Check that there is memory for something, before the system ends the process for it.
+    """Check that enough memory is free, because Linux would otherwise kill the process.
 
     Args:
-        name: What needs the memory, in the plural, such as "40 renders".
-        needed: The bytes that it needs.
-        device: The device on which it needs them.
+        name: Objects that need the memory, in the plural, such as "40 renders".
+        needed: Number of bytes that they need.
+        device: Device on which they are stored.
 
     Raises:
         InputError: If fewer bytes are free.
     """
     if not has_memory(needed, device):
         free = free_memory(device) or 0
-        sizes = f"{needed / GIB:.1f} GB of memory and {free / GIB:.1f} GB are free"
-        raise InputError(f"{name} need {sizes}: ask for fewer or smaller ones")
+        sizes = f"{needed / GIB:.1f} GB of memory, but only {free / GIB:.1f} GB are free"
+        raise InputError(f"{name} need {sizes}: reduce their number or size")
 
 
 def has_memory(needed: int, device: torch.device) -> bool:
-    """Return whether as many bytes are free on a device, or the system does not say.
+    """Return whether a number of bytes is free on a device.
 
     Args:
-        needed: The number of bytes.
-        device: The device.
+        needed: Number of bytes.
+        device: Device on which they are needed.
+
+    Returns:
+        True also if the system does not tell how much memory is free.
     """
     free = free_memory(device)
     return free is None or needed <= free
@@ -73,7 +76,7 @@ def free_memory(device: torch.device) -> int | None:
     try:
         limit = int((GROUP / "memory.max").read_text())
         used = int((GROUP / "memory.current").read_text())
-    # Without a container, there is no such file, or its text is "max".
+    # There is no such file outside containers. Without a limit, it contains "max".
     except (OSError, ValueError):
         return free
     return min(free, limit - used)

@@ -140,7 +140,8 @@ class PoseSettings(StepSettings):
     )
     joints: Any = setting(
         0.0,
-        "Largest rotation of the joints of a skinned mesh about each axis: of all joints, or {name: degrees} of some.",
+        "Largest rotation of the joints of a skinned mesh about each axis: of all joints, or "
+        "{name: degrees} of some.",
         "degrees",
     )
 
@@ -224,7 +225,7 @@ class ParameterSettings(Settings):
 
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        """The settings of the quantities to change, by name."""
+        """Return the settings of the attacked parameters by name."""
         named = {name: getattr(self, name) for name in PARAMETER_NAMES}
         return {name: settings for name, settings in named.items() if settings is not None}
 

@@ -1,4 +1,4 @@
-"""What a user sees of long work: progress bars, and the seconds of its phases."""
+"""Progress bars and messages for long work, and timers for its phases."""
 
 import sys
 import time
@@ -80,7 +80,7 @@ class _Progress:
         wait = PATIENCE
         while not self.ended.wait(wait):
             if self._is_terminal:
-                # From here on, the bar shows itself.
+                # The bar updates itself after its first appearance.
                 self._bar.delay = 0
                 self._bar.refresh()
                 return

@@ -343,9 +343,9 @@ class AugmentationService:
 
     @cached_property
     def _scene_hash(self) -> Tensor:
-        """The SHA-256 hash of labels, scene and image sizes, as 32 bytes.
+        """Compute a SHA-256 hash (32 bytes) of labels, scene and image sizes.
 
-        Numbers are rounded before, so that the same settings have the same hash
+        Numbers are rounded first, so that the same settings have the same hash
         on all machines.
         """
         shown: list[object] = [self.labels.tolist(), list(self.positive_classes)]

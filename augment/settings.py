@@ -43,9 +43,12 @@ MAX_INTERVAL = 10**9  # training images between two regenerations
 MAX_PROP_DISTANCE = 10.0  # position and size of props in world units
 MAX_PROJECTOR_PIXELS = 256  # per side
 MAX_BLUR = 1.5  # pixels
-MIN_FOV, MAX_FOV = 1.0, 45.0  # degrees, of a lens that a normalized mesh is in front of
-UNCHANGED = (1.0, 1.0)  # limits of a factor that changes nothing
-NONE = (0.0, 0.0)  # limits of a strength that is off
+# Limits of the field of view in degrees. The camera comes nearer as the field of
+# view grows, and beyond 45 degrees it could be inside of a normalized mesh.
+MIN_FOV = 1.0
+MAX_FOV = 45.0
+UNCHANGED = (1.0, 1.0)  # Range of a factor that changes nothing.
+NONE = (0.0, 0.0)  # Range of an amount that is always zero.
 
 
 @dataclass
@@ -62,8 +65,8 @@ class MeshSettings(Settings):
     )
     gloss: Any = setting(
         None,
-        "Specular material: [roughness, metallic, specular factor] or the first of them, from 0 to 1, "
-        "or file for the material of a glTF file. null: none.",
+        "Specular material: [roughness, metallic, specular factor] or the first of them, from 0 "
+        "to 1, or file for the material of a glTF file. null: none.",
     )
 
     def __post_init__(self) -> None:
@@ -86,10 +89,14 @@ def _is_gloss(values: object) -> bool:
 
 
 def require_color(name: str, color: Sequence[float] | None) -> None:
-    """Check that a color has three channels from 0 to 1. None is no color and passes.
+    """Check that a color has three channels from 0 to 1.
+
+    Args:
+        name: Name of the argument, for the error.
+        color: Red, green and blue. None is accepted.
 
     Raises:
-        InputError: If it has not.
+        InputError: If the color has another length or a value outside [0, 1].
     """
     if color is None:
         return
@@ -198,7 +205,7 @@ class LampsSettings(Settings):
     )
 
 
-# By the name of the kind of light; see `renderer.light.local_lights`.
+# Settings of each kind of local light, see `renderer.light.local_lights`.
 LOCAL_LIGHT_SETTINGS: dict[str, type[Settings]] = {
     "projector": ProjectorSettings,
     "lamps": LampsSettings,
@@ -241,7 +248,8 @@ class SceneSettings(Settings):
     )
     vertices: int = setting(
         0,
-        "Subdivide each mesh until it has more vertices than this. The paper attacks shapes with more than 10,000.",
+        "Subdivide each mesh until it has more vertices than this. The paper attacks shapes with "
+        "more than 10,000.",
         minimum=0,
         maximum=MAX_VERTICES,
         checks_type=False,  # Python code may give 1e4
@@ -294,7 +302,7 @@ def _as_settings(name: str, value: object, kind: type[Settings]) -> Settings | N
 
 @dataclass
 class RendererSettings(Settings):
-    """How images are rendered."""
+    """Settings of the renderer for the images of a scene."""
 
     rasterizer: str = setting(
         "auto",
@@ -303,7 +311,8 @@ class RendererSettings(Settings):
     )
     samples: int | None = setting(
         None,
-        "Samples per side of a pixel. With 2, each pixel has 4 samples. null: 2, or 8 with silhouettes.",
+        "Samples per side of a pixel. With 2, each pixel has 4 samples. null: 2, or 8 with "
+        "silhouettes.",
         minimum=1,
         maximum=MAX_SAMPLES,
     )
@@ -378,7 +387,7 @@ class CameraEffectSettings(Settings):
 
 @dataclass
 class VariationSettings(Settings):
-    """What is drawn anew for each render in each regeneration.
+    """Ranges from which each regeneration draws pose, lighting and surroundings of a render.
 
     By default nothing is drawn, which keeps the grid of the paper. Backgrounds keep the lighting
     that was drawn, also while an attack changes the lighting of the object.
@@ -422,7 +431,8 @@ class VariationSettings(Settings):
     )
     fov: list[float] = setting(
         list(NONE),
-        "Smallest and largest angle between the sides of the image, from 1 to 45. [0, 0]: the camera of the scene.",
+        "Smallest and largest angle between the sides of the image, from 1 to 45. [0, 0]: the "
+        "camera of the scene.",
         "degrees",
         minimum=0,
         maximum=MAX_FOV,
@@ -440,7 +450,8 @@ class VariationSettings(Settings):
     )
     directional_fraction: float = setting(
         0.0,
-        "Fraction of renders in directional lighting from the side of the camera, up to 70 degrees from it.",
+        "Fraction of renders in directional lighting from the side of the camera, up to 70 "
+        "degrees from it.",
         minimum=0,
         maximum=1,
     )
@@ -454,7 +465,8 @@ class VariationSettings(Settings):
     lit_background: bool = setting(False, "Light the backgrounds as walls that face the camera.")
     tables: float = setting(
         0.0,
-        "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the object.",
+        "Fraction of renders on a table in front of a wall, in the lighting and the shadow of the "
+        "object.",
         minimum=0,
         maximum=1,
     )
@@ -479,7 +491,7 @@ class VariationSettings(Settings):
 
     @property
     def moves(self) -> bool:
-        """Whether views change. They are then rasterized in every regeneration."""
+        """Return whether views change, so that every regeneration rasterizes them."""
         new_objects = self.instances or self.rotation > 0 or any(self.gloss.specular_factor)
         is_scaled = tuple(self.scale) != UNCHANGED
         moved = self.shift > 0 or is_scaled or any((self.azimuth, *self.fov))
@@ -498,7 +510,8 @@ class RandomLightSettings(Settings):
     )
     radius: float | None = setting(
         None,
-        "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: the amplitude applies.",
+        "L2 norm of the perturbation instead. 30 attack steps of 0.05 reach 1.5 at most. null: "
+        "the amplitude applies.",
         minimum=1 / MAX_SCALE,
         maximum=MAX_SCALE,
     )
@@ -523,14 +536,14 @@ class TrainingAttackSettings(AttackSettings):
 
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        """The settings of the parameters to change, by name: by default, the lighting."""
+        """Return the settings of the attacked parameters by name. The default is the lighting."""
         lighting = StepSettings(step=self.step, step_size=self.step_size)
         return super().parameters or {"lighting": lighting}
 
 
 @dataclass
 class AugmentationSettings(Settings):
-    """What an augmentation service renders, and when.
+    """Renders of an augmentation service, and the interval at which they are regenerated.
 
     >>> AugmentationSettings(mode="random", random_light=RandomLightSettings(radius=1.5)).renders
     True
@@ -539,7 +552,8 @@ class AugmentationSettings(Settings):
     mode: str = setting("adversarial", "Kind of renders.", choices=MODES)
     folder: str | None = setting(
         None,
-        "Folder of images for mode=folder: a folder per class, or other_NAME. They replace the renders.",
+        "Folder of images for mode=folder: a folder per class, or other_NAME. They replace the "
+        "renders.",
     )
     examples: int | None = setting(
         100,
@@ -598,7 +612,7 @@ class AugmentationSettings(Settings):
 
     @property
     def renders(self) -> bool:
-        """Whether there are any examples at all."""
+        """Return whether there are any examples."""
         return self.mode != "none" and self.examples != 0
 
 

@@ -3,7 +3,8 @@
 It shows an orange, a projector's pattern, and the orange under the pattern, and
 bars of the scores of runs before and after hardening.
 
-    python -m benchmarks.headline --attack FOLDER --mesh orange_sketchfab.glb --runs runs/demo/0 runs/demo/1 runs/demo/2
+    python -m benchmarks.headline --attack FOLDER --mesh orange_sketchfab.glb \\
+        --runs runs/demo/0 runs/demo/1 runs/demo/2
 
 FOLDER gets before.png, pattern.png and after.png. If it has them already,
 nothing is attacked. The pattern is rounded to 8 bits before the orange is

@@ -1,1 +1,1 @@
-"""Hydra's configuration: one choice per group. A package, so that it travels with an installation."""
+"""Hydra's configuration files, as a package, so that they are installed with the code."""

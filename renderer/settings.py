@@ -49,7 +49,7 @@ TURBIDITY = (2.0, 10.0)  # range of the haze of the air, from clear to hazy (pur
 
 @dataclass(frozen=True)
 class Facts:
-    """What `setting` says about a field. See there."""
+    """Explanation, unit and range of a field. They are the arguments of `setting`."""
 
     about: str = ""
     unit: str = ""
@@ -195,6 +195,13 @@ def facts_of(kind: type, name: str) -> Facts:
 
     A subclass may give a field another default without `setting`. The facts of its parent then
     apply.
+
+    Args:
+        kind: Settings class.
+        name: Name of the field.
+
+    Returns:
+        The facts. They are empty if the field was not made by `setting`.
     """
     for base in kind.__mro__:
         own: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})

@@ -142,10 +142,12 @@ class ShadedView:
         return reduce(torch.add, parts)
 
     def _with_outlines(self, camera: Camera, background: Tensor) -> PixelRadiance:
-        """Compute radiance that is differentiable in outlines.
+        """Compute radiance whose gradients include the motion of silhouettes.
 
-        See `renderer.visibility.silhouettes`. What shadows and bounces add to a pixel is divided among its samples by
-        albedo, where outlines move. The background is linear, (3, size²).
+        See `renderer.visibility.silhouettes`. The method needs the radiance of
+        each sample, but shadows and bounces are known per pixel. They are
+        divided among the samples of the pixel in proportion to the albedo. The
+        background is linear, shape (3, size²).
         """
         fragments = self.fragments
         pixel = fragments.pixel

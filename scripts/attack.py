@@ -1,4 +1,4 @@
-"""pnb-attack: attack a classifier through the lighting, the shape, the colors or the pixels of a mesh."""
+"""pnb-attack: attack a classifier through lighting, shape, colors or pixels."""
 
 from train.command import Command
 from train.command_settings import AttackExperimentSettings
@@ -33,9 +33,11 @@ main = Command(
     settings=AttackExperimentSettings,
     body="train.commands.attack_meshes:run",
     help=HelpText(
-        about="Attack a classifier through the lighting, the shape, the colors or the pixels of a mesh.",
+        about="Attack a classifier through the lighting, the shape, the colors or the pixels of a "
+        "mesh.",
         examples=[
-            "pnb-attack attack=lighting classifier=efficientnet_lite0 scene.meshes=[orange.glb] label=orange",
+            "pnb-attack attack=lighting classifier=efficientnet_lite0 "
+            "scene.meshes=[orange.glb] label=orange",
             "pnb-attack attack=lighting+geometry",
             "pnb-attack reload=runs/attacks/first/0_orange/example_000",
         ],

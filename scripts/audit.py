@@ -12,7 +12,8 @@ OWN_NETWORK = """\
       network = models.resnet18(num_classes=10)
       network.load_state_dict(torch.load("mine.pth"))
       normalize = transforms.Normalize((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-      return torch.nn.Sequential(normalize, network), 224, open("classes.txt").read().splitlines()"""
+      classes = open("classes.txt").read().splitlines()
+      return torch.nn.Sequential(normalize, network), 224, classes"""
 
 main = Command(
     name="audit",
@@ -20,14 +21,16 @@ main = Command(
     body="train.commands.audit:audit",
     help=HelpText(
         about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
-        "Your own network: classifier=torchvision:NAME weights=FILE classes=FILE, a file of TorchScript, of "
-        "torch.export (.pt2) or of ONNX (.onnx), or classifier=python:my_network:load, a function in my_network.py:"
+        "Your own network: classifier=torchvision:NAME weights=FILE classes=FILE, a file of "
+        "TorchScript, of torch.export (.pt2) or of ONNX (.onnx), or "
+        "classifier=python:my_network:load, a function in my_network.py:"
         f"\n\n{OWN_NETWORK}\n\n"
         "An audit that was stopped continues with the same settings, and with hardened= or photos= "
         "in addition.",
         examples=[
             "pnb-audit classifier=torchvision:resnet50 meshes=orange.glb",
-            "pnb-audit classifier=torchvision:mobilenet_v3_small weights=mine.pth classes=mine.txt meshes=orange.glb",
+            "pnb-audit classifier=torchvision:mobilenet_v3_small weights=mine.pth "
+            "classes=mine.txt meshes=orange.glb",
             "pnb-audit classifier=NAME meshes=[orange.glb] hard_negatives=[solid:lemon] out=audit",
         ],
     ),

@@ -52,7 +52,7 @@ def simplified(name: str) -> str:
 
 
 def class_of_name(name: str, classifier: Classifier) -> str | None:
-    """Return the class of a classifier that has a name, up to case, "_", "-" and spaces; None if not one class."""
+    """Return the class whose name differs only in case, "_", "-" and spaces. None if not unique."""
     same = [known for known in classifier.classes if simplified(known) == simplified(name)]
     if name in same:
         return name
@@ -87,8 +87,8 @@ def class_of_meshes(items: Sequence[Any], classifier: Classifier, key: str) -> s
         name = class_of_name(stem, classifier)
         if name is None:
             choices = nearest(stem, classifier.classes)
-            fault = f"label is not set, and the name of {mesh} is not that of one class of {classifier.name}"
-            raise InputError(f"{fault}: give label=CLASS, such as {choices}", "label")
+            fault = f"label is not set, and {mesh} is not named like a class of {classifier.name}"
+            raise InputError(f"{fault}: set label=CLASS, such as {choices}", "label")
         found.append(name)
     if len(set(found)) != 1:
         fault = f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}"

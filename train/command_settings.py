@@ -65,7 +65,8 @@ class ClassifierSettings(Settings):
     normalization: Any = setting_like(NetworkSettings, "normalization", None)
     size: int | None = setting(
         None,
-        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file records none.",
+        "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
+        "records none.",
         minimum=1,
         maximum=MAX_SIZE,
     )
@@ -118,7 +119,8 @@ class AttackSceneSettings(SceneSettings):
     views: int = setting_like(SceneSettings, "views", 1)
     search: int = setting(
         10,
-        "Number of cameras to try for a mesh that is misclassified, in several lightings and in front of light gray.",
+        "Number of cameras to try for a mesh that is misclassified, in several lightings and in "
+        "front of light gray.",
         minimum=0,
         maximum=MAX_VIEWS,
     )
@@ -162,14 +164,16 @@ class AttackExperimentSettings(ClassifierSettings):
     )
     target: Any = setting(
         None,
-        "Class to reach: null (any misclassification), least_likely, a class, or a list of classes, one per view.",
+        "Class to reach: null (any misclassification), least_likely, a class, or a list of "
+        "classes, one per view.",
         is_text=True,
     )
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
     reload: str | None = setting(
         None,
-        "Folder of an adversary. Its predictions are printed or, with attack=..., it is attacked further.",
+        "Folder of an adversary. Its predictions are printed or, with attack=..., it is attacked "
+        "further.",
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     device: str = setting("auto", "auto, cpu, cuda or cuda:N.")
@@ -227,7 +231,8 @@ class LabSettings(Settings):
     )
     patterns: list[str] = setting(
         list(TRAINED_PATTERNS),
-        f"Projected patterns, for as many setups each: {', '.join(PATTERNS)}. a+b projects two from two projectors.",
+        f"Projected patterns, for as many setups each: {', '.join(PATTERNS)}. a+b projects two "
+        "from two projectors.",
     )
     slides: list[str] = setting([], "Image files that the pattern `slides` projects.")
     environments: list[str] = setting(
@@ -327,15 +332,15 @@ class AuditSettings(ClassifierSettings):
     )
     label: Any = setting(
         None,
-        "Class of the meshes, by its name or index. null: the class that the name of the mesh's file tells. "
-        "Each class has an audit of its own.",
+        "Class of the meshes, by its name or index. null: the class that the name of the mesh's "
+        "file tells. Each class has an audit of its own.",
         is_text=True,
     )
     meshes: list[Any] = setting([], "Meshes of the class.")
     hard_negatives: list[Any] = setting(
         [],
-        "Meshes of other classes, in the same lighting. []: generated fruit and other things, but none with the name "
-        "of the class.",
+        "Meshes of other classes, in the same lighting. []: generated fruit and other things, but "
+        "none with the name of the class.",
     )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")
     laboratory: str | None = setting(
@@ -402,7 +407,8 @@ class EvaluateSettings(ClassifierSettings):
 
     photos: str = setting(
         REQUIRED,
-        "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory is installed.",
+        "Folder of photographs: a folder per class, or images of `label`. pretrained/laboratory "
+        "is installed.",
     )
     run: str | None = setting(
         None, "A run folder or a folder below pretrained/, instead of a classifier."
@@ -564,7 +570,8 @@ class ReportSettings(Settings):
     )
     out: str | None = setting(
         None,
-        "Folder of the page and its images. null: the common parent of the runs, whose page is replaced.",
+        "Folder of the page and its images. null: the common parent of the runs, whose page is "
+        "replaced.",
     )
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
 

@@ -219,7 +219,8 @@ class TrainSettings(Settings):
     )
     flips: str = setting(
         "random",
-        "Horizontal flips: half of the images at random, or each image in every other epoch (alternating).",
+        "Horizontal flips: half of the images at random, or each image in every other epoch "
+        "(alternating).",
         choices=FLIPS,
     )
     augmentation: str = setting(
@@ -249,7 +250,8 @@ class TrainSettings(Settings):
     )
     soup: bool = setting(
         False,
-        "Start each epoch with train.init_from again, and keep the mean of the networks of all epochs (a model soup).",
+        "Start each epoch with train.init_from again, and keep the mean of the networks of all "
+        "epochs (a model soup).",
     )
     eval_mode: bool | None = setting(
         None,
@@ -276,7 +278,8 @@ class TrainSettings(Settings):
     )
     deterministic: bool = setting(
         False,
-        "Compute the same bits every time on a GPU, which is slower. The results of a CPU always repeat.",
+        "Compute the same bits every time on a GPU, which is slower. The results of a CPU always "
+        "repeat.",
     )
     checkpoint_every: int = setting(
         1,
@@ -290,7 +293,8 @@ class TrainSettings(Settings):
     )
     cache: str | None = setting(
         "auto",
-        "Folder of rendered data sets and predictions. auto: ~/.cache/parametric-norm-balls. null: none.",
+        "Folder of rendered data sets and predictions. auto: ~/.cache/parametric-norm-balls. "
+        "null: none.",
     )
 
     def __post_init__(self) -> None:
@@ -337,23 +341,24 @@ class EvaluationSettings(Settings):
 
 @dataclass(kw_only=True)
 class NetworkSettings(Settings):
-    """What a user says about a network of their own."""
+    """Weights, classes, image size and normalization of a user's own network."""
 
     weights: str | None = setting(
         None,
-        "File of the classifier's weights: a state dict or a checkpoint, with any number of classes. "
-        "null: its own weights, or a download.",
+        "File of the classifier's weights: a state dict or a checkpoint, with any number of "
+        "classes. null: its own weights, or a download.",
     )
     classes: Any = setting(
         None,
-        "Names of the classifier's classes in the order of its outputs: a text file with a name in each line, or "
-        "[a,b]. null: the names that its source knows, otherwise 0, 1 and so on.",
+        "Names of the classifier's classes in the order of its outputs: a text file with a name "
+        "in each line, or [a,b]. null: the names that its source knows, otherwise 0, 1 and so on.",
         is_text=True,
     )
     normalization: Any = setting(
         None,
-        "Normalization before the classifier: imagenet, or [MEAN,STD] of red, green and blue in units of [0, 1], "
-        "such as [[0,0,0],[1,1,1]] for none. null: that of its source, and none before a file's network.",
+        "Normalization before the classifier: imagenet, or [MEAN,STD] of red, green and blue in "
+        "units of [0, 1], such as [[0,0,0],[1,1,1]] for none. null: that of its source, and none "
+        "before a file's network.",
         is_text=True,
     )
 
@@ -363,7 +368,7 @@ class NetworkSettings(Settings):
 
 
 def class_texts(classes: Any) -> Any:
-    """Return a setting of class names in which numbers are texts, since YAML takes digits for numbers."""
+    """Return class names as texts, since YAML reads digits as numbers."""
     if not isinstance(classes, list):
         return classes
     return [str(name) if is_whole(name) else name for name in classes]

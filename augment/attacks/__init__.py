@@ -1,1 +1,1 @@
-"""Attacks on what a scene shows, and what they leave behind: checks, images, lights, shapes, numbers."""
+"""Attacks on the light, shapes, materials and poses of a scene, and checks of their results."""

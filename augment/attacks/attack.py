@@ -97,35 +97,35 @@ class AttackResult:
 
     @property
     def preprocessed_model(self) -> nn.Module:
-        """Classifier with its preprocessing; see `augment.attacks.eot.preprocessed_model`."""
+        """Return the classifier with its preprocessing, see `augment.attacks.eot`."""
         return preprocessed_model(self.settings, self.classifier)
 
     @property
     def success(self) -> Tensor:
-        """Whether every view reaches its criterion, also with the noise of a sensor, (E,) bool."""
+        """Return a mask of the examples (E,) that meet the criterion, with noise, in all views."""
         return self.success_in_views.all(1)
 
     @property
     def success_without_noise(self) -> Tensor:
-        """Whether every view reaches its criterion as the classifier gets it, (E,) bool."""
+        """Return a mask of the examples (E,) that meet the criterion in all views without noise."""
         return self.criterion.reached(self.logits.argmax(2))
 
     @property
     def success_with_margin(self) -> Tensor:
-        """Whether a success also leads by `settings.margin` in every view, (E,) bool."""
+        """Return a mask of the successes (E,) that lead by `settings.margin` in all views."""
         gaps = logit_gap(self.logits, self.criterion.source, self.criterion.target)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
-        """Whether every view reached its criterion before the attack, (E,) bool."""
+        """Return a mask of the examples (E,) that met the criterion before the attack."""
         return self.criterion.reached(self.logits_before.argmax(2))
 
     @property
     def clean_correct(self) -> Tensor:
-        """Whether every view was classified correctly before the attack, (E,) bool.
+        """Return a mask of the examples (E,) whose views were all correct before the attack.
 
-        Only then is a success the merit of the attack.
+        Success rates of attacks count only these examples.
         """
         return (self.logits_before.argmax(2) == self.criterion.source).all(1)
 
@@ -154,7 +154,7 @@ class AttackResult:
         Raises:
             InputError: If there is no such example or view.
         """
-        # To import matplotlib takes half a second.
+        # Importing matplotlib takes half a second.
         from augment.attacks.plots import draw_attack
 
         example_count, view_count = self.images.shape[:2]

@@ -307,7 +307,7 @@ def require_transferable(
 
 @dataclass(frozen=True)
 class Successes:
-    """Which of E examples are a success. More successes are added in place.
+    """Masks of the E examples that are a success. `add` adds successes in place.
 
     Attributes:
         counted: With the noise of a sensor, as `fooled_in_views` counts,
@@ -333,7 +333,7 @@ class Successes:
 
     @property
     def left(self) -> Tensor:
-        """Indices of the examples that are not counted, shape (A,)."""
+        """Return the indices of the examples that are not counted, shape (A,)."""
         return torch.nonzero(~self.counted).squeeze(1)
 
     def add(

@@ -1,6 +1,6 @@
-"""The adapter of a classifier: one module that takes images as the renderer makes them, and names its classes.
+"""The class `Classifier`: a network that takes rendered images, with the names of its classes.
 
-Its network may be a user's own, returned by a function of a Python module.
+The network may be the user's own. A function of a Python module then returns it.
 """
 
 from __future__ import annotations
@@ -26,18 +26,30 @@ from renderer.validation import as_list, as_tensor, require_kind, require_whole
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-
-Label = str | Sequence[str]  # the class under study, or several
-OVERSHOOT = 0.1  # beyond [0, 1], of values that an interpolation or noise may give
-SEVERAL = 2  # images whose outputs are probabilities before a network is refused for it
+Label = str | Sequence[str]  # One positive class, or several.
+# Values of images may exceed [0, 1] by this much, since interpolation and noise
+# can do that.
+OVERSHOOT = 0.1
+# A network is refused after it returned probabilities for this many images.
+# Logits of a single image may be in [0, 1] and sum to 1 by chance.
+MIN_PROBABILITY_ROWS = 2
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """A threshold on the log-odds of the class `label`: images above it are taken for the class.
+    """Threshold on the log-odds of a class. Images above it are classified as the class.
 
-    It is the lowest that at most the fraction `false_positive_rate` of the `negatives` images of other things exceed in
-    a folder of this name, whose `images` have this hash.
+    The threshold is the lowest at which the false-positive rate on a folder of
+    photographs is at most `false_positive_rate`.
+
+    Attributes:
+        label: Name of the class.
+        threshold: Log-odds above which an image is classified as the class.
+        false_positive_rate: Largest allowed fraction of negatives above the
+            threshold, in [0, 1].
+        folder: Name of the folder of photographs.
+        images: Hash of the photographs.
+        negatives: Number of photographs that do not show the class.
     """
 
     label: str
@@ -49,12 +61,13 @@ class OperatingPoint:
 
 
 class NetworkCall:
-    """Calls a network and refuses what it returns in place of logits.
+    """Calls a network and checks that it returns logits.
 
     Attributes:
         name: Start of error messages, such as "classifier NAME".
-        probability_rows: Number of outputs so far that are probabilities, or None once an output was none. From then
-            on, outputs are not compared with probabilities, which costs nothing.
+        probability_rows: Number of images so far for which the network returned
+            probabilities. None after the first batch that has other values.
+            Later batches are then no longer checked, which saves time.
     """
 
     def __init__(self, name: str):
@@ -75,7 +88,8 @@ class NetworkCall:
             Logits, shape (N, C).
 
         Raises:
-            InputError: If the network fails, or returns something else than one row of logits for each image.
+            InputError: If the network fails, or does not return one row of
+                logits for each image.
         """
         shape = tuple(images.shape)
         try:
@@ -88,57 +102,74 @@ class NetworkCall:
         fits = isinstance(logits, Tensor) and logits.ndim == 2 and len(logits) == len(images)
         if not fits or classes not in (None, logits.shape[1]):
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            raise InputError(
-                f"{self.name} returned {returned}: make it return logits {expected} of images {shape}"
-            )
+            remedy = f"it must return logits {expected}"
+            raise InputError(f"{self.name} returned {returned} for images {shape}: {remedy}")
         self._require_no_probabilities(logits)
         return logits
 
     def _failure(
         self, network: Callable[[Tensor], Tensor], images: Tensor, error: Exception
     ) -> str:
-        """Say why a network fails on images, and what to do about it."""
+        """Return an error message with the failure of a network and its remedy."""
         weights = network.parameters() if isinstance(network, nn.Module) else iter(())
         dtypes = {weight.dtype for weight in weights if weight.is_floating_point()}
         given = f"{images.dtype} images {tuple(images.shape)}".removeprefix("torch.")
         reason = f"{self.name} fails on {given} ({type(error).__name__}: {single_line(error)})"
         if dtypes and images.dtype not in dtypes:
             of_weights = ", ".join(sorted(str(dtype).removeprefix("torch.") for dtype in dtypes))
-            remedy = f"convert it with network.to({images.dtype}), or the light of the scene to {of_weights}"
+            remedy = f"convert it with network.to({images.dtype}), or use light in {of_weights}"
             return f"{reason}: its weights are {of_weights}, {remedy}"
-        return f"{reason}: make it take these"
+        return f"{reason}: use a network that takes such images"
 
     def _require_no_probabilities(self, logits: Tensor) -> None:
-        """Refuse a network whose first outputs of several images are probabilities."""
+        """Raise InputError if the network's first outputs are probabilities."""
         if self.probability_rows is None or not len(logits):
             return
         if not are_probabilities(logits):
             self.probability_rows = None
             return
         self.probability_rows += len(logits)
-        if self.probability_rows >= SEVERAL:
-            fault = "returned probabilities, which are in [0, 1] and sum to 1, in place of logits"
-            raise InputError(
-                f"{self.name} {fault}: leave out its softmax, or return the logarithm of its result"
-            )
+        if self.probability_rows >= MIN_PROBABILITY_ROWS:
+            fault = "returned probabilities (values in [0, 1] that sum to 1) instead of logits"
+            raise InputError(f"{self.name} {fault}: remove its softmax, or return its logarithm")
 
 
 def are_probabilities(outputs: Tensor) -> bool:
-    """Tell whether all rows (N, C) of several classes are in [0, 1] and sum to 1 up to rounding."""
+    """Return whether every row of outputs (N, C) is in [0, 1] and sums to 1 up to rounding.
+
+    Outputs with a single class do not count as probabilities.
+    """
     if outputs.shape[1] < 2 or not outputs.is_floating_point():
         return False
     values = outputs.detach()
     rounding = max(1e-5, torch.finfo(values.dtype).eps)
-    off = (values.double().sum(1) - 1).abs().max()
-    return bool((values.min() >= 0) & (off <= rounding))
+    deviation = (values.double().sum(1) - 1).abs().max()
+    return bool((values.min() >= 0) & (deviation <= rounding))
 
 
 class Classifier(nn.Module):
-    """A frozen classifier: images, RGB in [0, 1], to logits of C classes; differentiable in the pixels.
+    """Frozen classifier from RGB images in [0, 1] to logits of C classes.
 
-    name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
-    the C names, each once. The parameters need no gradient and the mode stays eval, also after `train()`.
-    operating_points: of a published network that carries some, one for each class, for `detect`.
+    The logits are differentiable with respect to the pixels. The parameters of
+    the network need no gradient. The network stays in evaluation mode, even
+    after `train()`. Images are not resized.
+
+    Args:
+        function: Network, or another function from images (N, 3, size, size) to
+            logits (N, C). If it is a module, it is frozen, put in evaluation
+            mode and moved with the classifier.
+        size: Pixels per side of the images, from 1 to 4,096.
+        classes: Names of the C classes in the order of the logits. Each name
+            occurs once, because labels are found by name.
+        name: Name of the classifier in messages.
+
+    Attributes:
+        operating_points: Thresholds for `detect`, at most one for each class.
+            Empty if the network stores none.
+
+    Raises:
+        InputError: If a class name occurs twice, if there is no class, or if
+            the size is out of range.
     """
 
     operating_points: Sequence[OperatingPoint] = ()
@@ -150,8 +181,6 @@ class Classifier(nn.Module):
         classes: Sequence[str],
         name: str = "callable",
     ):
-        """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
-        mode. InputError for a class name that occurs twice, since labels are found by name, and a size beyond 4,096."""
         super().__init__()
         require_kind("name", name, str, "a string for messages")
         require_kind(
@@ -165,13 +194,25 @@ class Classifier(nn.Module):
         self.name = name
         self._call_network = NetworkCall(f"classifier {name}")
         if not 0 < len(set(self.classes)) == len(self.classes):
-            remedy = "name its classes, in the order of its logits, by different names"
-            raise InputError(f"classifier {name}: {remedy}")
+            fault = f"classifier {name}: classes has {len(self.classes)} names"
+            remedy = "give each class a name of its own, in the order of the logits"
+            raise InputError(f"{fault}, of which {len(set(self.classes))} are different: {remedy}")
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
-        """InputError for images of another size or far from [0, 1], and for a callable that fails or returns something
-        else than finite logits with a gradient, such as probabilities."""
+        """Compute the logits of images.
+
+        Args:
+            images: RGB images in [0, 1], shape (N, 3, size, size).
+
+        Returns:
+            Logits, shape (N, C).
+
+        Raises:
+            InputError: If the images have another size or are far from [0, 1].
+                Also if the network fails, or returns anything but finite logits
+                with a gradient.
+        """
         name = f"classifier {self.name}"
         size = self.size
         images = as_images("images", images)
@@ -182,7 +223,8 @@ class Classifier(nn.Module):
             )
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
-        require_unit_range("images", *extremes)  # only now, since the host waits here for a GPU
+        # Checked after the network was started, because the CPU waits for the GPU here.
+        require_unit_range("images", *extremes)
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
@@ -192,23 +234,32 @@ class Classifier(nn.Module):
     def detect(
         self, images: Float[Tensor, "N 3 size size"], label: str | None = None
     ) -> Bool[Tensor, " N"]:
-        """Whether images, RGB in [0, 1], show a class, by the threshold of its operating point instead of argmax.
+        """Decide which images show a class, by the threshold of its operating point.
 
-        label: the class, where there are operating points of several. InputError without one, and as of `forward`.
+        Args:
+            images: RGB images in [0, 1], shape (N, 3, size, size).
+            label: Name of the class. May be None if there is exactly one
+                operating point.
+
+        Returns:
+            Mask of the images that show the class, shape (N,).
+
+        Raises:
+            InputError: If the class has no operating point, or if `forward`
+                refuses the images.
         """
         require_kind("label", label, str | None, "the name of a class")
         points = [point for point in self.operating_points if label in (None, point.label)]
         if len(points) != 1:
             known = ", ".join(point.label for point in self.operating_points)
-            remedy = ": choose one when it is published (pnb-publish)"
-            if known:
-                remedy = f"s but of {known}: give one of these as label"
-            raise InputError(f"classifier {self.name} has no operating point{remedy}")
+            remedy = f"set label to one of {known}" if known else "store one with pnb-publish"
+            fault = f"classifier {self.name} has no operating point for label={label}"
+            raise InputError(f"{fault}: {remedy}")
         (point,) = points
         return log_odds(self(images).double(), self.label(point.label)) > point.threshold
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in eval mode: running batch statistics, no dropout."""
+        """Keep evaluation mode: running batch statistics and no dropout."""
         return super().train(False)
 
     def label(self, class_name: str | int) -> int:
@@ -228,37 +279,58 @@ class Classifier(nn.Module):
 
 
 def as_images(name: str, images: object) -> Tensor:
-    """Convert images to a tensor of floating-point numbers; InputError for bytes and for what is no number."""
+    """Convert images to a tensor of floating-point numbers.
+
+    Args:
+        name: Name of the argument, for errors.
+        images: Tensor, NumPy array or nested list.
+
+    Returns:
+        The images.
+
+    Raises:
+        InputError: If the images are bytes, or not numbers.
+    """
     if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
         raise InputError(
-            f"{name} is {describe(images)}: give floating-point RGB in [0, 1], such as {name} / 255"
+            f"{name} is {describe(images)}: use floating-point RGB in [0, 1], such as {name} / 255"
         )
     return as_tensor(name, images)
 
 
 def require_unit_range(name: str, *extremes: Tensor) -> None:
-    """Check that images are RGB in [0, 1], which values may exceed a little.
+    """Check that values of images are in [0, 1], up to `OVERSHOOT`.
 
     Args:
         name: Name of the argument, for the error.
-        extremes: The lowest and the highest value; none of no images.
+        extremes: The lowest and the highest value. Empty if there are no
+            images.
 
     Raises:
-        InputError: If values are far from [0, 1], as of bytes and of normalized images, or NaN.
+        InputError: If a value is NaN or far from [0, 1]. This happens with
+            bytes and with normalized images.
     """
     if not extremes:
         return
     low, high = torch.stack(extremes).tolist()
     if not (low >= -OVERSHOOT and high <= 1 + OVERSHOOT):
-        remedy = "give RGB in [0, 1], not normalized; divide bytes by 255"
-        raise InputError(f"{name} holds values from {low:g} to {high:g}: {remedy}")
+        remedy = "use RGB in [0, 1], without normalization (divide bytes by 255)"
+        raise InputError(f"{name} has values from {low:g} to {high:g}: {remedy}")
 
 
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
-    """Convert the names of classes, in the order of the logits, to a tuple of strings.
+    """Convert the names of classes to a tuple of strings.
+
+    Args:
+        name: Name of the argument, for errors.
+        classes: List of names in the order of the logits.
+
+    Returns:
+        The names.
 
     Raises:
-        InputError: If it is no list of strings, but for example one string.
+        InputError: If `classes` is not a list of strings. A single string is
+            refused, too.
     """
     return tuple(
         as_list(
@@ -268,9 +340,11 @@ def as_class_names(name: str, classes: object) -> tuple[str, ...]:
 
 
 class Wrapper(nn.Module):
-    """A module around a network, whose weights have the names of the network's own file.
+    """Module that holds another network and passes images to it.
 
-    Attributes:
+    Subclasses change the images before, or the logits after.
+
+    Args:
         network: Module or function from images to logits.
     """
 
@@ -291,7 +365,7 @@ def unwrapped(network: Any) -> Any:
 
 
 class ArrayFunction(Wrapper):
-    """A function from NumPy arrays to scores, for tensors. It has no gradients.
+    """Network of tensors that calls a function of NumPy arrays. It has no gradients.
 
     Args:
         function: Function from images (N, 3, H, W), float32 in [0, 1], to
@@ -305,10 +379,17 @@ class ArrayFunction(Wrapper):
 
 
 class Normalized(Wrapper):
-    """A network behind its own normalization: takes images (N, 3, H, W), RGB in [0, 1], as (x − mean) / std.
+    """Network that takes RGB images in [0, 1] and normalizes them as (x − mean) / std.
 
-    mean, std: in units of [0, 1] and in the network's own order of channels. bgr: whether that order is blue first.
-    The network gets them channels last, in which a CPU convolves about a quarter faster.
+    The images are stored channels last, with which convolutions on a CPU are
+    about a quarter faster.
+
+    Args:
+        network: Network that takes normalized images (N, 3, H, W).
+        mean: Mean of the three channels in the network's order, in units of
+            [0, 1].
+        std: Standard deviation of the channels, in the same order and unit.
+        bgr: Whether the network takes blue as the first channel.
     """
 
     mean: Tensor
@@ -323,10 +404,10 @@ class Normalized(Wrapper):
         self.bgr = bgr
 
     def forward(self, images: Tensor) -> Tensor:
+        """Compute the logits (N, C) of RGB images (N, 3, H, W) in [0, 1]."""
         ordered = images.flip(1) if self.bgr else images
-        return self.network(
-            ((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
-        )
+        normalized = (ordered - self.mean) / self.std
+        return self.network(normalized.contiguous(memory_format=torch.channels_last))
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
@@ -351,15 +432,16 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     text = str(name)
     if isinstance(name, str) and not name.isdecimal() and _are_indices(classes):
         remedy = f"give an index from 0 to {len(classes) - 1}, or name the classes"
-        raise InputError(f"{subject}: the classes have no names, and {name!r} is given: {remedy}")
+        raise InputError(
+            f"{subject}: {name!r} is a name, but the classes have only indices: {remedy}"
+        )
     if text.isascii() and text.isdecimal():
         if int(text) < len(classes):
             return int(text)
         indices = f"indices go from 0 to {len(classes) - 1}"
         raise InputError(f"{subject}: the label {text} is not a class: {indices}")
-    raise InputError(
-        f"{subject}: {name!r} is not a class of the model: choose one, such as {nearest(text, classes)}"
-    )
+    remedy = f"choose one, such as {nearest(text, classes)}"
+    raise InputError(f"{subject}: {name!r} is not a class of the model: {remedy}")
 
 
 def _are_indices(classes: Sequence[str]) -> bool:
@@ -368,7 +450,15 @@ def _are_indices(classes: Sequence[str]) -> bool:
 
 
 def nearest(name: str, choices: Sequence[str]) -> str:
-    """The three choices most like a name: 'a, b, c'."""
+    """Return the three most similar choices as one text.
+
+    Args:
+        name: Name that was given.
+        choices: Names to choose from.
+
+    Returns:
+        The nearest names, such as "a, b, c".
+    """
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
 
 
@@ -412,13 +502,13 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         network, size, classes = getattr(importlib.import_module(module), function)()
     except InputError:
         raise
-    except (Exception, SystemExit) as error:  # of the user's code, or where there is none
-        at = traceback.extract_tb(error.__traceback__)[-1]
-        reason = (
-            f"{type(error).__name__}: {single_line(error)}, in line {at.lineno} of {at.filename}"  # type: ignore[arg-type]
-        )
+    except (Exception, SystemExit) as error:  # The user's code may raise any exception.
+        last_call = traceback.extract_tb(error.__traceback__)[-1]
+        kind = type(error).__name__
+        place = f"line {last_call.lineno} of {last_call.filename}"
+        reason = f"{kind}: {single_line(error)}, in {place}"  # type: ignore[arg-type]
         expected = "python:package.module:function, which returns (module, size, classes)"
-        raise InputError(f"name=python:{name} fails ({reason}): give {expected}", "name") from error
+        raise InputError(f"name=python:{name} fails ({reason}): use {expected}", "name") from error
     ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
     if not (
         callable(network) and type(size) is int and ordered and all(type(c) is str for c in classes)

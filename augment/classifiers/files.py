@@ -85,12 +85,21 @@ def load_file(name: str, facts: NetworkFacts = NO_FACTS) -> Classifier:
 
 
 def build_file(name: str, size: int, facts: NetworkFacts = NO_FACTS) -> Classifier:
-    """Load a classifier from a file, for images of another size."""
+    """Load a classifier from a file, for images of another size.
+
+    Args:
+        name: Path of the file, see `load_file`.
+        size: Pixels per side of the images.
+        facts: Classes and normalization.
+
+    Returns:
+        The classifier.
+    """
     return load_file(name, replace(facts, size=size))
 
 
 def _read(path: Path) -> Content:
-    """Read the network of a file; InputError for a file of another kind."""
+    """Read the network of a file, or raise InputError for a file of another kind."""
     read = {EXPORTED: _read_exported, ONNX: read_onnx}.get(path.suffix.lower(), _read_torchscript)
     try:
         return read(path)
@@ -114,7 +123,7 @@ def _read_torchscript(path: Path) -> Content:
             )
         raise InputError(f"name={path} {advice}", "name")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that torch.jit is deprecated
+        warnings.simplefilter("ignore")  # torch warns that torch.jit is deprecated.
         return Content(torch.jit.load(path, map_location="cpu").eval())
 
 
@@ -177,7 +186,7 @@ def read_onnx(path: Path) -> Content:
         advice = 'pip install "parametric-norm-balls[onnx]"'
         raise InputError(f"name={path} needs onnxruntime: {advice}", "name") from error
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # errors
+    options.log_severity_level = 3  # Log errors and fatal errors.
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     [images] = session.get_inputs()
     sizes = [size if isinstance(size, int) else None for size in images.shape]

@@ -27,7 +27,8 @@ COLORS = 3
 UNIT_RANGE = (0.0, 1.0)
 # Pixels per side of the images of most networks that were trained on ImageNet.
 USUAL_SIZE = 224
-# Images of the call that checks a network. Two tell probabilities from logits.
+# Number of images in the call that checks a network. A single row of logits may
+# look like probabilities by chance, so there are two.
 CHECKED_COUNT = 2
 # Names of the modules of torchvision, kornia and this library that normalize.
 NORMALIZING = frozenset({"Normalize", "Normalized"})
@@ -39,11 +40,11 @@ Normalization = str | tuple[Sequence[float], Sequence[float]] | None
 
 @dataclass(frozen=True)
 class NetworkFacts:
-    """What a user says about a network that is loaded by its name.
+    """Classes, image size and normalization that a user gives for a network.
 
     Attributes:
         classes: Names of the classes in the order of the outputs. None for the
-            names that the source knows or, if it knows none, for "0", "1" and
+            names of the source or, if it has none, for "0", "1" and
             so on.
         size: Pixels per side of the images. None for the size of the source.
         normalization: "imagenet", or mean and standard deviation of the
@@ -91,10 +92,18 @@ def as_facts(
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
-    """Raise InputError if facts are given for the network `name`, which has its own."""
+    """Check that no facts are given for a network whose source has its own.
+
+    Args:
+        name: Name of the network, for the error.
+        facts: Facts that the user gave.
+
+    Raises:
+        InputError: If a fact is given.
+    """
     for key, value in vars(facts).items():
         if value is not None:
-            raise InputError(f"{key} is not for {name}, which has its own: leave it out", key)
+            raise InputError(f"{key} cannot be set for {name}, which has its own: remove it", key)
 
 
 def index_names(count: int) -> tuple[str, ...]:
@@ -165,9 +174,8 @@ def as_classifier(
     function = _preprocessed(network, normalization, value_range).to(device)
     count = _count_outputs(function, size, device, argument)
     if names is not None and len(names) != count:
-        raise InputError(
-            f"classes has {len(names)} names, and the network returns {count} outputs: give one name per output"
-        )
+        fault = f"classes has {len(names)} names, but the network returns {count} outputs"
+        raise InputError(f"{fault}: give one name per output")
     name = name or type(network).__name__
     return Classifier(function, size, names or index_names(count), name)
 

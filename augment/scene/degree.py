@@ -56,12 +56,12 @@ class Smoothest(NamedTuple):
 
     @property
     def gloss(self) -> float | None:
-        """The roughness, or None if no surface has gloss."""
+        """Return the roughness, or None if no surface has gloss."""
         return self.roughness if self.roughness < MATTE else None
 
     @property
     def degree(self) -> int:
-        """The degree of lighting that shows the gloss, or 0 if no surface has gloss."""
+        """Return the degree of light that the gloss needs, or 0 if no surface has gloss."""
         return required_degree(self.roughness) if self.roughness < MATTE else 0
 
     def warn(self, choice: str, degree: int) -> None:

@@ -40,7 +40,7 @@ NEAR = 0.001
 
 
 class FrozenView(NamedTuple):
-    """What shadows and bounces add to a view of a mesh with a known albedo.
+    """Radiance that shadows and bounces add to a view of a mesh with a known albedo.
 
     Attributes:
         change: Radiance that is added per unit of each of K coefficients of the
@@ -79,7 +79,7 @@ class FrozenTransport:
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
 
     def is_near(self, vertices: np.ndarray) -> bool:
-        """Return whether no coordinate of vertices (V, 3) is farther than `NEAR` from the mesh's."""
+        """Return whether all coordinates of vertices (V, 3) are within `NEAR` of the mesh."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
@@ -165,7 +165,7 @@ class DirectRenderer:
 
     @cached_property
     def vertices(self) -> list[Tensor]:
-        """The vertices of each unmoved object, shape (V, 3)."""
+        """Return the vertices of each unmoved object, shape (V, 3)."""
         return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
@@ -365,7 +365,15 @@ class _IndirectLight:
     is_kept: bool
 
     def radiance(self, albedo: Tensor, light: Tensor) -> Tensor:
-        """Return the added radiance (3, P), with albedo (S, 3), in light (K, 3)."""
+        """Compute the radiance that shadows and bounces add to the P pixels of the view.
+
+        Args:
+            albedo: Albedo of the S samples, shape (S, 3).
+            light: Coefficients of the environment light, shape (K, 3).
+
+        Returns:
+            Added radiance, shape (3, P).
+        """
         frozen = self.direct_rendering.transport_near(
             self.example, self.number, self.camera, self.positions
         )

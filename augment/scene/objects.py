@@ -46,26 +46,26 @@ class SceneObject:
 
     @property
     def own_faces(self) -> np.ndarray:
-        """Whether each face is the object's own, not a prop's or the table's. Shape (F,)."""
+        """Return a mask of the faces (F,) of the object itself, without props and table."""
         face_count = len(self.mesh.faces)
         own_count = face_count if self.own is None else self.own
         return np.arange(face_count) < own_count
 
     @property
     def own_vertices(self) -> np.ndarray:
-        """Whether each vertex is in no face of props and table. Shape (V,)."""
+        """Return a mask of the vertices (V,) that no face of props and table uses."""
         other_vertices = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), other_vertices)
 
     @cached_property
     def radius(self) -> float:
-        """The largest distance of a vertex from the origin, with props and table."""
+        """Return the largest distance of a vertex from the origin, including props and table."""
         distances = np.linalg.norm(self.mesh.vertices, axis=1)
         return float(distances[self.mesh.faces].max())
 
     @property
     def lowest(self) -> float:
-        """The height z of the lowest vertex, where a table is."""
+        """Return the height z of the lowest vertex, at which a table is placed."""
         heights = self.mesh.vertices[:, 2]
         return float(heights[self.mesh.faces].min())
 

@@ -92,7 +92,7 @@ class Relighting:
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """All stacks of operators. Missing stacks are built."""
+        """Return all stacks of operators, and build those that do not exist yet."""
         self._build_missing(range(self._stack_count))
         return [self._built[index].operators for index in range(self._stack_count)]
 

@@ -1,4 +1,4 @@
-"""The scene: examples of objects, cameras and backgrounds, rendered under conditions that an attack may change."""
+"""Examples of objects, cameras and backgrounds, rendered under conditions that attacks change."""
 
 from __future__ import annotations
 
@@ -216,22 +216,22 @@ class Scene:
 
     @cached_property
     def cameras(self) -> list[tuple[Camera, ...]]:
-        """The V cameras of each example."""
+        """Return the V cameras of each example."""
         return [example.cameras for example in self.examples]
 
     @cached_property
     def labels(self) -> list[str]:
-        """The class name of each example."""
+        """Return the class name of each example."""
         return [self.objects[example.object].label for example in self.examples]
 
     @cached_property
     def vertices(self) -> Tensor:
-        """The vertices of each object, shape (M, N, 3). Those of smaller meshes end in zeros."""
+        """Return the vertices of the M objects, shape (M, N, 3), padded with zeros."""
         return torch.nn.utils.rnn.pad_sequence(self._direct_renderer.vertices, batch_first=True)
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """The stacked transfer operators of all views, built where they are missing."""
+        """Return the stacked transfer operators of all views, and build missing ones."""
         return self._relighting.stacks
 
     def mesh(self, example: int) -> Mesh:

@@ -112,8 +112,8 @@ def _vary_geometry(
             replace(example, object=index_of_view[view])
             for example, view in zip(examples, views, strict=True)
         ]
-    # For images in one lighting, transfer operators are worth their cost only where the
-    # alternative is to trace rays.
+    # If a view is rendered in one lighting only, a transfer operator costs more than direct
+    # rendering, except if direct rendering would trace rays.
     needs_rays = bool(scene.basis.local_lights) or scene.settings.global_illumination
     one_light = once and settings.moves and not needs_rays
     return scene.changed(examples=examples, one_light=one_light, **changed)
@@ -265,7 +265,16 @@ class _DrawnLights:
         return torch.cat([environment, self.local], dim=1)
 
     def without_ground(self, is_on_table: Tensor, albedo: Tensor) -> "_DrawnLights":
-        """Replace the light from below by what tables of the images' mean albedo reflect."""
+        """Replace light from below by the light that a table reflects.
+
+        Args:
+            is_on_table: Mask of the examples with a table, shape (E,).
+            albedo: Albedo of the background images, shape (E, C, size, size).
+                A table has the mean albedo of its image.
+
+        Returns:
+            A copy with the changed environment light.
+        """
         environment = self.environment.clone()
         environment[is_on_table] = above_table(
             environment[is_on_table],
@@ -342,7 +351,7 @@ def _draw_directional(
         for example, turn in zip(scene.examples, angles, strict=True)
     ]
     directions = torch.from_numpy(np.stack([camera.axes()[2] for camera in cameras]))
-    # No light comes from below a table. A direction from there is mirrored.
+    # A table blocks light from below, so directions from below are mirrored.
     grounds = [scene.objects[example.object].ground for example in scene.examples]
     has_table = is_on_table | torch.tensor([ground is not None for ground in grounds])
     directions[has_table, 2] = directions[has_table, 2].abs()

@@ -135,7 +135,7 @@ class Harmonics(Basis):
 
     @property
     def nonzero(self) -> Tensor:
-        """Ascending indices (K,) of the functions that a diffuse surface under an open sky reflects."""
+        """Ascending indices of the functions that an unshadowed diffuse surface reflects, (K,)."""
         return nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ class Harmonics(Basis):
         return by_function.T.contiguous()
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Compute the radiance (N, size) from unit directions (N, 3) per unit of each coefficient."""
+        """Compute the radiance per unit of each coefficient, (N, size), from directions (N, 3)."""
         return basis(directions, self.degree)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:

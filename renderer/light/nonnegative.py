@@ -109,8 +109,8 @@ class _NodeLimits:
 
 
 _ALL_CANDIDATES = _NodeLimits(above_zero=0.04, above_neighbors=1e-3)
-# With these limits, a candidate must be lower than all its neighbors. This is
-# faster, and may miss dips, which the next exchange step finds.
+# Limits under which a candidate must be lower than all its neighbors. They are
+# faster. Dips that they miss are found by the next exchange step.
 _LOWEST_NODES = _NodeLimits(above_zero=0.04, above_neighbors=0.0)
 
 
@@ -341,7 +341,7 @@ class _Program:
 
 @dataclass(frozen=True)
 class _Motion:
-    """How a channel of the solution moves with t while the same rows stay active.
+    """Derivatives of a channel of the solution by t while the same rows stay active.
 
     `light` (K,) is the derivative of the solution by t, `multipliers` (M,) are
     those of the active rows, and `changes` (M,) are their derivatives by t.

@@ -327,7 +327,7 @@ def _radiosity(
 
 @dataclass(frozen=True)
 class _PatchLinks:
-    """What N patches receive from the sky and from each other.
+    """Irradiance of N patches from the sky and from each other.
 
     Attributes:
         from_sky: S, the irradiance from the sky per unit of each coefficient,
@@ -343,7 +343,7 @@ class _PatchLinks:
 
     @staticmethod
     def of(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
-        """Find by rays what the patches see."""
+        """Trace rays from all patches to find the sky and the patches that they see."""
         surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
         from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
         from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))

@@ -31,7 +31,7 @@ BATCH = 40
 
 
 def renders() -> tuple[Tensor, Tensor]:
-    """Render each class in 12 views, in uniform light; return images (120, 3, 32, 32) and labels."""
+    """Return images (120, 3, 32, 32) and labels: 12 views of each class in uniform light."""
     images = []
     for name in CLASSES:
         item = (f"solid:{name.lower().replace(' ', '_')}:0", name)

@@ -411,7 +411,7 @@ def _read_into(
         errors = pool.map(_read_image, images, paths)
         return list(progress(errors, "photographs", len(paths)))
     finally:
-        # After Ctrl-C, the images that remain are not read.
+        # Ctrl-C then ends the command without reading the remaining images.
         pool.shutdown(cancel_futures=True)
 
 

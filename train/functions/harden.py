@@ -44,8 +44,7 @@ from train.training.data import load_data
 from train.training.initial import initial_of
 from train.training.run import Run
 
-# What a section of the settings is given as: all of its fields, or those to
-# change by name.
+# Values of some settings of a section by name. None for the defaults.
 Section = Mapping[str, Any] | None
 
 

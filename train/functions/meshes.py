@@ -12,8 +12,8 @@ from renderer.validation import as_list
 from train.class_names import class_of_name
 from train.settings import solid_name
 
-# What a caller names a mesh by: a file or solid:NAME, a pair of it and its
-# class, or settings.
+# A mesh as an argument: a file or solid:NAME, a pair of these and a class, or
+# settings.
 MeshItem = str | Path | tuple[str | Path, str | int] | ObjectSettings
 EXPECTED = (
     "a list of files or solids such as 'solid:orange', "
@@ -89,7 +89,8 @@ def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[st
     """
     for index, item in enumerate(hard_negatives):
         name = item.get("label") or _name_of(item)
-        # With several classes under study, an object of one is a hard negative for the others.
+        # If there are several positive classes, an object of one class is a hard negative for
+        # the others.
         is_studied = name in labels and (len(labels) == 1 or not item.get("label"))
         if is_studied:
             raise InputError(

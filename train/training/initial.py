@@ -59,7 +59,7 @@ class Initial:
 
     @property
     def is_classifier(self) -> bool:
-        """Return whether the network is, or began as, a pretrained classifier of another library."""
+        """Return whether the network has the architecture of a classifier of another library."""
         return CLASSIFIER in self.architecture
 
     @property

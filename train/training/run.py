@@ -195,7 +195,7 @@ class Run:
         return recorded if isinstance(recorded, int) and recorded > 0 else None
 
     def _warn_of_stretched_schedule(self, planned: int) -> None:
-        """Warn if a resumed run continues at another learning rate, due to a new number of epochs."""
+        """Warn if a new number of epochs changes the learning rate of a resumed run."""
         recipe = self.settings.train
         # Each epoch of a soup runs through the whole schedule, so that the number of
         # epochs does not change it.

@@ -73,7 +73,7 @@ class Skylight(Parameter):
             Conditions with the light of the sky, differentiable with respect to
             the values.
         """
-        # In float64, the conversions of the angles add no rounding to their values.
+        # The angles are converted in float64, which adds no rounding error.
         zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
         # Shape (A, 49, 3).

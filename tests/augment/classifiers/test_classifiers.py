@@ -141,7 +141,7 @@ def test_a_classifier_is_frozen_and_stays_in_eval_mode():
     ("function", "shape", "message"),
     [
         (mean_color, (2, 3, 8, 9), "(N, 3, 8, 8), not (2, 3, 8, 9)"),
-        (lambda images: images[:, :2, 0, 0], (2, 3, 8, 8), "(2, 2): make it return logits (2, 3)"),
+        (lambda images: images[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2)"),
         (lambda images: images.detach().mean((2, 3)), (2, 3, 8, 8), "without a gradient"),
         (lambda images: images.mean((2, 3)) / 0, (2, 3, 8, 8), "NaN or infinite"),
         (lambda images: images @ images.double(), (2, 3, 8, 8), "float32 images (2, 3, 8, 8)"),

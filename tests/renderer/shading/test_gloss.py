@@ -266,7 +266,7 @@ def test_a_highlight_under_its_window_is_nowhere_negative(roughness):
 
 
 def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_it():
-    """This is a white furnace, seen from every side, for all roughness, metallic and specular_factor."""
+    """This is a white furnace for all roughness, metallic and specular_factor, from all sides."""
     grid = torch.meshgrid(
         torch.linspace(0, 1, 21, dtype=DOUBLE),
         torch.linspace(MIN_ROUGHNESS, 1, 9, dtype=DOUBLE),

@@ -44,7 +44,7 @@ ROUNDING = {"rtol": 1e-4, "atol": 1e-4}
 
 @pytest.fixture
 def here(tmp_path) -> Path:
-    """A folder with the weights, the names of the classes and photographs: a render of each class."""
+    """A folder with weights, the names of the classes, and a rendered photograph of each class."""
     torch.save(trained_weights(), tmp_path / "mine.pth")
     (tmp_path / "classes.txt").write_text("\n".join(CLASSES) + "\n")
     for name, image in zip(CLASSES, renders()[0][::VIEWS], strict=True):

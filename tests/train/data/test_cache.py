@@ -1,4 +1,4 @@
-"""The cache on disk: a hit where nothing has changed, a miss where anything has or the file is damaged."""
+"""The cache on disk is a hit if nothing has changed, and a miss if the file is damaged."""
 
 import errno
 import shutil
