@@ -1,4 +1,4 @@
-"""The first screen of a page: the answer in sentences, three numbers, and pictures of both networks."""
+"""The first screen of a page: the answer, three numbers, and pictures of both networks."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
