@@ -43,6 +43,7 @@ from renderer import Lamps as Lamps
 from renderer import Mesh as Mesh
 from renderer import OrthographicCamera as OrthographicCamera
 from renderer import PerspectiveCamera as PerspectiveCamera
+from renderer import PinholeCamera as PinholeCamera
 from renderer import Projector as Projector
 from renderer import TransferOperator as TransferOperator
 from renderer import TransferOperators as TransferOperators

@@ -1,6 +1,7 @@
 from renderer.camera import Camera as Camera
 from renderer.camera import OrthographicCamera as OrthographicCamera
 from renderer.camera import PerspectiveCamera as PerspectiveCamera
+from renderer.camera import PinholeCamera as PinholeCamera
 from renderer.camera import orbit_cameras as orbit_cameras
 from renderer.errors import InputError as InputError
 from renderer.fitting import FittedScene as FittedScene

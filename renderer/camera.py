@@ -1,10 +1,11 @@
-"""Orthographic and perspective cameras that look at the origin, and orbits of them.
+"""Orthographic, perspective and pinhole cameras, and orbits of them.
 
 World axes are right-handed, and z points up.
 """
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
@@ -12,12 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import MAX_MAGNITUDE, InputError, describe, is_number, require_range
+from renderer.errors import (
+    MAX_MAGNITUDE,
+    InputError,
+    describe,
+    is_number,
+    require_choice,
+    require_range,
+)
 from renderer.settings import MAX_VIEWS
-from renderer.validation import require_whole
+from renderer.validation import as_array, require_whole
 
-# Default of `Camera.reach`. A normalized mesh has a radius of at most √3.
-REACH = 2.0
+# How the axes of a camera of others lie, see `PinholeCamera.from_matrix`.
+CONVENTIONS = ("opencv", "opengl")
+# Default of `Camera.clip_range`. A normalized mesh has a radius of at most √3.
+CLIP_RANGE = 2.0
 # Largest polar angle and largest first azimuth of an orbit in degrees: two turns.
 MAX_TURN = 720.0
 # Limits of the field of view in degrees.
@@ -26,11 +36,17 @@ MAX_FOV = 172.0
 # Distance of the near plane from a perspective camera is at least this fraction
 # of the distance of the camera. A mesh that comes nearer raises an error.
 NEAREST = 0.01
+# All points before a pinhole camera have at least this fraction of the depth of
+# the farthest point.
+MIN_DEPTH_RATIO = 1e-3
+# Largest difference of the product of a rotation matrix and its transpose from
+# the identity, and largest skew in units of the focal length.
+MATRIX_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """Camera that looks at the origin and takes square images.
+    """Camera that takes square images of a scene around the origin.
 
     The camera lies at a polar angle from +z and at an azimuth from +x toward
     +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
@@ -46,12 +62,12 @@ class Camera(ABC):
             in world units.
         up: Position of the origin in the image, above the center in world
             units.
-        reach: Surfaces are visible if their depth differs from the depth of the
+        clip_range: Surfaces are visible if their depth differs from the depth of the
             origin by at most this, in world units.
         distance: Distance of the camera from the origin in world units.
 
     Raises:
-        InputError: If `width`, `reach` or `distance` is not positive, if
+        InputError: If `width`, `clip_range` or `distance` is not positive, if
             `polar` is beyond two turns, or if a value is not one number, not
             finite or too large.
     """
@@ -61,9 +77,13 @@ class Camera(ABC):
     width: float
     right: float = 0.0
     up: float = 0.0
-    reach: float = field(default=REACH, kw_only=True)
+    clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
+    # Only a `PinholeCamera` has other values.
+    principal_right: ClassVar[float] = 0.0
+    principal_up: ClassVar[float] = 0.0
+    pixel_aspect: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
         """Convert and check the fields."""
@@ -71,7 +91,7 @@ class Camera(ABC):
             if type(value) is not float:
                 object.__setattr__(self, name, _as_scalar(name, value))
         require_range("width", self.width, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
-        require_range("reach", self.reach, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+        require_range("clip_range", self.clip_range, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
         require_range("polar", self.polar, -MAX_TURN, MAX_TURN)
         for name in ("azimuth", "right", "up"):
             require_range(name, getattr(self, name), -MAX_MAGNITUDE, MAX_MAGNITUDE)
@@ -79,26 +99,26 @@ class Camera(ABC):
     @property
     def near(self) -> float:
         """Depth of the near plane: the smallest visible depth in world units."""
-        return max(self.distance - self.reach, NEAREST * self.distance)
+        return max(self.distance - self.clip_range, NEAREST * self.distance)
 
     @property
     def far(self) -> float:
         """Depth of the far plane: the largest visible depth in world units."""
-        return self.distance + self.reach
+        return self.distance + self.clip_range
 
-    def seeing(self, radius: float) -> Self:
+    def with_clip_range(self, radius: float) -> Self:
         """Return a camera that shows a ball around the origin in its full depth.
 
         Args:
             radius: Radius of the ball in world units.
 
         Returns:
-            This camera if its reach suffices, and otherwise a copy with a
-            larger reach.
+            This camera if its clipping range suffices, and otherwise a copy with a
+            larger clipping range.
         """
-        if radius <= self.reach:
+        if radius <= self.clip_range:
             return self
-        return replace(self, reach=math.floor(radius) + 1.0)
+        return replace(self, clip_range=math.floor(radius) + 1.0)
 
     def fixed(self) -> Self:
         """Return a camera with numbers instead of tensors.
@@ -136,6 +156,40 @@ class Camera(ABC):
                 moved[name] = getattr(self, name) * factor
         return replace(self, **moved)
 
+    def normalized(self, center: np.ndarray, scale: float) -> Self:
+        """Return a camera that sees a moved and scaled mesh as this camera sees the mesh.
+
+        Args:
+            center: Point of the scene that is moved to the origin, in world
+                units, shape (3,).
+            scale: Factor of the scene.
+
+        Returns:
+            Camera whose image of (p - center) · scale is this camera's image of
+            p. It is turned about the new origin.
+
+        Raises:
+            InputError: If the center lies behind a perspective camera.
+        """
+        right, up, back = self.axes() @ self._from_center(center)
+        changed: dict[str, Any] = {
+            "right": scale * (self.right + right),
+            "up": scale * (self.up + up),
+            "width": scale * self.width,
+            "clip_range": scale * self.clip_range,
+        }
+        # The distance of an orthographic camera is no field.
+        if "distance" in vars(self):
+            distance = self.distance - back
+            if not distance > 0:
+                raise InputError(
+                    f"cameras: the center {np.round(center, 3).tolist()} of the mesh lies behind a "
+                    "camera: give cameras that have the whole mesh in front of them"
+                )
+            changed["distance"] = scale * distance
+            changed["width"] = scale * self.width * (distance / self.distance)
+        return replace(self, **changed)
+
     def axes(self) -> np.ndarray:
         """Return the axes of the camera in world coordinates.
 
@@ -169,6 +223,10 @@ class Camera(ABC):
         position = np.array([-self.right, -self.up, self.distance])
         columns = np.column_stack([axes.T, position @ axes])
         return np.vstack([columns, [0, 0, 0, 1]])
+
+    def _from_center(self, points: np.ndarray) -> np.ndarray:
+        """Return points relative to the point that the camera is turned about."""
+        return points
 
     def eye(self) -> np.ndarray:
         """Return where the camera is, in homogeneous world coordinates.
@@ -214,8 +272,17 @@ class Camera(ABC):
             - the nearness of each point, shape (V,). It is larger for nearer
               points, and linear in the image on a plane.
         """
-        polar = torch.as_tensor(_in_radians(self.polar)).to(points)
-        azimuth = torch.as_tensor(_in_radians(self.azimuth)).to(points)
+        right, up, back = self._coordinates(points)
+        w, nearness = self._w_and_nearness(back)
+        scale = 2 / self.width
+        x = (right + self.right) * scale
+        y = (up + self.up) * scale
+        return torch.stack([x, y, w]).T, nearness
+
+    def _coordinates(self, points: Tensor) -> Tensor:
+        """Return the coordinates (right, up, back) of points (V, 3), shape (3, V)."""
+        polar = _as_tensor(_in_radians(self.polar), points)
+        azimuth = _as_tensor(_in_radians(self.azimuth), points)
         sin_polar = polar.sin()
         cos_polar = polar.cos()
         sin_azimuth = azimuth.sin()
@@ -225,12 +292,7 @@ class Camera(ABC):
             [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, sin_polar],
             [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar],
         )
-        right, up, back = torch.stack([torch.stack(axis) for axis in axes]) @ points.T
-        w, nearness = self._w_and_nearness(back)
-        scale = 2 / self.width
-        x = (right + self.right) * scale
-        y = (up + self.up) * scale
-        return torch.stack([x, y, w]).T, nearness
+        return torch.stack([torch.stack(axis) for axis in axes]) @ points.T
 
     @abstractmethod
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
@@ -275,11 +337,11 @@ class OrthographicCamera(Camera):
     @property
     def distance(self) -> float:  # type: ignore[override]
         """Distance that files store. Images do not depend on it."""
-        return 2 * self.reach
+        return 2 * self.clip_range
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project points to normalized device coordinates, see `Camera.project`."""
-        scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
+        scale = np.array([2 / self.width, 2 / self.width, -1 / self.clip_range])
         coordinates = (self.axes() * scale[:, None]) @ points.T
         coordinates += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
         return coordinates.T
@@ -349,6 +411,238 @@ class PerspectiveCamera(Camera):
         return depths
 
 
+@dataclass(frozen=True)
+class PinholeCamera(PerspectiveCamera):
+    """Pinhole camera with any position, direction, roll and principal point.
+
+    `from_matrix` creates it from a view matrix and intrinsics, and
+    `renderer.load_cameras` from the files of COLMAP and nerfstudio. It shows
+    everything in front of it. Where `Camera` has the origin, this camera has its
+    center: polar angle, azimuth, distance, right, up and width are relative to
+    the center. Attacks on the pose turn the camera about this point.
+
+    Attributes:
+        clip_range: Depth that files of cameras store. Images do not depend on
+            it.
+        roll: Turn about the viewing direction from the right to the top of the
+            image, in degrees.
+        center_x: Coordinate x of the center in world units.
+        center_y: Coordinate y of the center in world units.
+        center_z: Coordinate z of the center in world units.
+        principal_right: Position of the principal point, to the right of the
+            image's center in halves of the image's width.
+        principal_up: Position of the principal point, above the image's center
+            in halves of the image's height.
+        pixel_aspect: Focal length in vertical pixels over the focal length in
+            horizontal pixels.
+
+    >>> view = np.eye(4)
+    >>> view[2, 3] = 5.0  # The origin lies 5 units in front of the camera.
+    >>> camera = PinholeCamera.from_matrix(view, [[50, 0, 16], [0, 50, 20], [0, 0, 1]], size=32)
+    >>> image_position = camera.project(np.array([[0.0, 0.0, 0.0]]))[0, :2]
+    >>> (16 + 16 * image_position * [1, -1]).round(6).tolist()  # in pixels, y down
+    [16.0, 20.0]
+    """
+
+    roll: float = field(default=0.0, kw_only=True)
+    center_x: float = field(default=0.0, kw_only=True)
+    center_y: float = field(default=0.0, kw_only=True)
+    center_z: float = field(default=0.0, kw_only=True)
+    principal_right: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
+    principal_up: float = field(default=0.0, kw_only=True)  # type: ignore[misc]
+    pixel_aspect: float = field(default=1.0, kw_only=True)  # type: ignore[misc]
+
+    def __post_init__(self) -> None:
+        """Convert and check the fields."""
+        super().__post_init__()
+        require_range("roll", self.roll, -MAX_TURN, MAX_TURN)
+        require_range("pixel_aspect", self.pixel_aspect, 1 / MAX_MAGNITUDE, MAX_MAGNITUDE)
+        for name in ("center_x", "center_y", "center_z", "principal_right", "principal_up"):
+            require_range(name, getattr(self, name), -MAX_MAGNITUDE, MAX_MAGNITUDE)
+
+    @classmethod
+    def from_matrix(
+        cls,
+        view: np.ndarray | Tensor | Sequence[Sequence[float]],
+        intrinsics: np.ndarray | Tensor | Sequence[Sequence[float]],
+        size: int | tuple[int, int],
+        convention: str = "opencv",
+    ) -> Self:
+        """Create a camera from a view matrix and intrinsics.
+
+        The convention says how the axes of the camera lie: "opencv" (COLMAP) has
+        x to the right, y down and z forward. "opengl" (nerfstudio, Blender) has
+        x to the right, y up and z backward. The intrinsics are the same in both:
+        in pixels, from the upper left corner of the image to the right and down.
+        The center of the first pixel is therefore at (0.5, 0.5), as in COLMAP
+        and nerfstudio. Calibrations of OpenCV have it at (0, 0): add 0.5 to
+        their cx and cy.
+
+        Images are square. For an image of another shape, the camera shows the
+        square in its center whose side is the shorter side of the image.
+
+        Args:
+            view: Matrix from world to camera coordinates, shape (4, 4) or
+                (3, 4).
+            intrinsics: Matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels,
+                shape (3, 3).
+            size: Pixels per side of the image of the intrinsics, or its width
+                and height. Renders may have another size.
+            convention: "opencv" or "opengl".
+
+        Returns:
+            The camera. Its center lies on its axis, at the distance of the
+            world's origin.
+
+        Raises:
+            InputError: If a matrix has another shape, is no rotation and
+                translation, has skew, or if the convention is unknown.
+
+        Example:
+            >>> import norm_balls as nb
+            >>> view = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 4], [0, 0, 0, 1]]
+            >>> intrinsics = [[80, 0, 30], [0, 80, 32], [0, 0, 1]]
+            >>> camera = nb.PinholeCamera.from_matrix(view, intrinsics, size=64)
+            >>> nb.render(nb.solid("orange"), camera, nb.load_light("grace"), size=64).shape[-1]
+            64
+        """
+        require_choice("convention", convention, CONVENTIONS)
+        rotation, translation = _split_view(view)
+        if convention == "opencv":
+            # The rows of the rotation are the camera's axes. Ours are x to the
+            # right, y up and z backward.
+            rotation = rotation * [[1], [-1], [-1]]
+            translation = translation * [1, -1, -1]
+        focal_x, focal_y, x, y = _split_intrinsics(intrinsics)
+        image_width, image_height = _as_image_size(size)
+        side = min(image_width, image_height)
+        back = rotation[2]
+        position = -translation @ rotation
+        distance = float(np.linalg.norm(position)) or 1.0
+        center = position - distance * back
+        azimuth = math.atan2(back[1], back[0])
+        # This axis points to the right without roll.
+        level = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        return cls(
+            polar=math.degrees(math.atan2(math.hypot(back[0], back[1]), back[2])),
+            azimuth=math.degrees(azimuth),
+            width=distance * side / focal_x,
+            distance=distance,
+            roll=math.degrees(math.atan2(-rotation[1] @ level, rotation[0] @ level)),
+            center_x=center[0],
+            center_y=center[1],
+            center_z=center[2],
+            principal_right=(2 * x - image_width) / side,
+            principal_up=(image_height - 2 * y) / side,
+            pixel_aspect=focal_y / focal_x,
+        )
+
+    def normalized(self, center: np.ndarray, scale: float) -> Self:
+        """Return a camera for a moved and scaled mesh, see `Camera.normalized`."""
+        moved = super().normalized(center, scale)
+        return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
+
+    def axes(self) -> np.ndarray:
+        """Return the axes of the camera as rows, see `Camera.axes`."""
+        right, up, back = super().axes()
+        cosine = math.cos(math.radians(self.roll))
+        sine = math.sin(math.radians(self.roll))
+        return np.array([cosine * right + sine * up, cosine * up - sine * right, back])
+
+    def pose(self) -> np.ndarray:
+        """Return the matrix from camera to world coordinates, see `Camera.pose`."""
+        pose = super().pose()
+        pose[:3, 3] += [self.center_x, self.center_y, self.center_z]
+        return pose
+
+    def _from_center(self, points: np.ndarray) -> np.ndarray:
+        """Return points relative to the center."""
+        return points - np.array([self.center_x, self.center_y, self.center_z])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Project points to normalized device coordinates, see `Camera.project`.
+
+        The near plane and the far plane enclose the points.
+        """
+        depths = self.depths(points)
+        right, up, _ = self.axes() @ self._from_center(points).T
+        scale = 2 / self.width * (self.distance / depths)
+        x = (right + self.right) * scale + self.principal_right
+        y = (up + self.up) * scale * self.pixel_aspect + self.principal_up
+        near = depths.min() * (1 - MIN_DEPTH_RATIO)
+        far = depths.max() * (1 + MIN_DEPTH_RATIO)
+        normalized_depth = 2 * far / (far - near) * (1 - near / depths) - 1
+        return np.stack([x, y, normalized_depth]).T
+
+    def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project points to homogeneous image coordinates, see `Camera.homogeneous`."""
+        positions, nearness = super().homogeneous(points)
+        x, y, w = positions.T
+        x = x + self.principal_right * w
+        y = y * self.pixel_aspect + self.principal_up * w
+        return torch.stack([x, y, w]).T, nearness
+
+    def _coordinates(self, points: Tensor) -> Tensor:
+        """Return the coordinates (right, up, back) of points (V, 3), shape (3, V)."""
+        center = [self.center_x, self.center_y, self.center_z]
+        offset = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
+        right, up, back = super()._coordinates(points - offset)
+        roll = _as_tensor(_in_radians(self.roll), points)
+        cosine = roll.cos()
+        sine = roll.sin()
+        return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
+
+    def depths(self, points: np.ndarray) -> np.ndarray:
+        """Compute the depths of points, see `Camera.depths`."""
+        depths = self.distance - self._from_center(points) @ self.axes()[2]
+        if not (depths >= MIN_DEPTH_RATIO * np.abs(depths).max()).all():
+            position = self.pose()[:3, 3].round(3).tolist()
+            raise InputError(
+                f"the mesh reaches the camera at {position} or lies behind it: "
+                "give cameras that have the whole mesh in front of them"
+            )
+        return depths
+
+
+def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Check a view matrix, and return its rotation (3, 3) and its translation (3,)."""
+    matrix = as_array("view", view).astype(np.float64)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"view has shape {matrix.shape}: give a matrix (4, 4) or (3, 4)")
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    is_right_handed = np.linalg.det(rotation) > 0
+    is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
+    if not (error <= MATRIX_TOLERANCE and is_right_handed and is_affine):
+        raise InputError(
+            "view is no rotation and translation: give the matrix from world to camera"
+        )
+    return rotation, matrix[:3, 3]
+
+
+def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
+    """Check intrinsics, and return fx, fy, cx and cy."""
+    matrix = as_array("intrinsics", intrinsics).astype(np.float64)
+    if matrix.shape != (3, 3):
+        raise InputError(f"intrinsics has shape {matrix.shape}: give a matrix (3, 3)")
+    (focal_x, skew, x), (below, focal_y, y), last = matrix.tolist()
+    is_calibration = focal_x > 0 and focal_y > 0 and below == 0 and last == [0, 0, 1]
+    if not (is_calibration and abs(skew) <= MATRIX_TOLERANCE * focal_x):
+        raise InputError(
+            f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+        )
+    return focal_x, focal_y, x, y
+
+
+def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
+    """Check the size of an image, and return its width and its height."""
+    width, height = size if isinstance(size, tuple | list) and len(size) == 2 else (size, size)
+    for side in (width, height):
+        require_whole("size", side)
+        require_range("size", side, 1, MAX_MAGNITUDE)
+    return width, height
+
+
 def _as_scalar(name: str, value: Any) -> Any:
     """Convert a field of a camera to one number, or to a tensor () that gradients flow to."""
     if isinstance(value, Tensor) and value.numel() == 1:
@@ -358,6 +652,11 @@ def _as_scalar(name: str, value: Any) -> Any:
     if not is_number(value):
         raise InputError(f"{name} is {describe(value)}: give one number")
     return value.item() if isinstance(value, np.generic | np.ndarray) else value
+
+
+def _as_tensor(value: float | Tensor, like: Tensor) -> Tensor:
+    """Convert a field of a camera to a tensor with the dtype and the device of another."""
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def _in_radians(degrees: Any) -> Any:

@@ -354,7 +354,7 @@ def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list
     cameras = []
     for polar in POLAR:
         for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, polar, fov=fov):
-            cameras.append(_framed(camera.seeing(radius), mesh, mask))
+            cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
     framed = [camera for _, camera in coarse.ranked(cameras)]
     # All azimuths fit a round object equally well. The best camera of each polar
     # angle is therefore a start, too.

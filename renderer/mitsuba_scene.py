@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from PIL import Image
 
 from renderer.camera import Camera
@@ -162,11 +163,22 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
-            images = [np.array(module.render(scene, sensor=view)) for view in range(views)]
+            images = [
+                _as_square(np.array(module.render(scene, sensor=view))) for view in range(views)
+            ]
         except RuntimeError as error:
             reason = str(error).splitlines()[0]
             raise InputError(f"Mitsuba cannot render {path}: {reason}") from error
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+    return torch.stack(images)
+
+
+def _as_square(image: np.ndarray) -> torch.Tensor:
+    """Return an image (H, W, C) as (C, W, W), which stretches pixels that are not square."""
+    channels = torch.from_numpy(image).permute(2, 0, 1)
+    height, width = channels.shape[1:]
+    if height == width:
+        return channels
+    return F.interpolate(channels[None], (width, width), mode="bilinear", antialias=True)[0]
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:

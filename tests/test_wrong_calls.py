@@ -431,8 +431,8 @@ CAMERAS = [
         (0.0, 0.1),
     ),
     *calls_of(
-        "reach",
-        lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, reach=x),
+        "clip_range",
+        lambda x: renderer.OrthographicCamera(57.3, 0.0, 2.0, clip_range=x),
         0.0,
         "far",
         None,

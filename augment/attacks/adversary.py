@@ -16,7 +16,7 @@ from augment.scene.conditions import Conditions, Example
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from renderer.angles import ANGLE_UNIT, DEGREES, angles_in_degrees
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
 from renderer.errors import (
     MAX_SCALE,
     InputError,
@@ -339,9 +339,15 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 
 
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Return the camera of a description; one with perspective has a distance."""
-    kind = PerspectiveCamera if "distance" in description else OrthographicCamera
-    return kind(**angles_in_degrees(description, angle_unit))
+    """Return the camera of a description, whose fields tell its class."""
+    described = angles_in_degrees(description, angle_unit)
+    # Files of earlier versions have the former name of the clipping range.
+    if "reach" in described:
+        described["clip_range"] = described.pop("reach")
+    if "roll" in described:
+        return PinholeCamera(**described)
+    kind = PerspectiveCamera if "distance" in described else OrthographicCamera
+    return kind(**described)
 
 
 def _read_object(folder: Path, description: dict[str, Any]) -> SceneObject:

@@ -113,7 +113,7 @@ class Scene:
         self.one_light = one_light
         self.lights_of_degree = lights_of_degree
         # The depth range of a camera holds the whole object.
-        self.examples = [self._seeing(example) for example in examples]
+        self.examples = [self._with_clip_ranges(example) for example in examples]
         self.backgrounds = backgrounds.to(lights)
         self.lights = lights.expand(len(examples), *lights.shape[-2:])
         self.views = len(examples[0].cameras)
@@ -138,10 +138,12 @@ class Scene:
             self.objects, settings, rasterizer, basis, like=self.lights, cached=not one_light
         )
 
-    def _seeing(self, example: Example) -> Example:
+    def _with_clip_ranges(self, example: Example) -> Example:
         """Return an example whose cameras have a depth range that holds the whole object."""
         radius = self.objects[example.object].radius
-        return replace(example, cameras=tuple(camera.seeing(radius) for camera in example.cameras))
+        return replace(
+            example, cameras=tuple(camera.with_clip_range(radius) for camera in example.cameras)
+        )
 
     def _build_relighting(self) -> Relighting:
         """Prepare the operators of all views, which are built when they are first needed."""
@@ -270,7 +272,7 @@ class Scene:
         if conditions.vertices is not None:
             radius = float(conditions.vertices[row].detach().norm(dim=1).max())
         moves = conditions.cameras[row]
-        return tuple(camera.moved(*moves).seeing(radius) for camera in cameras)
+        return tuple(camera.moved(*moves).with_clip_range(radius) for camera in cameras)
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """Return the conditions of some examples before any attack.

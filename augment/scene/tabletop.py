@@ -310,7 +310,13 @@ def _surfaces(camera: Camera, image: ImageSettings, room: Room, normals: Tensor)
     """Find where the camera's rays meet the table or the wall, whose normals are (2, 3)."""
     count = image.size * image.samples
     middles = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * camera.width
-    up, right = torch.meshgrid(-middles - camera.up, middles - camera.right, indexing="ij")
+    # Positions in the image relative to the principal point.
+    half_width = camera.width / 2
+    up_of_rows = (-middles - camera.principal_up * half_width) / camera.pixel_aspect
+    right_of_columns = middles - camera.principal_right * half_width
+    up, right = torch.meshgrid(
+        up_of_rows - camera.up, right_of_columns - camera.right, indexing="ij"
+    )
     by_pixel = torch.stack([right, up]).view(
         2, image.size, image.samples, image.size, image.samples
     )

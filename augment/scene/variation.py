@@ -175,8 +175,11 @@ def _raise_above_table(camera: Camera) -> Camera:
 
 def _to_perspective(camera: Camera, fov: float) -> Camera:
     """Return a perspective camera that sees the same width at the origin, for a fov in degrees."""
+    distance = camera.width / 2 / math.tan(math.radians(fov) / 2)
+    if isinstance(camera, PerspectiveCamera):
+        return replace(camera, distance=distance)
     shared = {item.name: getattr(camera, item.name) for item in fields(Camera)}
-    return PerspectiveCamera(**shared, distance=camera.width / 2 / math.tan(math.radians(fov) / 2))
+    return PerspectiveCamera(**shared, distance=distance)
 
 
 def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:

@@ -221,7 +221,14 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     """Return the glTF description of a camera."""
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
-        perspective = {"yfov": math.radians(camera.angle), "aspectRatio": 1.0, **planes}
+        # The axis of a glTF camera meets the center of its image. For another
+        # principal point, the image is enlarged until it holds the given image.
+        half_width = math.tan(math.radians(camera.angle) / 2)
+        half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
+        half_width *= 1 + abs(camera.principal_right)
+        vertical_angle = 2 * math.atan(half_height)
+        aspect_ratio = half_width / half_height
+        perspective = {"yfov": vertical_angle, "aspectRatio": aspect_ratio, **planes}
         return {"type": "perspective", "perspective": perspective}
     half_width = camera.width / 2
     orthographic = {"xmag": half_width, "ymag": half_width, **planes}

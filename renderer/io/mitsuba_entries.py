@@ -69,7 +69,12 @@ def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Sce
 
 
 def sensor(
-    pose: np.ndarray, size: int, fov: float | None = None, pixel_format: str = "rgba"
+    pose: np.ndarray,
+    size: int,
+    fov: float | None = None,
+    pixel_format: str = "rgba",
+    film_center: tuple[float, float] = (0.0, 0.0),
+    pixel_aspect: float = 1.0,
 ) -> Scene:
     """Describe a camera.
 
@@ -79,6 +84,10 @@ def sensor(
         fov: Angle between the image's sides, in degrees. Without perspective, the
             image spans [-1, 1] in x and y under the pose.
         pixel_format: Mitsuba's name of the channels.
+        film_center: Position of the center of the film of a perspective camera,
+            right of and below the principal point, in units of the film's sides.
+        pixel_aspect: Vertical over horizontal focal length in pixels. Mitsuba's
+            pixels are square, so that the film has another number of rows.
 
     Returns:
         A "perspective" or an "orthographic" sensor.
@@ -86,18 +95,26 @@ def sensor(
     film = {
         "type": "hdrfilm",
         "width": size,
-        "height": size,
+        "height": max(1, round(size / pixel_aspect)),
         "pixel_format": pixel_format,
         "rfilter": {"type": "box"},
     }
-    lens = {"type": "orthographic"} if fov is None else {"type": "perspective", "fov": fov}
+    lens: Scene = {"type": "orthographic"}
+    if fov is not None:
+        lens = {"type": "perspective", "fov": fov}
+    if any(film_center):
+        right, below = film_center
+        lens |= {"principal_point_offset_x": right, "principal_point_offset_y": below}
     return {**lens, "to_world": pose, "film": film}
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
     """Describe a camera of the renderer, see `sensor`."""
     if isinstance(camera, PerspectiveCamera):
-        return sensor(pose_of(camera), size, camera.angle, pixel_format)
+        film_center = (-camera.principal_right / 2, camera.principal_up / 2)
+        pose = pose_of(camera)
+        aspect = camera.pixel_aspect
+        return sensor(pose, size, camera.angle, pixel_format, film_center, aspect)
     return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
 
 

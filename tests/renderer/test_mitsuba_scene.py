@@ -10,7 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.camera import OrthographicCamera, PerspectiveCamera, PinholeCamera
 from renderer.geometry.mesh import Mesh, normalize
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis
@@ -37,6 +37,16 @@ CAMERAS = [
     OrthographicCamera(57.3, 126.1, 2.3),
     OrthographicCamera(131.8, 292.2, 2.7, right=0.2, up=-0.1),
     PerspectiveCamera(80.2, 17.2, 2.7, right=0.2, up=-0.1, distance=2.2),
+    PinholeCamera(
+        polar=80.2,
+        azimuth=17.2,
+        width=2.9,
+        distance=3.2,
+        roll=34.0,
+        center_x=0.3,
+        principal_right=0.3,
+        principal_up=-0.2,
+    ),
 ]
 
 

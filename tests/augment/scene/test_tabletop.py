@@ -101,7 +101,7 @@ def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -
         scale: Factor of the room's irradiance.
     """
     placed = place(surface, camera)
-    camera = camera.seeing(9.0)
+    camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))
     ball = renderer.render(BALL, camera, even, **RENDERED)[0, 0]
     flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0, 0]

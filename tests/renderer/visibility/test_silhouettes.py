@@ -11,7 +11,7 @@ from oracles import draw_uniform, named_mesh
 from torch import Tensor
 
 import renderer
-from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera, PinholeCamera
 from renderer.geometry.mesh import concatenate
 from renderer.geometry.shapes import SOLIDS
 from renderer.light.lamps import Lamps
@@ -19,6 +19,17 @@ from renderer.light.presets import ambient, load_light
 
 FAR = OrthographicCamera(63.0, 22.9, 2.8)
 NEAR = PerspectiveCamera(63.0, 22.9, 2.8, 0.1, -0.05, distance=4.0)
+TURNED = PinholeCamera(
+    polar=63.0,
+    azimuth=22.9,
+    width=2.8,
+    distance=4.0,
+    roll=30.0,
+    center_x=0.1,
+    principal_right=0.2,
+    principal_up=-0.1,
+    pixel_aspect=1.1,
+)
 FROM_ABOVE = OrthographicCamera(0.0, 17.2, 2.0)
 LIGHT = 0.4 * load_light("grace").double()
 
@@ -178,11 +189,16 @@ def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
     assert relative_error(found, expected) < 0.02
 
 
-@pytest.mark.parametrize("camera", [FAR, NEAR], ids=["orthographic", "perspective"])
+@pytest.mark.parametrize(
+    "camera", [FAR, NEAR, TURNED], ids=["orthographic", "perspective", "pinhole"]
+)
 def test_gradients_by_the_camera_are_differences_of_new_images(camera):
     names = ["polar", "azimuth", "width", "right", "up"]
     if isinstance(camera, PerspectiveCamera):
         names.append("distance")
+    if isinstance(camera, PinholeCamera):
+        names += ["roll", "center_x", "center_y", "center_z"]
+        names += ["principal_right", "principal_up", "pixel_aspect"]
     image = MovedCamera(named_mesh("pear"), camera, names)
     directions = torch.eye(len(names), dtype=torch.float64)
     found = derivatives(image, directions, samples=8)
