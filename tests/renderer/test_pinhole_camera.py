@@ -1,4 +1,4 @@
-"""Pinhole cameras, compared with K (R p + t) in pixels and with Mitsuba in test_mitsuba_scene.py."""
+"""Pinhole cameras, compared with K (R p + t) in pixels; see test_mitsuba_scene.py, too."""
 
 from dataclasses import replace
 
