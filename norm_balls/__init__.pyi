@@ -51,6 +51,7 @@ from renderer import export_mesh as export_mesh
 from renderer import fit_scene as fit_scene
 from renderer import harmonics as harmonics
 from renderer import light_sphere as light_sphere
+from renderer import load_cameras as load_cameras
 from renderer import load_light as load_light
 from renderer import load_mesh as load_mesh
 from renderer import normalize as normalize

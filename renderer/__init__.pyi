@@ -10,6 +10,7 @@ from renderer.geometry.mesh import Mesh as Mesh
 from renderer.geometry.mesh import normalize as normalize
 from renderer.geometry.mesh import subdivide as subdivide
 from renderer.geometry.shapes import solid as solid
+from renderer.io.cameras import load_cameras as load_cameras
 from renderer.io.export import export_mesh as export_mesh
 from renderer.io.meshes import load_mesh as load_mesh
 from renderer.light import harmonics as harmonics

@@ -1,0 +1,115 @@
+"""Files of COLMAP and nerfstudio that the tests write, compared with scipy's rotations."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import renderer
+from renderer.errors import InputError
+
+POINTS = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y = 80.0, 85.0, 52.0, 31.0
+WIDTH, HEIGHT = 100, 60
+ROTATIONS = Rotation.random(2, random_state=0)
+TRANSLATIONS = np.array([[0.1, -0.2, 4.0], [0.3, 0.2, 5.0]])
+NAMES = ["front.png", "from the side.png"]
+
+
+def expected_positions(view: int, focal_y: float = FOCAL_Y) -> np.ndarray:
+    """Project POINTS to the central square of an image, x right and y up in [-1, 1]."""
+    x, y, depth = (ROTATIONS[view].apply(POINTS) + TRANSLATIONS[view]).T
+    column = FOCAL_X * x / depth + CENTER_X
+    row = focal_y * y / depth + CENTER_Y
+    return np.stack([column - WIDTH / 2, HEIGHT / 2 - row], axis=1) / (HEIGHT / 2)
+
+
+def write_colmap(folder: Path, model: str, parameters: list[float]) -> None:
+    """Write the text files of a model with two images of one camera."""
+    values = " ".join(map(str, parameters))
+    camera = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n7 {model} {WIDTH} {HEIGHT} {values}\n"
+    (folder / "cameras.txt").write_text(camera)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+    points_of_images = ["", "1.5 2.5 -1 3.5 4.5 12"]
+    for view, points in enumerate(points_of_images):
+        quaternion = ROTATIONS[view].as_quat(scalar_first=True)
+        numbers = " ".join(map(str, [*quaternion, *TRANSLATIONS[view]]))
+        lines += [f"{view + 1} {numbers} 7 {NAMES[view]}", points]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+
+
+def write_transforms(path: Path, **entries: object) -> None:
+    """Write the two views as transforms.json, whose matrices are those from camera to world."""
+    frames = []
+    for view, name in enumerate(NAMES):
+        pose = np.eye(4)
+        from_camera = ROTATIONS[view].inv()
+        # The camera has y up and z backward.
+        pose[:3, :3] = from_camera.as_matrix() @ np.diag([1, -1, -1])
+        pose[:3, 3] = -from_camera.apply(TRANSLATIONS[view])
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    path.write_text(json.dumps({"frames": frames, "w": WIDTH, "h": HEIGHT, **entries}))
+
+
+def require_expected(path: Path, focal_y: float = FOCAL_Y) -> None:
+    """Check that points are where the formulas put them."""
+    cameras = renderer.load_cameras(path)
+    assert [*cameras] == NAMES
+    for view, camera in enumerate(cameras.values()):
+        found = camera.project(POINTS)[:, :2]
+        np.testing.assert_allclose(found, expected_positions(view, focal_y), atol=1e-9)
+
+
+def test_points_are_where_cameras_of_colmap_see_them(tmp_path):
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
+    require_expected(tmp_path)
+
+
+def test_a_simple_pinhole_has_one_focal_length(tmp_path):
+    write_colmap(tmp_path, "SIMPLE_PINHOLE", [FOCAL_X, CENTER_X, CENTER_Y])
+    require_expected(tmp_path, focal_y=FOCAL_X)
+
+
+def test_points_are_where_cameras_of_nerfstudio_see_them(tmp_path):
+    entries = {"fl_x": FOCAL_X, "fl_y": FOCAL_Y, "cx": CENTER_X, "cy": CENTER_Y, "k1": 0.0}
+    write_transforms(tmp_path / "transforms.json", **entries)
+    require_expected(tmp_path)
+    require_expected(tmp_path / "transforms.json")
+
+
+def test_a_field_of_view_gives_the_focal_length(tmp_path):
+    angle = 2 * math.atan(WIDTH / 2 / FOCAL_X)
+    write_transforms(tmp_path / "a.json", camera_angle_x=angle, cx=CENTER_X, cy=CENTER_Y)
+    require_expected(tmp_path / "a.json", focal_y=FOCAL_X)
+
+
+def test_distorted_cameras_are_refused(tmp_path):
+    write_colmap(tmp_path, "OPENCV", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y, 0.1, 0, 0, 0])
+    with pytest.raises(InputError, match="undistort"):
+        renderer.load_cameras(tmp_path)
+    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, k1=0.1)
+    with pytest.raises(InputError, match="undistort"):
+        renderer.load_cameras(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"frames": []}', '{"frames": [{}]}'])
+def test_damaged_transforms_are_refused(tmp_path, content):
+    path = tmp_path / "transforms.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=str(path)):
+        renderer.load_cameras(path)
+
+
+def test_damaged_or_missing_files_of_colmap_are_refused(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        renderer.load_cameras(tmp_path)
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X])
+    with pytest.raises(InputError, match=r"cameras\.txt"):
+        renderer.load_cameras(tmp_path)
+    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
+    (tmp_path / "images.txt").write_text("1 0.5 0.5\n")
+    with pytest.raises(InputError, match=r"images\.txt"):
+        renderer.load_cameras(tmp_path)
