@@ -183,7 +183,7 @@ class Command:
         except BrokenPipeError:
             # Python flushes the output once more at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(128 + signal.SIGPIPE)
+            sys.exit(BROKEN_PIPE)
         except (Exception, KeyboardInterrupt) as error:
             # Some libraries turn KeyboardInterrupt into another error.
             if any(isinstance(cause, KeyboardInterrupt) for cause in causes(error)):
