@@ -49,6 +49,8 @@ from train.help import CONF, HelpText, types_below, without_none
 
 # Exit status after an error of the user.
 USER_ERROR = 2
+# Exit status of a process that SIGPIPE ends. Windows does not have that signal.
+BROKEN_PIPE = 141
 INTERRUPTED = "ended by SIGINT"
 # Start of the names of the installed commands.
 PREFIX = "pnb-"
