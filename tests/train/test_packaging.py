@@ -104,7 +104,7 @@ def write_modules_of_the_same_names(folder: Path) -> None:
 def venv_python(site: Path) -> Path:
     """Return the interpreter of the environment that has a folder site-packages."""
     root = next(path for path in site.parents if (path / "pyvenv.cfg").exists())
-    return next(root.glob("*/python*"))
+    return next(path for path in root.glob("*/python*") if path.is_file())
 
 
 @pytest.mark.slow
