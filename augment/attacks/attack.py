@@ -102,13 +102,19 @@ class AttackResult:
 
     @property
     def success(self) -> Tensor:
-        """Return a mask of the examples (E,) that meet the criterion, with noise, in all views."""
-        return self.success_in_views.all(1)
+        """Return a mask of the examples (E,) that the attack made meet the criterion, with noise.
+
+        All views count. An example that met the criterion before the attack is no success.
+        """
+        return self.success_in_views.all(1) & ~self.success_before
 
     @property
     def success_without_noise(self) -> Tensor:
-        """Return a mask of the examples (E,) that meet the criterion in all views without noise."""
-        return self.criterion.reached(self.logits.argmax(2))
+        """Return a mask of the examples (E,) that the attack made meet the criterion without noise.
+
+        All views count. An example that met the criterion before the attack is no success.
+        """
+        return self.criterion.reached(self.logits.argmax(2)) & ~self.success_before
 
     @property
     def success_with_margin(self) -> Tensor:

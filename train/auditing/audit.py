@@ -25,6 +25,7 @@ from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.auditing import audit_page as page
 from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfer_success
+from train.auditing.plain_light import PlainViews, find_plain_views
 from train.class_names import class_name, class_of_meshes, simplified, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
@@ -33,7 +34,7 @@ from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
 from train.report.results import RESULTS, require_replaceable
-from train.runs.run_config import CONFIG, read_config, require_same, write_config
+from train.runs.run_config import CONFIG, read_config, read_json, require_same, write_config
 from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_chosen, load_network
 from train.settings import published, read_objects, solid_name
@@ -109,6 +110,7 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
         console.warning(sentence)
     with sole_writer("out", out):
         _begin(settings, out, renders)
+        plan.find_views(out / page.CLASSIFIER)
         if plan.folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
@@ -119,6 +121,8 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
         for key in plan.networks:
             plan.measure(key, out / key)
         names = {key: network.name for key, network in plan.networks.items()}
+        if len(set(names.values())) < len(names):
+            names[page.HARDENED] += " (hardened)"
         return page.write_audit_page(settings.label, names, plan.folders, out, caveats)
 
 
@@ -156,6 +160,19 @@ class _Plan:
         subjects = objects[: len(meshes)]
         self.views = Views(subjects, settings.scale(VIEWS), seed, self.device)
         self.attacked_views = Views(subjects, settings.scale(ATTACKED), seed, self.device)
+
+    def find_views(self, own: Path) -> None:
+        """Search views that the audited classifier recognizes in plain light. All networks get them.
+
+        Args:
+            own: Folder of the parts of the audited classifier.
+        """
+        own.mkdir(exist_ok=True)
+        path = own / page.PLAIN
+        _write_part(path, _search, self.networks[page.CLASSIFIER], self.attacked_views)
+        plain = PlainViews(**read_json(path))
+        self.views = plain.apply_to(self.views)
+        self.attacked_views = plain.apply_to(self.attacked_views)
 
     def measure(self, key: str, own: Path) -> None:
         """Measure the missing parts of one network.
@@ -342,6 +359,11 @@ def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *argument
     """Call a function and write its result as JSON, unless the file exists."""
     if not path.exists():
         atomic_write(path, json.dumps(measure(*arguments)) + "\n", durable=True)
+
+
+def _search(classifier: Classifier, views: Views) -> dict[str, Any]:
+    """Search views in plain light, and return the result for JSON."""
+    return asdict(find_plain_views(classifier, views))
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:

@@ -9,16 +9,33 @@ import numpy as np
 from PIL import Image
 
 from renderer.io.images import read_square
+from train.auditing.audit_screen import attack_pictures, charts, plain_sentence, screen_of_one
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
+from train.auditing.plain_light import PlainViews
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
 from train.evaluation.tables import Estimate, Proportion, fraction
+from train.report import comparison as compare
 from train.report import plots, summary
+from train.report.first_screen import (
+    NETWORKS,
+    Compared,
+    FirstScreen,
+    compare_networks,
+    contrasts,
+    in_words,
+    place_of,
+)
 from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
 from train.runs.run_config import CONFIG, read_config, read_json
 
+# Answers of `write_answer` as the first words of a page.
+VERDICTS = {
+    "No": "It is not safe under unusual lighting.",
+    "Unknown": "It is unknown whether it is safe.",
+}
 # Folders of the parts of the networks.
 CLASSIFIER = "classifier"
 HARDENED = "hardened"
@@ -27,8 +44,12 @@ LABORATORY = "laboratory"
 PHOTOGRAPHS = "photographs"
 # File of `train.auditing.lights.recognized` in the folder of a network.
 RECOGNIZED = "recognized.json"
+# File of `train.auditing.plain_light.find_plain_views` in the folder of the audited network.
+PLAIN = "plain_light.json"
 # File of `train.auditing.lights.transfers` in the folder of a network.
 TRANSFER = "transfer.json"
+# JavaScript of the slider.
+SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8")
 # Number of images in a gallery of the worst images.
 WORST = 10
 # Minimum fraction of correctly classified images of a network that is called
@@ -66,6 +87,8 @@ def write_audit_page(
     counts = {}
     for name, path in paths.items():
         counts[name] = {kind: read_json(path / f"{kind}.json") for kind in KINDS}
+    first_name = names[CLASSIFIER]
+    plain = PlainViews(**read_json(out / CLASSIFIER / PLAIN))
     transfers = {}
     if len(paths) > 1:
         transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
@@ -79,31 +102,75 @@ def write_audit_page(
         steps=(STEPS, ADDITIONAL_STEPS),
         counts=counts,
         correct=correct,
-        pictures=_attack_pictures(paths, counts),
+        plain_sentence=plain_sentence(label, first_name, plain),
+        pictures={name: attack_pictures(path, counts[name]) for name, path in paths.items()},
+        charts=charts(counts),
+        slider=_slider(counts),
+        script=SLIDER_SCRIPT if _slider(counts) else "",
         transfers=transfers,
         answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
-        screen=None,
+        screen=_first_screen(label, paths, folders, counts, plain),
         caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
         agreement=_agreement(scored),
         config=read_config(out / CONFIG),
     )
 
 
-def _attack_pictures(
+def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Return the lights of one attack on the first network with a success. None without one."""
+    for name, by_kind in counts.items():
+        for kind, part in by_kind.items():
+            if "slider" in part:
+                return {"network": name, "light": KINDS[kind].title, **part["slider"]}
+    return None
+
+
+def _first_screen(
+    label: str,
     paths: Mapping[str, Path],
+    folders: Mapping[str, Path],
     counts: Mapping[str, Mapping[str, Any]],
-) -> dict[str, list[Picture]]:
-    """Read the pictures of one adversary of each network, by kind of lighting."""
-    pictures: dict[str, list[Picture]] = {kind: [] for kind in KINDS}
-    for name, path in paths.items():
-        for kind, part in counts[name].items():
-            predicted = " and ".join(part.get("predicted", ()))
-            caption = f"{name}: {predicted}"
-            pictures[kind] += plots.from_file(path / f"{kind}.png", caption, 2 * SIDE, caption)
-    return pictures
+    plain: PlainViews,
+) -> FirstScreen:
+    """Compare both networks on the first folder of images, or describe the only network."""
+    (name, path), *others = paths.items()
+    part = next(iter(folders), None)
+    if others and part is not None:
+        other, other_path = others[0]
+        screen = _compare(label, (name, path / part), (other, other_path / part), folders[part])
+        if screen is not None:
+            return screen
+    scores = read_json(path / part / SUMMARY) if part is not None else None
+    answer = write_answer(label, name, path, folders).partition("? ")[2].partition(":")[0]
+    verdict = VERDICTS.get(answer, answer)
+    return screen_of_one(label, name, verdict, plain, counts[name], scores)
+
+
+def _compare(
+    label: str,
+    original: tuple[str, Path],
+    hardened: tuple[str, Path],
+    images: Path,
+) -> FirstScreen | None:
+    """Compare the scores of two networks, each a name and a folder, on the same images."""
+    runs = {}
+    for name, path in (original, hardened):
+        scores = {path.name: summary.PhotographScores.read(read_json(path / SUMMARY))}
+        runs[name] = [summary.RunSummary(path.parent, name, {"network": name}, scores, None)]
+    (group,) = summary.group_by_images(runs).values()
+    evaluations = compare.read_evaluations(group)
+    compared = Compared(
+        label=in_words(label),
+        before=evaluations[original[0]],
+        after=evaluations[hardened[0]],
+        names=(f"before: {original[0]}", f"after: {hardened[0]}"),
+        subjects=NETWORKS,
+        place=place_of(images, images.name),
+    )
+    return compare_networks(compared, contrasts(original[1], hardened[1], images, label))
 
 
 def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
@@ -158,6 +225,9 @@ def write_answer(label: str, name: str, folder: Path, parts: Collection[str]) ->
     Returns:
         A question and its answer.
     """
+    if not any(any(views) for views in read_json(folder / RECOGNIZED).values()):
+        question = f"Is {name} safe under unusual lighting?"
+        return f"{question} Unknown: it does not recognize {label} in plain light, either."
     findings = _find_rates(label, folder, parts)
     faults = [finding.text for finding in findings if finding.right < PASS_THRESHOLD]
     faults += _attack_faults(folder)
@@ -223,11 +293,15 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
         "renders in environments": correct.keys() - random,
         "renders in random light": random,
     }
-    rates = {}
+    rates: dict[str, Estimate] = {}
     for title, names in lights.items():
         # The array has a row for each view and a column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
         views = np.arange(len(hits)).repeat(hits.shape[1])
+        if hits.min() == hits.max():
+            # All replicates are equal. The interval counts each view once.
+            rates[title] = fraction(int(hits[:, 0].sum()), len(hits))
+            continue
         replicates = bootstrap(partial(weighted_mean, hits.ravel()), views)
         rates[title] = estimate(float(hits.mean()), replicates)
     return rates

@@ -7,7 +7,7 @@ negative radiance in any direction.
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +41,7 @@ from renderer.light.basis import HARMONICS, with_local_lights
 from renderer.light.presets import load_light, perturb
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import choose
+from train.auditing.frames import SIDE, frames_of
 
 # Images in one pass of the classifier.
 BATCH = 16
@@ -64,8 +65,6 @@ STEPS = 10
 ADDITIONAL_STEPS = 20
 # Steps of an attack that are as long together as the radius.
 STEPS_PER_RADIUS = 4
-# Pixels per side of a picture on the page.
-SIDE = 200
 # Gray value of the background, in sRGB.
 BACKGROUND = 0.5
 
@@ -124,12 +123,18 @@ class Views:
         count: Number of views.
         seed: Seed of the poses and the cameras.
         device: Device of the renders.
+        light: Name of the environment lighting, before an attack changes it.
+        exposure: Factor of this lighting.
+        size: Factor of the size of the objects.
     """
 
     objects: Sequence[SceneObject]
     count: int
     seed: int
     device: torch.device
+    light: str = LIGHT
+    exposure: float = 1.0
+    size: float = 1.0
 
     def scene(self, size: int, kind: str = "lighting") -> Scene:
         """Build a scene with one example for each view.
@@ -143,7 +148,8 @@ class Views:
         """
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
         local_lights = [build_local_light(light) for light in KINDS[kind].local]
-        basis, lights = with_local_lights(load_light(LIGHT), local_lights)
+        natural_light = load_light(self.light) * self.exposure
+        basis, lights = with_local_lights(natural_light, local_lights)
         scene = Scene.grid(
             objects,
             CAMERA,
@@ -154,7 +160,9 @@ class Views:
             shared=False,
             basis=basis,
         )
-        return vary(scene, VARIATION, generator(self.seed, "views"))
+        scales = [self.size * scale for scale in VARIATION.scale]
+        variation = replace(VARIATION, scale=scales)
+        return vary(scene, variation, generator(self.seed, "views"))
 
 
 def recognized(
@@ -183,15 +191,25 @@ def recognized(
     examples = torch.arange(views.count, device=views.device)
     recognized_by_light = {}
     for name, light in progress(lights.items(), "renders in other light"):
-        conditions = Conditions(light.to(scene.lights).expand(len(scene), -1, -1))
+        exposed = views.exposure * light.to(scene.lights)
+        conditions = Conditions(exposed.expand(len(scene), -1, -1))
         with torch.no_grad():
             images = scene.render(conditions, examples)
-        recognized_by_light[name] = _is_correct(classifier, scene, images).tolist()
+        recognized_by_light[name] = is_correct(classifier, scene, images).tolist()
     return recognized_by_light
 
 
-def _is_correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
-    """Test whether each image (E, 1, 3, H, W) of a scene with one class gets that class, (E,)."""
+def is_correct(classifier: Classifier, scene: Scene, images: Tensor) -> Tensor:
+    """Test whether a classifier recognizes the images of a scene with one class.
+
+    Args:
+        classifier: Classifier to test.
+        scene: Scene with one view per example.
+        images: Images of its examples, shape (E, 1, 3, H, W).
+
+    Returns:
+        Whether each image gets the class of the scene, shape (E,), bool.
+    """
     logits = logits_of(classifier, images, BATCH)[:, 0]
     return logits.argmax(1) == classifier.label(scene.labels[0])
 
@@ -263,7 +281,10 @@ def success_by_light(
         - random: for each radius, the same of the random draws alone,
         - adversarial_without_noise and random_without_noise: the same two
           counts for images without noise,
-        - predicted: classes of the picture before and after, if there is one.
+        - predicted, confidence: classes of the picture before and after, with
+          their probabilities, if there is a picture,
+        - slider: lights between both, as `frames_of` returns them, if there is
+          a picture.
     """
     result = adversaries(classifier, views, kind)
     radii = KINDS[kind].radii
@@ -288,7 +309,8 @@ def success_by_light(
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
         logits = torch.stack([result.logits_before[example, 0], result.logits[example, 0]])
-        counts["predicted"] = predictions(logits, classifier.classes)["predicted"]
+        counts |= predictions(logits, classifier.classes)
+        counts["slider"] = frames_of(result, example)
         write_image(out / f"{kind}.png", _draw_pair(result, example))
     return counts
 
@@ -347,7 +369,7 @@ class _TransferTest:
         label = other.label(problem.scene.labels[0])
         self.result = result
         self.problem = problem
-        self.is_correct = _is_correct(other, problem.scene, problem.images(problem.start))
+        self.is_correct = is_correct(other, problem.scene, problem.images(problem.start))
         self.criterion = Criterion(torch.full_like(result.criterion.source, label))
         self.model = preprocessed_model(result.settings, other)
 

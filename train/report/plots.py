@@ -12,6 +12,7 @@ from PIL import Image
 
 from train.evaluation.scores.metrics import auc_and_recalls
 from train.evaluation.scores.sheet import Pair, draw_roc
+from train.evaluation.tables import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -167,6 +168,65 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
             means.append(f"{method} {np.mean(areas):.3f}")
     alt = f"ROC; AUC: {', '.join(means)}"
     return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", alt)
+
+
+def by_radius(
+    lines: Mapping[str, Sequence[Estimate]],
+    radii: Sequence[float],
+    title: str,
+    x_title: str,
+) -> Picture:
+    """Plot the fraction of views that stay recognized by the radius of attacks.
+
+    Args:
+        lines: Fraction at each radius, by name. Each second line is of random
+            draws against the network of the line before it.
+        radii: Radii in ascending order.
+        title: Title of the plot.
+        x_title: Title of the radii.
+
+    Returns:
+        The plot, with the radii at equal distances.
+    """
+    ends = [f"{name} {_percent(values[-1])}" for name, values in lines.items()]
+    alt = f"{title}: still recognized at the largest radius: {', '.join(ends)}"
+
+    def draw(axes: "Axes") -> None:
+        positions = np.arange(len(radii))
+        # One network has the second color, that of networks after hardening.
+        first = 1 if len(lines) <= 2 else 0
+        for index, (name, values) in enumerate(lines.items()):
+            is_random = index % 2 == 1
+            _draw_fractions(axes, positions, values, name, COLORS[first + index // 2], is_random)
+        axes.set(ylim=(-0.02, 1.02), xlabel=x_title, ylabel="still recognized")
+        axes.set_xticks(positions, [f"{radius:g}" for radius in radii])
+
+    return _plot(draw, title, alt)
+
+
+def _percent(estimate: Estimate) -> str:
+    """Write a fraction in percent."""
+    return "-" if estimate.value is None else f"{estimate.value:.0%}"
+
+
+def _draw_fractions(
+    axes: "Axes",
+    positions: np.ndarray,
+    values: Sequence[Estimate],
+    name: str,
+    color: str,
+    is_random: bool,
+) -> None:
+    """Draw a line of fractions; attacks have error bars, and random draws are dotted."""
+    heights = np.array([estimate.value for estimate in values], float)
+    if is_random:
+        axes.plot(positions, heights, color=color, linestyle=":", label=name)
+        return
+    lows = np.array([estimate.low for estimate in values], float)
+    highs = np.array([estimate.high for estimate in values], float)
+    # Rounding can put the end of an interval inside of it.
+    errors = np.stack([heights - lows, highs - heights]).clip(min=0)
+    axes.errorbar(positions, heights, errors, color=color, marker="o", ms=4, capsize=3, label=name)
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:

@@ -139,7 +139,7 @@ def test_success_counts_only_for_examples_that_were_classified_correctly_before(
     scene = {"backgrounds": [0.5, 0.0]}
     result = attacked("lighting", scene, classifier, force=True, max_steps=30)
     assert result.clean_correct.tolist() == [True, False]
-    assert result.success.tolist() == [True, True]
+    assert result.success.tolist() == [True, False]
 
 
 # --------------------------------------------------------------- refusals and warnings

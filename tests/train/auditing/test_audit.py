@@ -16,10 +16,13 @@ from augment.scene.objects import load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
+from renderer.light.presets import load_light
 from train.auditing import audit, lights
 from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
+from train.auditing.frames import frames_of
 from train.auditing.lights import KINDS, Views, adversaries, success_by_light, transfer_success
+from train.auditing.plain_light import find_plain_views
 from train.command_settings import AuditSettings
 from train.evaluation.laboratory import lab_patterns as patterns
 
@@ -74,6 +77,53 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
     assert counts["adversarial"] == expected
     for random, hits in zip(counts["random"], expected, strict=True):
         assert random <= hits
+
+
+def mean_values_of(views: Views) -> torch.Tensor:
+    """Render the views in their own light, and average each image."""
+    scene = views.scene(8)
+    light = load_light(views.light) * views.exposure
+    conditions = Conditions(light.expand(len(scene), -1, -1))
+    return scene.render(conditions, torch.arange(len(scene))).mean((1, 2, 3, 4))
+
+
+def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
+    limit = float(mean_values_of(views).min()) - 1e-3
+    network = darker_than(limit)
+
+    plain = find_plain_views(network, views)
+
+    assert plain.recognized_as_given == 0
+    assert plain.recognized >= 3
+    is_dark = mean_values_of(plain.apply_to(views)) < limit
+    assert plain.recognized == int(is_dark.sum())
+
+
+def test_views_that_are_recognized_as_they_are_stay_so(views):
+    plain = find_plain_views(darker_than(1.0), views)
+    assert plain.recognized == plain.recognized_as_given == views.count
+    assert plain.apply_to(views) == views
+
+
+def test_a_classifier_that_recognizes_nothing_is_not_attacked_with_success(views, tmp_path):
+    blind = darker_than(-1.0)
+    assert find_plain_views(blind, views).recognized == 0
+    counts = success_by_light(blind, views, "lamps", tmp_path)
+    assert counts["correct"] == 0
+    assert counts["adversarial"] == [0, 0, 0, 0]
+    assert not adversaries(blind, views, "lamps").success.any()
+
+
+def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views):
+    middle_two = mean_values(views, 2.0).sort().values[1:3]
+    result = adversaries(darker_than(float(middle_two.mean())), views, "lamps")
+    example = int((result.clean_correct & result.success).nonzero()[0])
+    slider = frames_of(result, example)
+    ends = [slider["frames"][index]["probabilities"] for index in (0, -1)]
+    expected = [result.logits_before[example, 0], result.logits[example, 0]]
+    assert slider["classes"] == ["orange", "other"]
+    for probabilities, logits in zip(ends, expected, strict=True):
+        np.testing.assert_allclose(probabilities, logits.softmax(0), atol=1e-4)
 
 
 @pytest.fixture
@@ -322,6 +372,19 @@ def test_a_classifier_is_called_safe_only_if_intervals_lie_above_the_limit(
     write_parts(tmp_path, hits, n, adversarial=[0, 0, 1, 1])
     text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
     assert text.startswith(f"Is dark safe under unusual lighting? {answer}")
+
+
+def test_a_classifier_that_recognizes_nothing_in_plain_light_is_called_neither(tmp_path):
+    write_parts(tmp_path, 0, 400, adversarial=[0, 0, 0, 0])
+    text = page.write_answer("orange", "dark", tmp_path, [page.LABORATORY])
+    assert text.startswith("Is dark safe under unusual lighting? Unknown: ")
+
+
+def test_no_interval_of_an_audit_has_zero_width(tmp_path):
+    for is_recognized in (True, False):
+        rates = page._rates({"uniform": [is_recognized] * 5, "random 1": [is_recognized] * 5})
+        for rate in rates.values():
+            assert rate.low < rate.high
 
 
 def test_a_light_is_a_fault_from_the_radius_on_that_loses_half_of_the_views(tmp_path):
