@@ -162,7 +162,7 @@ class _Plan:
         self.attacked_views = Views(subjects, settings.scale(ATTACKED), seed, self.device)
 
     def find_views(self, own: Path) -> None:
-        """Search views that the audited classifier recognizes in plain light. All networks get them.
+        """Search views that the audited classifier recognizes in plain light, for all networks.
 
         Args:
             own: Folder of the parts of the audited classifier.

@@ -181,7 +181,7 @@ def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
 
 
 def _remaining(part: Mapping[str, Any], method: str) -> list[Estimate]:
-    """Return the fraction of the correct views that stay recognized, at radius 0 and each radius."""
+    """Return the fraction of the correct views that stay recognized, at radius 0 and others."""
     correct = part["correct"]
     return [fraction(correct - fooled, correct) for fooled in (0, *part[method])]
 
