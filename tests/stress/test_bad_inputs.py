@@ -308,11 +308,14 @@ def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(
     examples,
 ):
     good = (corpus / file).read_bytes()
+    damaged = given(content=damages(file, good))
+    limits = settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
+    read = partial(outcome, file)
 
-    @settings(max_examples=examples, derandomize=examples == QUICK, **UNLIMITED)
-    @given(content=damages(file, good))
+    @limits
+    @damaged
     def used_or_refused(content: bytes) -> None:
-        outcome(file, partial(Path.write_bytes, data=content))
+        read(partial(Path.write_bytes, data=content))
 
     used_or_refused()
 

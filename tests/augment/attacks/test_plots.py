@@ -4,20 +4,13 @@ import io
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from torch import Tensor
 
 import augment
 import renderer
+from tests.helpers import bright_or_dark
 
 SIZE = 8
-
-
-def bright_or_dark(images: Tensor) -> Tensor:
-    """Return logits that compare the mean of an image with 0.3."""
-    mean = images.mean((1, 2, 3))
-    return torch.stack([mean, 0.3 + 0 * mean], dim=1)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 
 import renderer
 from augment.scene import tabletop
-from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh, concatenate, normalize
 from renderer.geometry.shapes import sphere
 from renderer.light.basis import HARMONICS
@@ -141,6 +141,14 @@ def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(camera, surface):
     compared.require_close(mean=0.01, typical=0.02)
 
 
+def distance_to_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return how far from its pixel (SIZE, SIZE) each point (3, SIZE, SIZE) is seen."""
+    middles = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    pixels = np.stack(np.meshgrid(middles, -middles), axis=-1)
+    projected = camera.project(points.reshape(3, -1).T)[:, :2]
+    return np.abs(projected.reshape(SIZE, SIZE, 2) - pixels).max(axis=-1)
+
+
 @each_camera
 def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera):
     """The camera sees the middle of the pixel at the height of the unit sphere or the table."""
@@ -151,23 +159,19 @@ def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera
     y = placed[0] * camera.width / 2
     x = -placed[1] * camera.width / 2
 
-    middles = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
-    pixels = np.stack(np.meshgrid(middles, -middles), axis=-1)
-
-    def distance_to_pixel(height: np.ndarray) -> np.ndarray:
-        """Return how far from its pixel (H, W) each point is seen."""
-        points = np.stack([x, y, height], axis=-1).reshape(-1, 3)
-        seen = camera.project(points)[:, :2].reshape(SIZE, SIZE, 2)
-        return np.abs(seen - pixels).max(axis=-1)
-
     even = ambient(torch.ones(3))
     shown = renderer.render(ball, camera, even, SIZE, 0.0, samples=1)[0, 0].numpy()
     is_ball = shown > 0
     assert 0.2 < is_ball.mean() < 0.8
-    on_table = distance_to_pixel(np.full_like(x, -1.0))
+    table = np.stack([x, y, np.full_like(x, -1.0)])
+    on_table = distance_to_pixel(camera, table)
     assert on_table[~is_ball].max() < 1e-6
     bulge = np.sqrt(np.clip(1 - x**2 - y**2, 0, None))
-    on_ball = np.minimum(distance_to_pixel(bulge), distance_to_pixel(-bulge))
+    upper_half = np.stack([x, y, bulge])
+    lower_half = np.stack([x, y, -bulge])
+    on_upper_half = distance_to_pixel(camera, upper_half)
+    on_lower_half = distance_to_pixel(camera, lower_half)
+    on_ball = np.minimum(on_upper_half, on_lower_half)
     # The sphere has faces, so that points are off by up to a quarter of a pixel.
     assert on_ball[is_ball].max() < 0.5 / SIZE
 

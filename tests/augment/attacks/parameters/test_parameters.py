@@ -262,7 +262,7 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
 def test_vertices_that_move_along_the_view_have_the_gradient_of_new_images(make_scene, view):
     """No outline moves then, so that every change is one of normals and nothing is kept fixed."""
     scene = make_scene()
-    (geometry,) = problem_of(scene, **free("geometry")).parameters
+    problem = problem_of(scene, **free("geometry"))
     weights = float64_noise(3, 6, 6, draws=torch.Generator().manual_seed(2))
     camera = scene.cameras[1][view]
     away = torch.from_numpy(camera.axes()[2])
@@ -270,13 +270,13 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_new_images(make_
 
     def weighted_sum(values: Tensor) -> Tensor:
         example = torch.ones(len(values), dtype=torch.int64)
-        conditions = geometry.apply(values, scene.conditions(example), example)
-        images = scene.render(conditions, example)[:, view]
+        images = problem.render(values, example)[:, view]
         return (images * weights).sum((1, 2, 3))
 
-    expected = derivatives(weighted_sum, geometry.start[0], directions)
+    at = problem.start[0]
+    expected = derivatives(weighted_sum, at, directions)
     assert expected.abs().max() > 0.01
-    found = directions @ gradient_at(weighted_sum, geometry.start[0])
+    found = directions @ gradient_at(weighted_sum, at)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
