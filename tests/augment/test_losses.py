@@ -13,6 +13,7 @@ from augment.losses import (
     kl_divergence,
     label_loss,
     log_odds,
+    logit_gap,
     ranking_loss,
 )
 
@@ -53,6 +54,14 @@ def test_a_complementary_label_excludes_the_other_studied_classes_too():
     predicted = torch.arange(5)
     of_all = torch.full((5,), complementary_label(1))
     assert is_correct(predicted, of_all, [4]).tolist() == [True, False, True, True, False]
+
+
+def test_the_gap_of_a_target_is_its_lead_and_without_one_that_of_the_best_other_class():
+    logits = torch.tensor([[3.0, 1.0, 2.0], [3.0, 1.0, 2.0], [0.0, 4.0, 1.5]])
+    source = torch.tensor([1, 0, 1])
+    target = torch.tensor([0, 2, NO_CLASS])
+    assert logit_gap(logits, source, target).tolist() == [1.0, -1.0, -2.5]
+    assert logit_gap(logits, source).tolist() == [2.0, -1.0, -2.5]
 
 
 def test_other_studied_classes_change_no_label_of_a_class():

@@ -136,6 +136,26 @@ def test_points_are_projected_as_by_hand(camera, points, expected):
     np.testing.assert_allclose(projected[:, :2], expected, atol=2 * EPS)
 
 
+@pytest.mark.parametrize("camera", [*ORTHOGRAPHIC[:2], *PERSPECTIVE])
+def test_nearness_falls_with_the_distance_from_the_camera(camera):
+    steps_away = np.linspace(-0.5, 0.5, 9)
+    points = -steps_away[:, None] * camera.axes()[2]
+    _, nearness = camera.homogeneous(torch.from_numpy(points))
+    assert (nearness.diff() < 0).all()
+
+
+@pytest.mark.parametrize("camera", [*ORTHOGRAPHIC[:2], *PERSPECTIVE])
+def test_nearness_is_linear_in_the_image_of_a_plane(camera):
+    corners = np.array([[0.5, 0.1, -0.3], [-0.4, 0.6, 0.2], [-0.1, -0.5, 0.4]])
+    inside = np.array([0.2, 0.5, 0.3]) @ corners
+    points = np.vstack([corners, inside])
+    image = camera.project(points)[:, :2]
+    corners_of_image = np.column_stack([image[:3], np.ones(3)])
+    weights = np.append(image[3], 1.0) @ np.linalg.inv(corners_of_image)
+    nearness = camera.homogeneous(torch.from_numpy(points))[1].numpy()
+    np.testing.assert_allclose(weights @ nearness[:3], nearness[3], rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize("camera", PERSPECTIVE)
 def test_perspective_depth_grows_from_the_near_plane_to_the_far_plane(
     camera,

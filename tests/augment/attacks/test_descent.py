@@ -255,6 +255,19 @@ def test_a_goal_of_some_examples_is_theirs():
     assert criterion.select(rows).reached(predicted[rows]).tolist() == [True, False]
 
 
+def test_descent_ends_when_every_view_is_misclassified_by_the_margin():
+    start = random(EXAMPLE_COUNT, VALUE_COUNT, seed=2)
+    problem = LinearScene(start, "unit", 0.3, views=2)
+    criterion = Criterion(torch.zeros(EXAMPLE_COUNT, 2, dtype=torch.int64))
+    model = Linear(WEIGHT)
+    result = descend(model, problem, criterion, settings_of(30, margin=0.5))
+    logits = model(result.images.flatten(0, 1)).unflatten(0, (-1, 2))
+    leads = logits[..., 1] - logits[..., 0]
+    has_ended = result.steps < 30
+    assert has_ended.sum() > 4
+    assert (leads[has_ended] >= 0.5).all()
+
+
 # --------------------------------------------------------------- shorter steps
 
 
@@ -365,6 +378,24 @@ def test_after_a_success_of_higher_cost_steps_are_compared_with_where_they_start
     assert axis.rendered == [1, -0.5, 0.25, 0.625]
     assert result.success.tolist() == [True]
     assert result.values.tolist() == [[0.625]]  # Its cost is the lowest.
+
+
+class Hill(nn.Module):
+    """Two classes, of which the second leads most at the image value 0.1."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        lead = 2 - (images.flatten(1)[:, 0] - 0.1).square()
+        return torch.stack([torch.zeros_like(lead), lead], dim=1)
+
+
+def test_of_several_successes_the_one_of_the_lowest_cost_is_kept():
+    """The steps lead from 1 to -1/2 and back. The margin is out of reach."""
+    axis = Axis(torch.ones(1, 1, dtype=torch.float64))
+    labels = torch.zeros(1, dtype=torch.int64)
+    result = attack(Hill(), axis, labels, steps=2, backtracking=False, margin=100.0)
+    assert axis.rendered == [1, -0.5, 1]
+    assert result.success.tolist() == [True]
+    assert result.values.tolist() == [[-0.5]]
 
 
 class ClampedScene(LinearScene):

@@ -175,6 +175,16 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     assert (covariance - expected).abs().max() < error
 
 
+@pytest.mark.parametrize("name", NORMS)
+def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
+    is_used = torch.tensor([True, False, True, False, False]).expand(DRAW_COUNT, -1)
+    center = torch.zeros(DRAW_COUNT, 5)
+    drawn = sample(StepSettings(name, 1.0), center, torch.Generator().manual_seed(1), is_used)
+    assert not drawn[~is_used].any()
+    lengths = norms(drawn, name)
+    assert stats.kstest(lengths.numpy() ** 2, "uniform").pvalue > 0.01
+
+
 def test_a_ball_without_a_radius_has_no_uniform_draw():
     with pytest.raises(InputError, match="radius=None"):
         sample(StepSettings(), torch.zeros(1, 2), torch.Generator())

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
-from augment.attacks.descent import Criterion
+from augment.attacks.descent import Criterion, descend
 from augment.attacks.eot import NOISE_DRAWS, stored
 from augment.losses import NO_CLASS
 from augment.service import Renders
@@ -217,6 +217,43 @@ def test_fewer_attacks_count_with_noise(attacked):
     assert torch.equal(without.success, with_noise.success_without_noise)
     assert (with_noise.success <= without.success).all()
     assert with_noise.success.sum() < without.success.sum()
+
+
+class StillScene:
+    """A scene of one example whose views (V, 3, SIZE, SIZE) no step changes."""
+
+    def __init__(self, views: Tensor):
+        self.views = views
+        self.start = torch.zeros(1, 1)
+        self.group_size = 1
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.views[None] + 0 * values[:, :, None, None, None]
+
+    def take_step(
+        self,
+        values: Tensor,
+        gradient: Tensor,
+        examples: Tensor,
+        length: Tensor,
+    ) -> Tensor:
+        return values
+
+
+@pytest.mark.parametrize(("leads", "steps"), [((20.0, 20.0), 0), ((20.0, 0.1), 3)])
+def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps):
+    """Leads are in standard deviations of the change of the logits by noise."""
+    wanted = torch.tensor(leads) * CHANGE_BY_NOISE / (2 * GAIN)
+    gray = torch.full((2, 3, SIZE, SIZE), 0.5)
+    direction = PATTERN / PATTERN.square().sum()
+    views = gray + (wanted - resemblance(gray))[:, None, None, None] * direction
+    criterion = Criterion(torch.zeros(1, 2, dtype=torch.long))
+    settings = augment.AttackSettings(
+        max_steps=3, margin=0.0, sensor_noise=1.0, noise_margin=1.0, quantized=False
+    )
+    result = descend(nervous(0.0), StillScene(views), criterion, settings)
+    assert result.success.tolist() == [True]
+    assert result.steps.tolist() == [steps]
 
 
 @pytest.mark.parametrize("parameter", ["pose", pytest.param("material", marks=pytest.mark.slow)])

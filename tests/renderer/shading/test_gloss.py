@@ -236,6 +236,13 @@ def zonal_amplitudes(roughness: float, degree: int, rings: int) -> np.ndarray:
     return (lobe * directions[:, 2] * solid_angles) @ polynomials
 
 
+def test_a_direction_below_the_surface_passes_the_coat_like_one_at_its_horizon():
+    varnish = SampleGloss(double(0.4), double(0.0), double(1.0))
+    below = torch.tensor([-0.01, -0.5, -0.99], dtype=DOUBLE)
+    horizon = torch.zeros(3, dtype=DOUBLE)
+    torch.testing.assert_close(varnish.entering(below), varnish.entering(horizon))
+
+
 @pytest.mark.parametrize("roughness", [MIN_ROUGHNESS, 0.3, 0.6])
 def test_the_degree_for_a_roughness_is_the_last_band_with_the_amplitude(
     roughness,

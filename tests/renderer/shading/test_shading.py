@@ -19,7 +19,12 @@ from torch import Tensor
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.geometry.mesh import Mesh
 from renderer.image import background_term, tonemap
-from renderer.light.harmonics import DIFFUSE_DEGREE, nonzero_coefficients
+from renderer.light.harmonics import (
+    DIFFUSE_DEGREE,
+    basis,
+    lambertian_factors,
+    nonzero_coefficients,
+)
 from renderer.settings import ImageSettings
 from renderer.shading import shading
 from renderer.shading.shading import radiance
@@ -78,6 +83,15 @@ def test_short_and_zero_normals_have_finite_irradiance_and_no_gradient_that_is_n
     assert values.isfinite().all()
     assert not gradient.isnan().any()
     assert not gradient[-len(SPECIAL) :].any()
+
+
+def test_a_zero_normal_has_the_irradiance_of_the_harmonics_at_the_zero_vector():
+    """An operator holds this value, and `render` shows the same."""
+    light = draw(49, 3)
+    zero_normal = torch.zeros(1, 3, dtype=torch.float64)
+    rows = basis(zero_normal, 6) * lambertian_factors(6)
+    expected = (rows @ light).T
+    torch.testing.assert_close(irradiance(zero_normal, light), expected, rtol=0, atol=1e-12)
 
 
 def test_second_derivatives_are_refused_instead_of_wrong():

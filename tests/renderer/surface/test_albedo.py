@@ -13,6 +13,7 @@ from renderer.camera import OrthographicCamera
 from renderer.geometry.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import (
+    changed_albedo,
     face_albedo,
     paint_faces,
     surface_albedo,
@@ -236,6 +237,12 @@ def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
     expected = surface_albedo(mesh, fragments, "linear")
     found = surface_albedo(painted, fragments, "linear")
     torch.testing.assert_close(found, expected, rtol=0, atol=1.1 / 255)
+
+
+def test_a_changed_albedo_is_at_most_1_or_what_it_was_above_1():
+    albedo = torch.tensor([[1.5, 0.5, 2.0]])
+    added = torch.tensor([[0.2, 0.7, -0.5]])
+    assert changed_albedo(albedo, None, added).tolist() == [[1.5, 1.0, 1.5]]
 
 
 def test_the_float32_gradient_of_a_painted_albedo_is_the_same_on_several_threads_and_on_one():

@@ -205,6 +205,19 @@ def test_the_sky_over_the_center_of_a_pit_has_the_configuration_factor_of_a_squa
     assert found == pytest.approx(expected, abs=QUADRATURE_ERROR)
 
 
+def test_the_walls_of_a_pit_that_is_small_beside_the_mesh_hide_the_sky():
+    """The pit has a five hundredth of the mesh's size. The rest of the mesh is below it."""
+    scale = 1 / 500
+    whole = operator_of(pit(1.0), OrthographicCamera(0, 0, 0.01), size=1)
+    small = pit(1.0)
+    far_below = np.array([[0.0, 0.0, -1.0], [0.1, 0.0, -1.0], [0.0, 0.1, -1.0]])
+    vertices = np.concatenate([scale * small.vertices, far_below])
+    far_face = len(small.vertices) + np.arange(3)
+    mesh = Mesh.plain(vertices, np.concatenate([small.faces, far_face[None]]))
+    scaled = operator_of(mesh, OrthographicCamera(0, 0, 0.01 * scale), size=1)
+    torch.testing.assert_close(sky_fraction(scaled), sky_fraction(whole), rtol=0, atol=0.01)
+
+
 @pytest.mark.parametrize("albedo", [0.2, 0.5, 0.8])
 def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(albedo, monkeypatch):
     """Each point of a sphere sees equal areas of it by the same share (integrating sphere).
@@ -223,6 +236,16 @@ def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(albedo, m
     # The hole z > 0.6 has 20% of the area.
     expected = 0.8 * albedo * (one_bounce - direct)
     assert two_bounces - one_bounce == pytest.approx(expected, rel=0.05)
+
+
+def test_bounces_reflect_the_scaled_albedo():
+    """Half of an albedo is the same surface as half of the scale."""
+    bright = pit(1.0)
+    dark = replace(bright, corner_colors=0.5 * bright.corner_colors)
+    light = load_light("grace").double()
+    scaled = render(bright, ABOVE, light, 6, albedo_scale=0.5, bounces=2, rasterizer="numpy")
+    expected = render(dark, ABOVE, light, 6, bounces=2, rasterizer="numpy")
+    torch.testing.assert_close(scaled, expected, rtol=0, atol=1e-6)
 
 
 WHITE_MESHES = {

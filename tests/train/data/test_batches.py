@@ -84,20 +84,26 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift,
     assert chisquare(occurrences).pvalue > 1e-4
 
 
-def mirrored_rows(epoch: int) -> torch.Tensor:
-    """Return for each of 40 images whether the epoch shows it mirrored."""
+def mirrored_rows(now: Round) -> torch.Tensor:
+    """Return for each of 40 images whether the round shows it mirrored."""
     ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
-    shown = training_batches(numbered(ramp), 40, 0, epoch_round(40, epoch), "alternating")
+    shown = training_batches(numbered(ramp), 40, 0, now, "alternating")
     ((images, labels, _),) = shown
     is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
     return is_flipped[labels.argsort()]
 
 
 def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
-    first = mirrored_rows(epoch=0)
+    first = mirrored_rows(epoch_round(40, 0))
     assert 0 < first.sum() < 40
-    assert torch.equal(mirrored_rows(epoch=1), ~first)
-    assert torch.equal(mirrored_rows(epoch=2), first)
+    assert torch.equal(mirrored_rows(epoch_round(40, 1)), ~first)
+    assert torch.equal(mirrored_rows(epoch_round(40, 2)), first)
+
+
+def test_alternating_flips_are_the_same_in_all_rounds_of_an_epoch():
+    every = torch.arange(40)
+    first = mirrored_rows(Round(number=2, epoch=1, rows=every))
+    assert torch.equal(mirrored_rows(Round(number=3, epoch=1, rows=every)), first)
 
 
 def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():

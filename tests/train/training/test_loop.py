@@ -134,7 +134,9 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
     colors = images.images[:, :, 0, 0] / 255
     velocities = [torch.zeros_like(value) for value in parameters]
     for step in range(2):
-        loss = F.cross_entropy(F.linear(colors, *parameters), images.labels)
+        logits = F.linear(colors, *parameters)
+        loss = F.cross_entropy(logits, images.labels)
+        accuracy = (logits.argmax(1) == images.labels).double().mean()
         rate = 0.5 * (1 + math.cos(math.pi * step / 2)) / 2
         gradients = torch.autograd.grad(loss, parameters)
         with torch.no_grad():
@@ -143,6 +145,7 @@ def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tm
                 velocity.mul_(0.9).add_(gradient)
                 value -= rate * (gradient + 0.9 * velocity)
         assert lines[step]["train/loss"] == pytest.approx(loss.item())
+        assert lines[step]["train/accuracy"] == pytest.approx(accuracy.item())
         assert lines[step]["train/learning_rate"] == pytest.approx(rate)
     torch.testing.assert_close(linear.weight, parameters[0])
     torch.testing.assert_close(linear.bias, parameters[1])
@@ -368,6 +371,23 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
     assert last["epoch"] == 5
     torch.testing.assert_close(best["model"], states[1], rtol=0, atol=0)
     torch.testing.assert_close(last["model"], states[4], rtol=0, atol=0)
+
+
+def test_best_pt_is_not_written_again_for_an_epoch_that_is_no_better(tmp_path, monkeypatch):
+    accuracies = iter([0.6, 0.5, 0.4])
+    monkeypatch.setattr(loop, "evaluate", lambda *_: {"loss": 1.0, "accuracy": next(accuracies)})
+    written = []
+    save = checkpoint.save
+
+    def recorded(path: Path, *arguments) -> None:
+        written.append(path.name)
+        save(path, *arguments)
+
+    monkeypatch.setattr(checkpoint, "save", recorded)
+    trainer = make_trainer(tmp_path, color_network(), epochs=3, batch_size=12)
+    fit(trainer, single_colors(12), single_colors(3))
+    assert written.count(checkpoint.LAST) == 3
+    assert written.count(checkpoint.BEST) == 1
 
 
 class DivergingNetwork(nn.Module):
