@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from augment.parameter_settings import PARAMETER_NAMES, ParameterSettings
 from renderer.errors import MAX_SCALE, InputError
@@ -12,6 +13,13 @@ from renderer.settings import Settings, setting
 MAX_NOISE = 255.0
 # Default of `AttackSettings.noise_margin`.
 NOISE_MARGIN = 2.0
+
+GRADIENT = "gradient"
+RANDOM_SEARCH = "random_search"
+CMA_ES = "cma_es"
+OPTIMIZERS = (GRADIENT, RANDOM_SEARCH, CMA_ES)
+# Queries of each example by an optimizer without gradients.
+DEFAULT_QUERIES = 1000
 
 
 @dataclass
@@ -39,18 +47,31 @@ class EOTSettings(Settings):
 
 @dataclass
 class AttackSettings(ParameterSettings):
-    """Attacked parameters, and the steps, restarts and checks of an attack.
+    """Attacked parameters, and the optimizer, restarts and checks of an attack.
 
     The defaults are careful: the lighting stays physically possible, and a success survives the
     noise of a camera and its 8 bits. The paper has allow_negative=True, margin=0, quantized=False
     and sensor_noise=0.
     """
 
+    optimizer: str | None = setting(
+        None,
+        "How the values are changed: along the gradient, or by random_search or cma_es, which need no gradients. "
+        "null: gradient, or random_search if the classifier has no gradients.",
+        choices=OPTIMIZERS,
+    )
     max_steps: int = setting(
         30,
-        "Largest number of steps. The paper takes 30 (appendix C).",
+        "Largest number of steps along the gradient. The paper takes 30 (appendix C).",
         minimum=0,
         maximum=10**6,
+    )
+    max_queries: int | None = setting(
+        None,
+        "Largest number of forward passes for each example: images that the search shows to the classifier. "
+        f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
+        minimum=1,
+        maximum=10**9,
     )
     backtracking: bool = setting(
         False, "Take back a step that did not lower the cost, and try half of it (backtracking)."
@@ -107,6 +128,31 @@ class AttackSettings(ParameterSettings):
         if self.restarts and not has_radius:
             remedy = "set the radius of every parameter, or restarts=0"
             raise InputError(f"restarts draws from the norm-balls: {remedy}", "restarts")
+
+    @property
+    def uses_gradients(self) -> bool:
+        """Whether the optimizer computes gradients."""
+        return self.optimizer in (None, GRADIENT)
+
+    @property
+    def query_limit(self) -> int | None:
+        """The `max_queries` in use. None for no limit."""
+        if self.max_queries is not None or self.uses_gradients:
+            return self.max_queries
+        return DEFAULT_QUERIES
+
+    @property
+    def step_limit(self) -> int:
+        """The largest number of steps: `max_steps`, or without gradients one for each query."""
+        if self.uses_gradients:
+            return self.max_steps
+        return self.query_limit or 0
+
+    def with_budget(self, factor: int) -> Self:
+        """Return settings with so many times as many steps and queries."""
+        query_limit = self.query_limit
+        max_queries = None if query_limit is None else factor * query_limit
+        return replace(self, max_steps=factor * self.max_steps, max_queries=max_queries)
 
     @property
     def lead_over_noise(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import RANDOM_SEARCH, AttackSettings
 from augment.attacks.adversary import Adversary
-from augment.attacks.descent import Criterion, DescentResult, descend
-from augment.attacks.eot import preprocessed_model, stored
+from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.eot import NOISE_DRAWS, preprocessed_model, stored
+from augment.attacks.optimizers import descend
 from augment.attacks.parameters.light_parameter import environment_light
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers.adapter import Classifier, class_index
@@ -26,6 +27,7 @@ from augment.classifiers.plain_networks import (
     as_classifier,
     gradient_flags_kept,
 )
+from augment.classifiers.remembered import remembering
 from augment.losses import logit_gap
 from augment.model_passes import BatchSize
 from augment.parameter_settings import StepSettings
@@ -79,6 +81,10 @@ class AttackResult:
         descent: Where the descent ended. Its own success is that of its images
             alone. While shape and colors change, it holds shadows and bounces
             fixed.
+        queries: Number of forward passes for each example, (E,) int64: images
+            that the search showed to the classifier, and those with the noise
+            of a sensor by which its success is counted. An image that is shown
+            again counts once.
         seconds: Seconds of the descent, by phase.
     """
 
@@ -93,6 +99,7 @@ class AttackResult:
     logits: Tensor
     success_in_views: Tensor
     descent: DescentResult
+    queries: Tensor
     seconds: dict[str, float]
 
     @property
@@ -139,6 +146,11 @@ class AttackResult:
     def steps(self) -> Tensor:
         """Number of steps of each example, (E,) int64."""
         return self.descent.steps
+
+    @property
+    def backward_passes(self) -> Tensor:
+        """Number of images of each example whose gradient was computed, (E,) int64."""
+        return self.descent.backward_passes
 
     @property
     def conditions(self) -> Conditions:
@@ -289,6 +301,9 @@ def _attack(
     """Change a scene until a classifier errs, as `attack` does."""
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
+    settings = with_optimizer(settings, classifier)
+    if not classifier.has_gradients:
+        classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
     # The warning names the line that calls `attack`.
@@ -330,8 +345,51 @@ def _attack(
         logits=logits,
         success_in_views=success_in_views,
         descent=descent,
+        queries=_count_queries(descent, images, logits.argmax(2), criterion, settings),
         seconds=phases.take(),
     )
+
+
+def with_optimizer(settings: AttackSettings, classifier: Classifier) -> AttackSettings:
+    """Choose the optimizer of an attack, if the settings do not.
+
+    Args:
+        settings: Settings of the attack.
+        classifier: The classifier to attack.
+
+    Returns:
+        The settings or, if the classifier has no gradients, settings with
+        random search, of which a warning tells.
+    """
+    if settings.optimizer is not None or classifier.has_gradients:
+        return settings
+    chosen = replace(settings, optimizer=RANDOM_SEARCH)
+    # The warning names the line that calls `attack`.
+    warnings.warn(
+        f"classifier {classifier.name} has no gradients: random search attacks it with at most "
+        f"{chosen.query_limit} queries for each example (max_queries, optimizer)",
+        stacklevel=4,
+    )
+    return chosen
+
+
+def _count_queries(
+    descent: DescentResult,
+    images: Tensor,
+    predicted: Tensor,
+    criterion: Criterion,
+    settings: AttackSettings,
+) -> Tensor:
+    """Count the different images of each example that an attack classified, shape (E,)."""
+    view_count = images.shape[1]
+    queries = descent.queries.clone()
+    if images is not descent.images:
+        queries += view_count
+    if settings.sensor_noise:
+        # `fooled_in_views` draws noise for these examples.
+        is_tested = criterion.reached_in_views(predicted).any(1)
+        queries += NOISE_DRAWS * view_count * is_tested
+    return queries
 
 
 def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) -> None:

@@ -153,6 +153,8 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "success_with_margin": bool(result.success_with_margin[example]),
         "success_in_views": result.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
+        "queries": int(result.queries[example]),
+        "backward_passes": int(result.backward_passes[example]),
         "cost_before": float(descent.cost_before[example]),
         "cost": float(descent.cost[example]),
         "label": [classes[index] for index in result.criterion.source[example].tolist()],

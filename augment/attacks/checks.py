@@ -21,8 +21,9 @@ from augment.attacks.attack import (
     predictions,
     require_result,
 )
-from augment.attacks.descent import Criterion, descend
+from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
+from augment.attacks.optimizers import descend
 from augment.attacks.parameters import parameter_class
 from augment.attacks.problem import AttackProblem, build_problem
 from augment.classifiers import Classifier
@@ -55,10 +56,11 @@ CHECKED = {
 def check(result: AttackResult) -> dict[str, Any]:
     """Compare an attack with random draws and with longer descents.
 
-    There are as many draws as the attack has steps. They are as far from the
-    start as the attack may go (uniform in the norm-balls) or, without a radius,
-    went. The longer descents have 3 and 10 times as many steps. A success
-    counts as in the result, with the noise of a sensor.
+    There are as many draws as the attack has steps or, without gradients,
+    queries. They are as far from the start as the attack may go (uniform in the
+    norm-balls) or, without a radius, went. The longer searches have 3 and 10
+    times as many steps or queries. A success counts as in the result, with the
+    noise of a sensor.
 
     Args:
         result: The result of `augment.attack`.
@@ -67,8 +69,9 @@ def check(result: AttackResult) -> dict[str, Any]:
         Fractions of examples, and mean costs. "cost_fell" is a fraction of the
         examples without success before the attack, and "zero_gradient" one of
         all examples. "success", "success_with_margin", "random_search",
-        "success_by_steps" (by number of steps), and the same names with
-        "_without_noise", are fractions of the clean-correct examples.
+        "success_by_steps" (by number of steps, or of queries without
+        gradients), and the same names with "_without_noise", are fractions of
+        the clean-correct examples.
 
     Raises:
         InputError: If `result` is no result of an attack.
@@ -391,7 +394,7 @@ def _success_by_draws(
 ) -> Successes:
     """Return what was found, and what as many draws (E, D) as the attack had steps add to it."""
     found = found.clone()
-    for _ in progress(range(result.settings.max_steps), "random search"):
+    for _ in progress(range(_count_draws(result)), "random search"):
         left = found.left
         if not len(left):
             break
@@ -402,16 +405,26 @@ def _success_by_draws(
     return found
 
 
-def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
-    """Return the successes of the attack and of longer ones from its start, by number of steps.
+def _count_draws(result: AttackResult) -> int:
+    """Return the number of random draws that need as many passes as the attack."""
+    settings = result.settings
+    if settings.uses_gradients:
+        return settings.max_steps
+    passes_per_draw = result.images.shape[1] * (1 + settings.eot.draws)
+    return max(1, settings.step_limit // passes_per_draw)
 
-    Examples that a shorter descent counts already are not attacked again.
+
+def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
+    """Return the successes of the attack and of longer ones from its start, by their budget.
+
+    The budget is a number of steps or, without gradients, of queries. Examples
+    that a shorter search counts already are not attacked again.
     """
     settings = result.settings
     found = Successes(result.success, result.success_without_noise)
-    by_steps = {settings.max_steps: found}
+    by_steps = {settings.step_limit: found}
     for factor in GROWTH:
-        longer = replace(settings, max_steps=factor * settings.max_steps)
+        longer = settings.with_budget(factor)
         found = found.clone()
         left = found.left
         if len(left):
@@ -424,7 +437,7 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
                 seed=result.seed,
             )
             found.add(result, result.problem, end.values, left, end.images)
-        by_steps[longer.max_steps] = found
+        by_steps[longer.step_limit] = found
     return by_steps
 
 

@@ -29,7 +29,7 @@ after the descent (`augment.attacks.attack.fooled_in_views`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING
@@ -37,11 +37,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.eot import ExpectationOverTransformations, stored
+from augment.attacks.eot import NOISE_DRAWS, ExpectationOverTransformations, stored
 from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.model_passes import BatchSize, frozen_eval_mode
 from augment.progress import Phases, progress
-from augment.random_streams import generator
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -116,18 +115,24 @@ class DescentResult:
         values: Values of the returned candidate.
         images: Images of the returned candidate, in [0, 1].
         steps: Number of steps taken, including those of restarts.
+        queries: Number of forward passes: images of the example that the
+            classifier was shown, including those of restarts.
+        backward_passes: Number of these images for which a gradient was
+            computed.
         success_before: Whether the initial values reach the criterion.
         success: Whether the returned candidate reaches the criterion, without noise.
         cost_before: Cost of the initial values (equation 1).
         cost: Cost of the returned candidate (equation 1).
         predicted: Class predicted for each view of the returned candidate.
         zero_gradient: Whether the gradient at the initial values is exactly
-            zero.
+            zero. False if no gradient was computed.
     """
 
     values: Float[Tensor, "E D"]
     images: Float[Tensor, "E V 3 H W"]
     steps: Int[Tensor, " E"]
+    queries: Int[Tensor, " E"]
+    backward_passes: Int[Tensor, " E"]
     success_before: Bool[Tensor, " E"]
     success: Bool[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
@@ -161,7 +166,7 @@ class DescentResult:
             getattr(self, item.name)[rows] = getattr(group, item.name)
 
     def add_restart(self, rows: Tensor, restart: DescentResult) -> None:
-        """Add the steps of a restart, and take over its result wherever it succeeds.
+        """Add the steps and passes of a restart, and take over its result wherever it succeeds.
 
         Args:
             rows: Row of each restarted example, shape (A,). None of these
@@ -171,83 +176,13 @@ class DescentResult:
         is_success = restart.success
         successful_rows = rows[is_success]
         self.steps[rows] += restart.steps
+        self.queries[rows] += restart.queries
+        self.backward_passes[rows] += restart.backward_passes
         self.values[successful_rows] = restart.values[is_success]
         self.images[successful_rows] = restart.images[is_success]
         self.success[successful_rows] = restart.success[is_success]
         self.cost[successful_rows] = restart.cost[is_success]
         self.predicted[successful_rows] = restart.predicted[is_success]
-
-
-def descend(
-    model: nn.Module,
-    problem: AttackProblem,
-    criterion: Criterion,
-    settings: AttackSettings,
-    phases: Phases | None = None,
-    *,
-    examples: Tensor | None = None,
-    start: Tensor | None = None,
-    restarts: Iterable[Tensor] = (),
-    seed: int = 0,
-) -> DescentResult:
-    """Attack examples by projected gradient descent, with restarts.
-
-    Examples are attacked in groups of at most `problem.group_size`, which limits
-    the memory that the gradients take. The model runs in evaluation mode, and
-    its state is restored afterwards.
-
-    Args:
-        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
-            [0, 1] to logits (N, C).
-        problem: Attacked parameters and the scene that renders them.
-        criterion: Source and target classes of the A examples.
-        settings: Number of steps, margin, backtracking, batch size, and the
-            random transformations of EOT (expectation over transformations).
-        phases: Timer to which the seconds of the classifier passes are added.
-            None for no timer.
-        examples: Indices of the attacked examples in the problem, shape (A,).
-            None attacks all examples.
-        start: Initial values, shape (A, D). None starts at `problem.start`.
-        restarts: Further initial values, each of shape (A, D). They are tried
-            in turn for the examples that have not succeeded.
-        seed: Seed of the EOT transformations, and of the noise with which leads
-            are compared.
-
-    Returns:
-        Result of the A examples.
-    """
-    if examples is None:
-        examples = torch.arange(len(problem.start), device=problem.start.device)
-    if start is None:
-        start = problem.start[examples]
-    expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
-    descent = Descent(
-        model=model,
-        problem=problem,
-        settings=settings,
-        expectation=expectation,
-        phases=phases or Phases(),
-        seed=seed,
-    )
-    rows_by_group = torch.arange(len(start), device=start.device).split(problem.group_size)
-    if len(rows_by_group) == 1:
-        return descent.run_with_restarts(criterion, examples, start, restarts)
-
-    # Every group needs all restarts, but an iterator yields them only once.
-    restarts = list(restarts)
-    result = None
-    for rows in progress(rows_by_group, "groups of examples"):
-        group_result = descent.run_with_restarts(
-            criterion.select(rows),
-            examples[rows],
-            start[rows],
-            (restart[rows] for restart in restarts),
-        )
-        if result is None:
-            result = group_result.allocate(len(start))
-        result.write(rows, group_result)
-    assert result is not None, "there are at least two groups"
-    return result
 
 
 @dataclass(frozen=True)
@@ -298,9 +233,9 @@ class Descent:
 
     @torch.enable_grad()
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
-        """Take gradient steps until all examples are finished, or `max_steps` of them.
+        """Take steps until all examples are finished or have used up their budget.
 
-        Only examples that are not finished are rendered and classified.
+        Only these examples are rendered and classified.
 
         Args:
             criterion: Source and target classes of the A examples.
@@ -311,22 +246,50 @@ class Descent:
         Returns:
             Result of the A examples.
         """
-        state = _State.at_start(criterion, examples, start, self.settings.batch_size)
+        state = State.at_start(criterion, examples, start, self.settings.batch_size)
         with frozen_eval_mode(self.model):
             # The initial values are evaluated before the first step, so there
             # is one more evaluation than steps.
-            for step in progress(range(self.settings.max_steps + 1), "attack, until all succeed"):
+            step_limit = self.settings.step_limit
+            for step in progress(range(step_limit + 1), "attack, until all succeed"):
                 evaluation = self._evaluate(state)
                 if step == 0:
                     state.begin_result(evaluation)
+                self._count_passes(state, evaluation)
                 decision = self._decide(state, evaluation)
                 state.record(evaluation, decision)
-                if step == self.settings.max_steps or not len(state.active_rows):
+                self._drop_examples_without_budget(state)
+                if step == step_limit or not len(state.active_rows):
                     break
                 self._step(state)
         return state.result
 
-    def _evaluate(self, state: _State) -> _Evaluation:
+    def _count_passes(self, state: State, evaluation: Evaluation) -> None:
+        """Add the passes of an evaluation to those of the N active examples."""
+        pass_count = evaluation.candidate_count * self._passes_of_candidate(state)
+        state.result.queries[state.active_rows] += pass_count
+        if evaluation.gradient is not None:
+            state.result.backward_passes[state.active_rows] += pass_count
+
+    def _passes_of_candidate(self, state: State) -> int:
+        """Return the number of images by which a candidate is evaluated."""
+        view_count = state.criterion.source.shape[1]
+        return view_count * (1 + self.settings.eot.draws)
+
+    def _drop_examples_without_budget(self, state: State) -> None:
+        """Remove the examples for which the next step would need too many queries."""
+        limit = self.settings.query_limit
+        if limit is None or not len(state.active_rows):
+            return
+        needed = self._candidates_per_step(state) * self._passes_of_candidate(state)
+        is_affordable = state.result.queries[state.active_rows] + needed <= limit
+        state.active_rows = state.active_rows[is_affordable]
+
+    def _candidates_per_step(self, state: State) -> int:
+        """Return the number of candidates of an example that a step evaluates."""
+        return 1
+
+    def _evaluate(self, state: State) -> Evaluation:
         """Render and classify the candidates of the N active examples."""
         candidate = state.candidate[state.active_rows].requires_grad_(True)
         criterion = state.criterion.select(state.active_rows)
@@ -336,7 +299,7 @@ class Descent:
             score, image_gradient = self._score(images, criterion, state.batch_size)
         # The chain rule continues the gradient from the images to the values.
         (gradient,) = torch.autograd.grad(rendered, candidate, image_gradient)
-        return _Evaluation(
+        return Evaluation(
             values=candidate.detach(),
             images=images,
             score=score,
@@ -346,7 +309,7 @@ class Descent:
 
     def _score(
         self, images: Tensor, criterion: Criterion, batch_size: BatchSize
-    ) -> tuple[_Score, Tensor]:
+    ) -> tuple[Score, Tensor]:
         """Compute the costs, logit gaps and predictions of N examples, batch by batch.
 
         Args:
@@ -363,12 +326,8 @@ class Descent:
         all_gradients = torch.empty_like(all_images)
         score_batch = partial(self._score_batch, all_images, criterion.flatten(), all_gradients)
         scores = list(batch_size.map(score_batch, len(all_images)))
-        # Each of these has shape (N, V).
-        cost = torch.cat([score.cost for score in scores]).unflatten(0, (-1, view_count))
-        gap = torch.cat([score.gap for score in scores]).unflatten(0, (-1, view_count))
-        predicted = torch.cat([score.predicted for score in scores]).unflatten(0, (-1, view_count))
         image_gradient = all_gradients.unflatten(0, (-1, view_count))
-        return _Score(cost=cost.sum(1), gap=gap.amin(1), predicted=predicted), image_gradient
+        return Score.of_examples(scores, view_count), image_gradient
 
     def _score_batch(
         self,
@@ -376,7 +335,7 @@ class Descent:
         criterion: Criterion,
         all_gradients: Tensor,
         batch_rows: slice,
-    ) -> _Score:
+    ) -> Score:
         """Compute the cost, logit gap and prediction of each image of a batch.
 
         The gradient of the cost with respect to the batch is written to its
@@ -402,39 +361,45 @@ class Descent:
         # Copying keeps the memory layout of the images, whichever layout the
         # network prefers.
         all_gradients[batch_rows] = batch_gradient
-        return _Score(
+        return Score(
             cost=cost.detach(),
             gap=logit_gap(expected_logits.detach(), classes.source, classes.target),
             predicted=logits.detach().argmax(1),
         )
 
-    def _decide(self, state: _State, evaluation: _Evaluation) -> _Decision:
-        """Decide which candidates are finished, accepted and kept (see `_Decision`)."""
+    def _decide(self, state: State, evaluation: Evaluation) -> Decision:
+        """Decide which candidates are finished, accepted and kept (see `Decision`)."""
         active_rows = state.active_rows
         is_success = evaluation.is_criterion_met
         cost = evaluation.score.cost
         is_finished = is_success & (evaluation.score.gap >= self.settings.margin)
         if self.settings.lead_over_noise:
             is_finished = self._with_lead_over_noise(is_finished, state, evaluation)
-        is_accepted = torch.ones_like(is_finished)
-        if self.settings.backtracking:
-            is_accepted = is_finished | (cost < state.cost[active_rows])
+        is_accepted = is_finished | self._is_accepted(state, evaluation)
         # An example without success keeps its last accepted candidate, or its
         # first success. Then only a success of lower cost replaces a success.
         is_cheaper_success = is_success & (cost < state.result.cost[active_rows])
         has_succeeded = state.result.success[active_rows]
         is_better = torch.where(has_succeeded, is_cheaper_success, is_success | is_accepted)
-        return _Decision(
+        return Decision(
             is_finished=is_finished,
             is_accepted=is_accepted,
             is_kept=is_finished | is_better,
+            length_factor=torch.where(is_accepted, 1.0, 0.5),
         )
+
+    def _is_accepted(self, state: State, evaluation: Evaluation) -> Tensor:
+        """Return which candidates the next step starts from although they are unfinished, (N,)."""
+        is_cheaper = evaluation.score.cost < state.cost[state.active_rows]
+        if self.settings.backtracking:
+            return is_cheaper
+        return torch.ones_like(is_cheaper)
 
     def _with_lead_over_noise(
         self,
         is_finished: Tensor,
-        state: _State,
-        evaluation: _Evaluation,
+        state: State,
+        evaluation: Evaluation,
     ) -> Tensor:
         """Return which of the finished examples also lead by more than noise changes, shape (N,).
 
@@ -446,6 +411,7 @@ class Descent:
         """
         chosen = is_finished.nonzero()[:, 0]
         rows = state.active_rows[chosen]
+        state.result.queries[rows] += NOISE_DRAWS * evaluation.images.shape[1]
         with self.phases("attack_classifier"):
             is_leading = self._leads_over_noise(
                 evaluation.images[chosen],
@@ -486,7 +452,7 @@ class Descent:
         needed = self.settings.lead_over_noise * (largest - smallest)
         return (smallest >= needed).all(1)
 
-    def _step(self, state: _State) -> None:
+    def _step(self, state: State) -> None:
         """Set the candidates of the active examples to one step from their accepted values."""
         active_rows = state.active_rows
         state.candidate[active_rows] = self.problem.take_step(
@@ -499,7 +465,7 @@ class Descent:
 
 
 @dataclass(frozen=True)
-class _Score:
+class Score:
     """Cost, logit gap and predicted classes of N examples, or of N single images.
 
     Attributes:
@@ -516,9 +482,22 @@ class _Score:
     gap: Tensor
     predicted: Tensor
 
+    @classmethod
+    def of_examples(cls, batches: Sequence[Score], view_count: int) -> Score:
+        """Return the score of examples from the scores of batches of single images.
+
+        Args:
+            batches: Scores of all images, in order.
+            view_count: Number of views of each example.
+        """
+        cost = torch.cat([score.cost for score in batches]).unflatten(0, (-1, view_count))
+        gap = torch.cat([score.gap for score in batches]).unflatten(0, (-1, view_count))
+        predicted = torch.cat([score.predicted for score in batches]).unflatten(0, (-1, view_count))
+        return cls(cost=cost.sum(1), gap=gap.amin(1), predicted=predicted)
+
 
 @dataclass(frozen=True)
-class _Evaluation:
+class Evaluation:
     """Images, scores and gradients of the candidates of the N active examples.
 
     Attributes:
@@ -528,19 +507,29 @@ class _Evaluation:
         is_criterion_met: Mask of the examples whose predictions reach the criterion
             in every view, shape (N,).
         gradient: Gradient of the cost with respect to the candidates,
-            shape (N, D).
+            shape (N, D). None if none was computed.
+        candidate_count: Number of candidates of each example that were
+            evaluated. The other attributes are those of the best one.
     """
 
     values: Tensor
     images: Tensor
-    score: _Score
+    score: Score
     is_criterion_met: Tensor
-    gradient: Tensor
+    gradient: Tensor | None = None
+    candidate_count: int = 1
+
+    @property
+    def is_gradient_zero(self) -> Tensor:
+        """Whether the gradient of each example was computed and is zero, shape (N,)."""
+        if self.gradient is None:
+            return torch.zeros_like(self.is_criterion_met)
+        return self.gradient.abs().amax(1) == 0
 
 
 @dataclass(frozen=True)
-class _Decision:
-    """Decisions about the candidates of the N active examples, as masks of shape (N,).
+class Decision:
+    """Decisions about the candidates of the N active examples, as tensors of shape (N,).
 
     Attributes:
         is_finished: The candidate reaches the criterion with the required margin,
@@ -548,15 +537,17 @@ class _Decision:
         is_accepted: The next step starts from the candidate.
         is_kept: The candidate is the result of its example unless a later
             candidate replaces it.
+        length_factor: Factor of the length of the next step.
     """
 
     is_finished: Tensor
     is_accepted: Tensor
     is_kept: Tensor
+    length_factor: Tensor
 
 
 @dataclass
-class _State:
+class State:
     """State of a descent of A examples, of which N are still active.
 
     A step starts from the accepted values and leads to the candidate, which is
@@ -592,7 +583,7 @@ class _State:
     @classmethod
     def at_start(
         cls, criterion: Criterion, examples: Tensor, start: Tensor, batch_size: int
-    ) -> _State:
+    ) -> State:
         """Create the state before the first evaluation. The initial values are its candidates.
 
         Args:
@@ -615,7 +606,7 @@ class _State:
             candidate=values.clone(),
         )
 
-    def begin_result(self, evaluation: _Evaluation) -> None:
+    def begin_result(self, evaluation: Evaluation) -> None:
         """Set `result` from the evaluation of the initial values, with 0 steps and no success.
 
         All A examples are still active here. `record` then decides about the
@@ -626,22 +617,24 @@ class _State:
             values=self.values.clone(),
             images=evaluation.images.clone(),
             steps=zeros,
+            queries=zeros.clone(),
+            backward_passes=zeros.clone(),
             success_before=evaluation.is_criterion_met,
             success=zeros.bool(),
             cost_before=evaluation.score.cost,
             cost=self.cost.clone(),
             predicted=torch.zeros_like(self.criterion.source),
-            zero_gradient=evaluation.gradient.abs().amax(1) == 0,
+            zero_gradient=evaluation.is_gradient_zero,
         )
 
-    def record(self, evaluation: _Evaluation, decision: _Decision) -> None:
+    def record(self, evaluation: Evaluation, decision: Decision) -> None:
         """Carry out the decisions about the candidates of the N active examples.
 
         Args:
             evaluation: Images, scores and gradients of the candidates.
             decision: Decisions about the candidates.
         """
-        self._halve_length(~decision.is_accepted)
+        self.length[self.active_rows] *= decision.length_factor[:, None]
         accepted, kept, unfinished = _indices_of_masks(
             decision.is_accepted,
             decision.is_kept,
@@ -651,11 +644,7 @@ class _State:
         self._keep(kept, evaluation)
         self.active_rows = self.active_rows[unfinished]
 
-    def _halve_length(self, is_rejected: Tensor) -> None:
-        """Halve the next step of the active examples whose candidate was rejected."""
-        self.length[self.active_rows] *= torch.where(is_rejected, 0.5, 1.0)[:, None]
-
-    def _accept(self, chosen: Tensor, evaluation: _Evaluation) -> None:
+    def _accept(self, chosen: Tensor, evaluation: Evaluation) -> None:
         """Make the chosen candidates the values from which the next step starts.
 
         Args:
@@ -664,10 +653,11 @@ class _State:
         """
         rows = self.active_rows[chosen]
         self.values[rows] = evaluation.values[chosen]
-        self.gradient[rows] = evaluation.gradient[chosen]
+        if evaluation.gradient is not None:
+            self.gradient[rows] = evaluation.gradient[chosen]
         self.cost[rows] = evaluation.score.cost[chosen]
 
-    def _keep(self, chosen: Tensor, evaluation: _Evaluation) -> None:
+    def _keep(self, chosen: Tensor, evaluation: Evaluation) -> None:
         """Write the chosen candidates to the result.
 
         Args:

@@ -121,6 +121,18 @@ class AttackProblem:
         ]
         return torch.cat(moved, dim=1)
 
+    def search_scale(self, examples: Tensor) -> Tensor:
+        """Return standard deviations of random changes, see `Parameter.search_scale`.
+
+        Args:
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Standard deviation of each value, shape (A, D).
+        """
+        scales = [parameter.search_scale(examples) for parameter in self.parameters]
+        return torch.cat(scales, dim=1).to(self.start)
+
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls.
 

@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -33,6 +34,8 @@ OVERSHOOT = 0.1
 # A network is refused after it returned probabilities for this many images.
 # Logits of a single image may be in [0, 1] and sum to 1 by chance.
 MIN_PROBABILITY_ROWS = 2
+# Value of the pixels of an image that shows nothing.
+GRAY = 0.5
 
 
 @dataclass(frozen=True)
@@ -150,13 +153,13 @@ def are_probabilities(outputs: Tensor) -> bool:
 class Classifier(nn.Module):
     """Frozen classifier from RGB images in [0, 1] to logits of C classes.
 
-    The logits are differentiable with respect to the pixels. The parameters of
+    The logits of a network are differentiable with respect to the pixels. The parameters of
     the network need no gradient. The network stays in evaluation mode, even
     after `train()`. Images are not resized.
 
     Args:
-        function: Network, or another function from images (N, 3, size, size) to
-            logits (N, C). If it is a module, it is frozen, put in evaluation
+        function: Network, or another function from images (N, 3, size, size),
+            tensors or NumPy arrays, to logits (N, C). If it is a module, it is frozen, put in evaluation
             mode and moved with the classifier.
         size: Pixels per side of the images, from 1 to 4,096.
         classes: Names of the C classes in the order of the logits. Each name
@@ -188,7 +191,9 @@ class Classifier(nn.Module):
         )
         require_whole(f"classifier {name}: size", size)
         require_range(f"classifier {name}: size", size, 1, MAX_SIZE)
-        self.function = function
+        self.function: Callable[[Tensor], Tensor] = (
+            function if isinstance(function, nn.Module) else AnyFunction(function)
+        )
         self.size = size
         self.classes = as_class_names(f"classifier {name}: classes", classes)
         self.name = name
@@ -228,8 +233,30 @@ class Classifier(nn.Module):
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
-            raise InputError(f"{name} returned logits without a gradient: compute them in torch")
+            raise InputError(
+                f"{name} returned logits without a gradient: compute them in torch, "
+                "or choose optimizer='random_search'"
+            )
         return logits
+
+    @cached_property
+    def has_gradients(self) -> bool:
+        """Whether the logits are differentiable in the pixels.
+
+        A network of torch with weights is taken to be. Any other function is
+        called on a gray image.
+        """
+        parameters = self.function.parameters() if isinstance(self.function, nn.Module) else ()
+        weight = next(iter(parameters), None)
+        if weight is not None:
+            return True
+        gray = torch.full((1, 3, self.size, self.size), GRAY, requires_grad=True)
+        try:
+            with torch.enable_grad():
+                return bool(self._call_network(self.function, gray).requires_grad)
+        except InputError:
+            # A function that converts images to NumPy fails on images with gradients.
+            return False
 
     def detect(
         self, images: Float[Tensor, "N 3 size size"], label: str | None = None
@@ -375,7 +402,65 @@ class ArrayFunction(Wrapper):
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
         scores = self.network(images.detach().cpu().float().numpy())
+        return as_scores(scores, images)
+
+
+class AnyFunction(Wrapper):
+    """A function from images to scores, which takes tensors or NumPy arrays.
+
+    The first call finds out which: it gives the function a tensor, and a NumPy
+    array if the function then fails or returns no tensor.
+
+    Attributes:
+        takes_arrays: Whether the function takes NumPy arrays. None before the
+            first call.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]):
+        super().__init__(function)
+        self.takes_arrays: bool | None = None
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
+        if self.takes_arrays is None:
+            return self._call_first(images)
+        if self.takes_arrays:
+            return ArrayFunction(self.network)(images)
+        return as_scores(self.network(images), images)
+
+    def _call_first(self, images: Tensor) -> Tensor:
+        """Compute scores, and find out what the function takes."""
+        failure = None
+        scores = None
+        try:
+            scores = self.network(images)
+        except Exception as error:  # Users' functions raise errors of many kinds.
+            failure = error
+        if not isinstance(scores, Tensor):
+            try:
+                array_scores = ArrayFunction(self.network)(images)
+            except Exception:
+                # The first error tells of the function that takes tensors.
+                if failure is not None:
+                    raise failure from None
+            else:
+                self.takes_arrays = True
+                return array_scores
+        self.takes_arrays = False
+        return as_scores(scores, images)
+
+
+def as_scores(scores: Any, images: Tensor) -> Any:
+    """Convert scores of NumPy, or lists of numbers, to a tensor like the images.
+
+    A tensor is returned as it is, and so is what is no array of numbers.
+    """
+    if isinstance(scores, Tensor):
+        return scores
+    try:
         return torch.as_tensor(np.asarray(scores)).to(images)
+    except (TypeError, ValueError):
+        return scores
 
 
 class Normalized(Wrapper):

@@ -14,7 +14,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Classifier, NetworkCall, Normalized, as_class_names
+from augment.classifiers.adapter import (
+    AnyFunction,
+    Classifier,
+    NetworkCall,
+    Normalized,
+    as_class_names,
+)
 from renderer.errors import InputError, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, require_kind, require_whole
@@ -126,7 +132,7 @@ def as_classifier(
     Args:
         network: A classifier, which is returned as it is, or a network from
             images to logits: a `torch.nn.Module` in evaluation mode, or a
-            function.
+            function of tensors or of NumPy arrays.
         size: Pixels per side of the images. None for 224.
         classes: Names of the classes in the order of the logits. None for the
             indices "0", "1" and so on.
@@ -203,24 +209,13 @@ def gradient_flags_kept(network: object) -> Iterator[None]:
             parameter.requires_grad_(flag)
 
 
-class _Function(nn.Module):
-    """A function from images to logits as a module."""
-
-    def __init__(self, function: Callable[[Tensor], Tensor]):
-        super().__init__()
-        self.function = function
-
-    def forward(self, images: Tensor) -> Tensor:
-        return self.function(images)
-
-
 def _preprocessed(
     network: Callable[[Tensor], Tensor],
     normalization: Normalization,
     value_range: tuple[float, float],
 ) -> nn.Module:
     """Put the scaling and the normalization of images in front of a network."""
-    module = network if isinstance(network, nn.Module) else _Function(network)
+    module = network if isinstance(network, nn.Module) else AnyFunction(network)
     mean, std = mean_and_std(normalization)
     black, white = as_list("value_range", value_range, float | int, "the values of black and white")
     if not black < white:

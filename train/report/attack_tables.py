@@ -56,7 +56,7 @@ def format_attack(
     has_noise = bool(result.settings.sensor_noise)
     text = [_heading(name, result)]
     if checks is not None:
-        text += _check_lines(checks, has_noise)
+        text += _check_lines(checks, has_noise, result.settings.uses_gradients)
     adversaries = [line for line in lines if line["success"] and line["clean_correct"]]
     if adversaries:
         for version in adversaries[0]["versions"]:
@@ -71,7 +71,14 @@ def _heading(name: str, result: AttackResult) -> str:
     steps = result.steps[result.success & ~result.success_before].double()
     if len(steps):
         heading += f"; median of {steps.median():.0f} steps"
-    return f"{heading} ({result.seconds['attack']:.1f} s)"
+    return f"{heading}; {_passes(result)} ({result.seconds['attack']:.1f} s)"
+
+
+def _passes(result: AttackResult) -> str:
+    """Count the forward passes of an attack and, if there are any, its backward passes."""
+    text = f"{int(result.queries.sum())} queries"
+    backward_count = int(result.backward_passes.sum())
+    return f"{text}, {backward_count} backward passes" if backward_count else text
 
 
 def _success(result: AttackResult) -> str:
@@ -96,21 +103,25 @@ def _success(result: AttackResult) -> str:
     return text
 
 
-def _check_lines(checks: Mapping[str, Any], has_noise: bool) -> list[str]:
+def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
     """Say what the checks of an attack found."""
+    unit = "step" if uses_gradients else "query"
+    units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
     rates = []
     for steps, rate in checks["success_by_steps"].items():
         rates.append(f"{_both_rates(rate, rates_without_noise[steps], has_noise)} in {steps}")
     search_without_noise = checks[f"random_search{WITHOUT_NOISE}"]
     search = _both_rates(checks["random_search"], search_without_noise, has_noise)
+    zero_gradient = ""
+    if uses_gradients:
+        zero_gradient = f", without a gradient at the start in {checks['zero_gradient']:.0%}"
     return [
         "log-probability of the right class over all views (less a target's): "
         f"{checks['cost_before']:.2f} before, {checks['cost']:.2f} after; "
-        f"lower in {checks['cost_fell']:.0%}, "
-        f"without a gradient at the start in {checks['zero_gradient']:.0%}",
-        f"random changes of the same size, one for each step, succeed on {search}; "
-        f"attacks of more steps: {', '.join(rates)}",
+        f"lower in {checks['cost_fell']:.0%}{zero_gradient}",
+        f"random changes of the same size, one for each {unit}, succeed on {search}; "
+        f"attacks of more {units}: {', '.join(rates)}",
         *(f"warning: {warning}" for warning in warnings(checks)),
     ]
 

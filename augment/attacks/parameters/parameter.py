@@ -11,6 +11,9 @@ from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 
+# Length of the first random changes without a radius, in steps of the attack.
+STEPS_OF_SEARCH = 4
+
 
 class Parameter(ABC):
     """Quantity of a scene that an attack changes, such as its lighting.
@@ -93,6 +96,35 @@ class Parameter(ABC):
         """
         center = self.start[examples]
         return take_step(self.settings, values, gradient, center, self.project_feasible, length)
+
+    def search_scale(self, examples: Tensor) -> Tensor:
+        """Return standard deviations of random changes that reach across the norm-ball.
+
+        A change is about as long as the radius of the ball with the norm "l2",
+        and half as long in each value with the norm "linf". Without a radius, it
+        is about as long as `STEPS_OF_SEARCH` steps.
+
+        Args:
+            examples: Indices of the examples in the scene, shape (A,).
+
+        Returns:
+            Standard deviation of each value, shape (A, D). Values without effect
+            have 0.
+        """
+        settings = self.settings
+        center = self.start[examples]
+        if settings.radius is not None:
+            length = settings.radius
+            is_length_of_value = settings.norm == "linf"
+        else:
+            length = STEPS_OF_SEARCH * settings.step_size
+            is_length_of_value = settings.step == "sign"
+        used = torch.ones_like(center)
+        if self.used_mask is not None:
+            used = self.used_mask[examples].to(center)
+        if is_length_of_value:
+            return length / 2 * used
+        return length * used / used.sum(1, keepdim=True).clamp(min=1).sqrt()
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """Find the nearest values that are feasible and lie in the norm-balls around the start.

@@ -1,0 +1,157 @@
+"""CMA-ES: an attack that needs no gradients, by the library `cma` (Hansen 2016).
+
+Each example has an evolution strategy of its own. It draws a generation of
+candidates from a normal distribution, and adapts the mean and the covariance to
+the best of them. At first, the mean is at the initial values, and the standard
+deviations reach across the norm-ball (`Parameter.search_scale`). Candidates are
+projected onto the feasible values in the norm-ball before they are evaluated.
+A penalty keeps the distribution near these values: the interquartile range of
+the costs times the mean squared distance from the projection, in units of the
+first standard deviations (as Hansen et al. 2009 scale it).
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.attacks.descent import Criterion, DescentResult, State
+from augment.attacks.gradient_free import GradientFree
+from augment.random_streams import stream_seed
+from renderer.errors import InputError
+
+# With more values, the covariance is diagonal (Ros and Hansen 2008), because its
+# memory and time grow with the square of their number.
+MAX_FULL_COVARIANCE = 1000
+
+
+@dataclass
+class Population:
+    """Evolution strategy of one example.
+
+    Its points are offsets from the start in units of `Parameter.search_scale`.
+
+    Attributes:
+        strategy: `cma.CMAEvolutionStrategy`.
+        start: Values at which it began, shape (D,).
+        scale: Unit of each value, shape (D,). It is 0 for values without effect.
+        drawn: Points of the present generation, shape (P, D).
+    """
+
+    strategy: Any
+    start: Tensor
+    scale: Tensor
+    drawn: np.ndarray = field(init=False)
+
+    def ask(self) -> Tensor:
+        """Draw the values of a generation, shape (P, D)."""
+        self.drawn = np.stack(self.strategy.ask())
+        return self._unprojected()
+
+    def _unprojected(self) -> Tensor:
+        """Return the values of the points of the generation, shape (P, D)."""
+        return self.start + self.scale * torch.from_numpy(self.drawn).to(self.scale)
+
+    def tell(self, values: Tensor, costs: Tensor) -> None:
+        """Adapt to the costs (P,) of the projected values (P, D) of the generation."""
+        outside = self._unprojected() - values
+        distances = torch.where(self.scale > 0, outside / self.scale, 0.0)
+        lower, upper = costs.double().quantile(costs.new_tensor([0.25, 0.75]).double())
+        penalties = (upper - lower) * distances.double().square().mean(1)
+        self.strategy.tell(list(self.drawn), (costs.double() + penalties).tolist())
+
+
+@dataclass(frozen=True)
+class CMAES(GradientFree):
+    """CMA-ES against one classifier, see the module.
+
+    Attributes:
+        populations: Evolution strategies, by the row of the example.
+        generations: Projected values of the present generation, shape (P, D),
+            by the row of the example.
+    """
+
+    populations: dict[int, Population] = field(default_factory=dict, init=False)
+    generations: dict[int, Tensor] = field(default_factory=dict, init=False)
+
+    def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
+        """Search until all examples are finished or have used up their queries."""
+        self.populations.clear()
+        self.generations.clear()
+        return super().run(criterion, examples, start)
+
+    def _candidates_per_step(self, state: State) -> int:
+        """Return the number of candidates in a generation, the default of the library."""
+        return 4 + int(3 * math.log(state.values.shape[1]))
+
+    def _step(self, state: State) -> None:
+        """Draw the next generation of each active example, and project it."""
+        for row in state.active_rows.tolist():
+            if row not in self.populations:
+                self.populations[row] = self._begin(state, row)
+            values = self.populations[row].ask()
+            example = state.examples[row].expand(len(values))
+            self.generations[row] = self.problem.project(values, example)
+        state.result.steps[state.active_rows] += 1
+
+    def _begin(self, state: State, row: int) -> Population:
+        """Start the evolution strategy of an example at its accepted values."""
+        example = state.examples[[row]]
+        value_count = state.values.shape[1]
+        strategy = start_strategy(
+            value_count,
+            population_size=self._candidates_per_step(state),
+            seed=stream_seed(self.seed, int(example), "cma"),
+        )
+        [scale] = self.problem.search_scale(example)
+        return Population(strategy, state.values[row].clone(), scale)
+
+    def _candidates(self, state: State) -> Tensor:
+        """Return the generation of each active example, shape (N, P, D), or its initial values."""
+        if not self.generations:
+            return super()._candidates(state)
+        return torch.stack([self.generations[row] for row in state.active_rows.tolist()])
+
+    def _learn(self, state: State, candidates: Tensor, costs: Tensor) -> None:
+        """Tell the evolution strategies the costs (N, P) of their generations (N, P, D)."""
+        if not self.generations:
+            return
+        for index, row in enumerate(state.active_rows.tolist()):
+            self.populations[row].tell(candidates[index], costs[index])
+
+
+def start_strategy(value_count: int, population_size: int, seed: int) -> Any:
+    """Start an evolution strategy at 0 with standard deviation 1.
+
+    Args:
+        value_count: Number of values D.
+        population_size: Number of points of a generation.
+        seed: Seed of its random numbers, which leave those of NumPy alone.
+
+    Returns:
+        `cma.CMAEvolutionStrategy`.
+
+    Raises:
+        InputError: If `cma` is not installed.
+    """
+    try:
+        cma: Any = importlib.import_module("cma")
+    except ImportError as error:
+        advice = 'pip install "parametric-norm-balls[search]"'
+        raise InputError(f"optimizer=cma_es needs cma: {advice}", "optimizer") from error
+    numbers = np.random.default_rng(seed)
+    options = {
+        "verbose": -9,
+        "popsize": population_size,
+        "CMA_diagonal": value_count > MAX_FULL_COVARIANCE,
+        # With a seed, the library would seed NumPy for the whole process.
+        "seed": np.nan,
+        "randn": lambda *shape: numbers.standard_normal(shape),
+    }
+    return cma.CMAEvolutionStrategy(np.zeros(value_count), 1.0, options)

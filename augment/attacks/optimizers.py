@@ -1,0 +1,102 @@
+"""Attack examples with the optimizer that the settings choose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from augment.attack_settings import CMA_ES, GRADIENT, RANDOM_SEARCH
+from augment.attacks.cma_es import CMAES
+from augment.attacks.descent import Criterion, Descent, DescentResult
+from augment.attacks.eot import ExpectationOverTransformations
+from augment.attacks.random_search import RandomSearch
+from augment.progress import Phases, progress
+from augment.random_streams import generator
+
+if TYPE_CHECKING:
+    from augment.attack_settings import AttackSettings
+    from augment.attacks.problem import AttackProblem
+
+# Optimizers by their names in the settings.
+OPTIMIZERS: dict[str, type[Descent]] = {
+    GRADIENT: Descent,
+    RANDOM_SEARCH: RandomSearch,
+    CMA_ES: CMAES,
+}
+
+
+def descend(
+    model: nn.Module,
+    problem: AttackProblem,
+    criterion: Criterion,
+    settings: AttackSettings,
+    phases: Phases | None = None,
+    *,
+    examples: Tensor | None = None,
+    start: Tensor | None = None,
+    restarts: Iterable[Tensor] = (),
+    seed: int = 0,
+) -> DescentResult:
+    """Attack examples with the optimizer of the settings, with restarts.
+
+    Examples are attacked in groups of at most `problem.group_size`, which limits
+    the memory that the gradients take. The model runs in evaluation mode, and
+    its state is restored afterwards.
+
+    Args:
+        model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
+            [0, 1] to logits (N, C).
+        problem: Attacked parameters and the scene that renders them.
+        criterion: Source and target classes of the A examples.
+        settings: Optimizer and its budget, margin, backtracking, batch size,
+            and the random transformations of EOT (expectation over
+            transformations).
+        phases: Timer to which the seconds of the classifier passes are added.
+            None for no timer.
+        examples: Indices of the attacked examples in the problem, shape (A,).
+            None attacks all examples.
+        start: Initial values, shape (A, D). None starts at `problem.start`.
+        restarts: Further initial values, each of shape (A, D). They are tried
+            in turn for the examples that have not succeeded.
+        seed: Seed of the EOT transformations, of the noise with which leads
+            are compared, and of the optimizers that draw random numbers.
+
+    Returns:
+        Result of the A examples.
+    """
+    if examples is None:
+        examples = torch.arange(len(problem.start), device=problem.start.device)
+    if start is None:
+        start = problem.start[examples]
+    expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
+    optimizer = OPTIMIZERS[settings.optimizer or GRADIENT]
+    descent = optimizer(
+        model=model,
+        problem=problem,
+        settings=settings,
+        expectation=expectation,
+        phases=phases or Phases(),
+        seed=seed,
+    )
+    rows_by_group = torch.arange(len(start), device=start.device).split(problem.group_size)
+    if len(rows_by_group) == 1:
+        return descent.run_with_restarts(criterion, examples, start, restarts)
+
+    # Every group needs all restarts, but an iterator yields them only once.
+    restarts = list(restarts)
+    result = None
+    for rows in progress(rows_by_group, "groups of examples"):
+        group_result = descent.run_with_restarts(
+            criterion.select(rows),
+            examples[rows],
+            start[rows],
+            (restart[rows] for restart in restarts),
+        )
+        if result is None:
+            result = group_result.allocate(len(start))
+        result.write(rows, group_result)
+    assert result is not None, "there are at least two groups"
+    return result

@@ -1,0 +1,44 @@
+"""Random search: an attack that needs no gradients.
+
+A candidate is a random change of the accepted values, projected onto the
+feasible values in the norm-ball. It is accepted if its cost is lower. At first,
+changes reach across the norm-ball (`Parameter.search_scale`). They become
+longer after an accepted candidate and shorter after another, so that about one
+candidate in five is accepted: the (1+1) evolution strategy of Rechenberg
+(1973).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from augment.attacks.descent import Decision, Evaluation, State
+from augment.attacks.gradient_free import GradientFree
+
+# Factors of the length of a change after an accepted candidate and after another.
+# Four of the second undo one of the first.
+GROWTH = 1.5
+SHRINKAGE = GROWTH**-0.25
+
+
+@dataclass(frozen=True)
+class RandomSearch(GradientFree):
+    """Random search against one classifier, see the module."""
+
+    def _step(self, state: State) -> None:
+        """Set the candidates of the active examples to random changes of their accepted values."""
+        rows = state.active_rows
+        examples = state.examples[rows]
+        scale = state.length[rows] * self.problem.search_scale(examples)
+        direction = self._draw_normal(state, count=1)[:, 0]
+        moved = state.values[rows] + scale * direction
+        state.candidate[rows] = self.problem.project(moved, examples)
+        state.result.steps[rows] += 1
+
+    def _decide(self, state: State, evaluation: Evaluation) -> Decision:
+        """Decide as the descent does, and adapt the lengths of the next changes."""
+        decision = super()._decide(state, evaluation)
+        factor = torch.where(decision.is_accepted, GROWTH, SHRINKAGE)
+        return replace(decision, length_factor=factor)

@@ -1,0 +1,266 @@
+"""Attacks without gradients find known optima, stay in their balls and count their queries."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+import augment
+from augment.attack_settings import AttackSettings
+from augment.attacks.descent import Criterion, DescentResult
+from augment.attacks.norm_ball import project
+from augment.attacks.optimizers import descend
+from augment.attacks.problem import AttackProblem
+from augment.parameter_settings import StepSettings
+from renderer.light.nonnegative import project_nonnegative
+
+OPTIMIZERS = ["random_search", "cma_es"]
+VALUE_COUNT = 4
+RADIUS = 0.4
+EPS = torch.finfo(torch.float64).eps
+
+
+def random(*shape: int, seed: int) -> Tensor:
+    """Return normal numbers in float64."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+SLOPE = random(VALUE_COUNT, seed=0)
+CENTERS = random(3, VALUE_COUNT, seed=1)
+
+
+class Linear(nn.Module):
+    """Two classes. The first leads the second by 20 + slope · values of the image."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        lead = 20 + images.flatten(1) @ SLOPE
+        return torch.stack([lead, torch.zeros_like(lead)], dim=1)
+
+
+@dataclass
+class Values:
+    """A scene whose images are the values themselves, in balls around the start."""
+
+    ball: StepSettings
+    start: Tensor
+    group_size: int = 1000
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return values[:, None, None, None]
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return project(self.ball, values, self.start[examples])
+
+    def search_scale(self, examples: Tensor) -> Tensor:
+        return torch.full_like(self.start[examples], RADIUS / 2)
+
+
+def search(optimizer: str, norm: str, start: Tensor, queries: int, seed: int = 0) -> DescentResult:
+    """Lower the lead of the first class, which always remains."""
+    problem = Values(StepSettings(norm, RADIUS), start)
+    criterion = Criterion(torch.zeros(len(start), 1, dtype=torch.int64))
+    settings = AttackSettings(optimizer=optimizer, max_queries=queries)
+    return descend(Linear(), problem, criterion, settings, seed=seed)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_search_finds_the_lowest_point_of_an_l2_ball(optimizer):
+    result = search(optimizer, "l2", CENTERS, queries=400)
+    lowest = CENTERS - RADIUS * SLOPE / SLOPE.norm()
+    # On the sphere, the cost is quadratic in this distance.
+    torch.testing.assert_close(result.values, lowest, rtol=0, atol=0.05 * RADIUS)
+    found = (result.values - CENTERS) @ SLOPE
+    assert (found < -0.999 * RADIUS * SLOPE.norm()).all()
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_search_finds_the_lowest_corner_of_an_linf_ball(optimizer):
+    result = search(optimizer, "linf", CENTERS, queries=400)
+    found = (result.values - CENTERS) @ SLOPE
+    assert (found < -0.999 * RADIUS * SLOPE.abs().sum()).all()
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_the_same_seed_gives_the_same_result_and_leaves_other_random_numbers(optimizer):
+    numpy_state = np.random.get_state()[1].copy()
+    torch_state = torch.random.get_rng_state()
+    first = search(optimizer, "l2", CENTERS, queries=60)
+    assert (np.random.get_state()[1] == numpy_state).all()
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
+    again = search(optimizer, "l2", CENTERS, queries=60)
+    for field in fields(DescentResult):
+        assert torch.equal(getattr(first, field.name), getattr(again, field.name)), field.name
+    other = search(optimizer, "l2", CENTERS, queries=60, seed=1)
+    assert not torch.equal(first.values, other.values)
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_an_example_is_searched_as_if_alone(optimizer):
+    together = search(optimizer, "l2", CENTERS, queries=60)
+    alone = search(optimizer, "l2", CENTERS[:1], queries=60)
+    torch.testing.assert_close(alone.values[0], together.values[0], rtol=0, atol=64 * EPS)
+
+
+# --------------------------------------------------------------- scenes
+
+BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("ball", BALLS, ids=["linf", "l2"])
+def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatch, optimizer, ball):
+    pytest.importorskip("cma")
+    rendered = []
+    render = AttackProblem.render
+
+    def record(problem, values, examples):
+        rendered.append(values)
+        return render(problem, values, examples)
+
+    monkeypatch.setattr(AttackProblem, "render", record)
+    result = attacked(
+        {"lighting": ball},
+        optimizer=optimizer,
+        max_queries=30,
+        margin=100.0,
+        allow_negative=False,
+    )
+    values = torch.cat(rendered)
+    offsets = values - result.problem.start
+    order = torch.inf if ball.norm == "linf" else 2
+    # Float32 rounds the center plus the radius.
+    assert offsets.norm(order, dim=1).max() <= ball.radius * (1 + 1e-4)
+    assert offsets.norm(order, dim=1).max() > ball.radius / 2
+    lights = values.unflatten(1, (-1, 3))
+    torch.testing.assert_close(project_nonnegative(lights), lights, rtol=0, atol=1e-5)
+
+
+PARAMETERS = ["lighting", "skylight", "geometry", "pose", "material", "albedo", "pixels", "lamps"]
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS)
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_search_lowers_the_cost_of_every_parameter(attacked, optimizer, parameter):
+    pytest.importorskip("cma")
+    result = attacked(parameter, optimizer=optimizer, max_queries=30, margin=100.0)
+    assert result.descent.cost < result.descent.cost_before
+    assert not result.descent.zero_gradient.any()
+
+
+def logits_of_means(images: np.ndarray) -> np.ndarray:
+    """Return the logits (N, 2) of red and blue images as NumPy arrays."""
+    assert isinstance(images, np.ndarray)
+    return 30 * np.stack([images[:, 0].mean((1, 2)), images[:, 2].mean((1, 2))], axis=1)
+
+
+class Counting:
+    """A NumPy function that keeps the images that it was given."""
+
+    def __init__(self):
+        self.images = []
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        scores = logits_of_means(images)
+        self.images += [image.tobytes() for image in images]
+        return scores
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.filterwarnings("ignore:the light is negative")
+def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise):
+    pytest.importorskip("cma")
+    function = Counting()
+    scene = augment.build_scene([("solid:orange", 0)], 8, views=2, rasterizer="numpy")
+    lighting = augment.StepSettings("linf", 0.2)
+    settings = augment.AttackSettings(
+        lighting=lighting,
+        optimizer=optimizer,
+        max_queries=40,
+        quantized=False,
+        sensor_noise=noise,
+        noise_margin=1.0,
+    )
+    gray = 2  # images with which the network is checked
+    result = augment.attack(function, scene, settings=settings, force=True)
+    probes = 1
+    assert len(function.images) == int(result.queries.sum()) + gray + probes
+    assert len(set(function.images)) >= int(result.queries.sum())
+    assert result.backward_passes.tolist() == [0] * len(scene)
+    assert (result.descent.queries <= 40).all()
+
+
+def test_the_queries_of_a_gradient_attack_are_limited_and_counted_alike(attacked):
+    options = {"max_steps": 50, "margin": 100.0}
+    limited = attacked("lighting", max_queries=7, **options)
+    assert limited.descent.queries.tolist() == [7]
+    assert limited.backward_passes.tolist() == [7]
+    assert limited.steps.tolist() == [6]
+    steps = attacked("lighting", max_steps=6, margin=100.0)
+    assert torch.equal(limited.descent.values, steps.descent.values)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:You are using the legacy")
+def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_network(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        layers = [nn.Conv2d(3, 4, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten()]
+        network = nn.Sequential(*layers, nn.Linear(4, 3)).eval()
+    weights = [parameter.detach().numpy() for parameter in network.parameters()]
+
+    def numpy_network(images: np.ndarray) -> np.ndarray:
+        windows = np.lib.stride_tricks.sliding_window_view(images, (3, 3), axis=(2, 3))
+        features = np.einsum("ncijxy,kcxy->nkij", windows, weights[0])
+        features = np.maximum(features + weights[1][:, None, None], 0).mean((2, 3))
+        return features @ weights[2].T + weights[3]
+
+    path = tmp_path / "network.onnx"
+    torch.onnx.export(
+        network,
+        (torch.rand(1, 3, 16, 16),),
+        path,
+        dynamo=False,
+        input_names=["images"],
+        dynamic_axes={"images": {0: "N"}},
+    )
+    scene = augment.build_scene([("solid:orange", 0)], 16, rasterizer="numpy")
+    settings = augment.AttackSettings(
+        lighting=augment.StepSettings("linf", 0.2), optimizer="random_search", max_queries=40
+    )
+    functions = [network, numpy_network, augment.load_classifier(str(path))]
+    torch_result, *others = [
+        augment.attack(function, scene, settings=settings, force=True) for function in functions
+    ]
+    assert torch_result.descent.cost < torch_result.descent.cost_before
+    for other in others:
+        assert torch.equal(other.descent.values, torch_result.descent.values)
+        torch.testing.assert_close(other.logits, torch_result.logits, rtol=1e-4, atol=1e-5)
+
+
+def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sentence():
+    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
+    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
+    with pytest.warns(UserWarning, match="random search attacks it with at most 5 queries"):
+        result = augment.attack(logits_of_means, scene, settings=settings, force=True)
+    assert result.settings.optimizer == "random_search"
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda images: images.mean((2, 3)),
+        lambda images: images.numpy().mean((2, 3)),
+        lambda images: np.asarray(images, dtype=np.float64).mean((2, 3)).tolist(),
+        lambda images: images.astype(np.float32).mean(axis=(2, 3)),
+    ],
+    ids=["tensors", "tensors to arrays", "lists", "arrays"],
+)
+def test_a_function_may_take_and_return_tensors_or_arrays(function):
+    classifier = augment.Classifier(function, 4, ["red", "green", "blue"])
+    images = random(2, 3, 4, 4, seed=0).sigmoid().float()
+    for _ in range(2):
+        torch.testing.assert_close(classifier(images), images.mean((2, 3)))
