@@ -56,8 +56,8 @@ class AttackSettings(ParameterSettings):
 
     optimizer: str | None = setting(
         None,
-        "How the values are changed: along the gradient, or by random_search or cma_es, which need no gradients. "
-        "null: gradient, or random_search if the classifier has no gradients.",
+        "How the values are changed: along the gradient, or by random_search or cma_es, which "
+        "need no gradients. null: gradient, or random_search if the classifier has no gradients.",
         choices=OPTIMIZERS,
     )
     max_steps: int = setting(
@@ -68,7 +68,8 @@ class AttackSettings(ParameterSettings):
     )
     max_queries: int | None = setting(
         None,
-        "Largest number of forward passes for each example: images that the search shows to the classifier. "
+        "Largest number of forward passes for each example: images that the search shows to the "
+        "classifier. "
         f"null: {DEFAULT_QUERIES}, and no limit besides max_steps for optimizer=gradient.",
         minimum=1,
         maximum=10**9,

@@ -159,8 +159,8 @@ class Classifier(nn.Module):
 
     Args:
         function: Network, or another function from images (N, 3, size, size),
-            tensors or NumPy arrays, to logits (N, C). If it is a module, it is frozen, put in evaluation
-            mode and moved with the classifier.
+            tensors or NumPy arrays, to logits (N, C). If it is a module, it is
+            frozen, put in evaluation mode and moved with the classifier.
         size: Pixels per side of the images, from 1 to 4,096.
         classes: Names of the C classes in the order of the logits. Each name
             occurs once, because labels are found by name.
