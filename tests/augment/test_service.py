@@ -504,7 +504,10 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
     model,
     labels,
 ):
-    """Plates belong to neither of the two classes, and tables to the second."""
+    """Plates belong to neither of the two classes, and tables to the second.
+
+    Each plate is attacked as if its class were the only one.
+    """
     is_plate = labels == 0
     mixed = torch.where(is_plate, complementary_label(1), labels)
     images = serve(labels=mixed, positive_classes=(1, 2)).regenerate(model, 0).images
@@ -514,6 +517,9 @@ def test_hard_negatives_of_several_classes_are_attacked_towards_each_in_turn(
         towards = rises[is_plate & (turns == turn), target]
         assert (towards >= -1e-5).all()
         assert (towards > 0).any()
+        alone = serve(labels=mixed, positive_classes=(target,)).regenerate(model, 0).images
+        is_chosen = is_plate & (turns == turn)
+        torch.testing.assert_close(images[is_chosen], alone[is_chosen])
     assert (rises[~is_plate, 2] <= 1e-5).all()
 
 

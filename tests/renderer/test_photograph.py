@@ -55,6 +55,21 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
     assert error(straight, expected) > 0.1
 
 
+def test_a_photograph_without_its_upper_and_lower_edge_has_the_same_window():
+    """The axis of the camera still passes through the middle of the photograph."""
+    camera = PerspectiveCamera(57.3, 40.1, 6.0, 1.2, -0.9, distance=5.0)
+    pixels = photographed(renderer.solid("pear"), camera)
+    focal_length = SIZE * camera.distance / camera.width
+    above = np.array([0.0, 0.8, 0.6])
+    windows = []
+    for edge in (0, 64):
+        shown = pixels[edge : SIZE - edge]
+        center = np.array([270.0, 250.0 - edge])
+        windows.append(Photograph(shown, focal_length).window(center, 100.0, above).cut(shown, 50))
+    assert windows[0].max() > 0
+    torch.testing.assert_close(windows[1], windows[0], rtol=0, atol=1e-5)
+
+
 def test_a_window_without_perspective_is_what_the_moved_camera_renders():
     mesh = renderer.solid("pear")
     pixels = photographed(mesh, OrthographicCamera(57.3, 40.1, 6.0, 1.25, -0.9375))

@@ -44,6 +44,20 @@ def test_more_steps_succeed_more_often(slow_attack):
     assert rates[-1] == 1
 
 
+def test_a_cost_that_stays_the_same_does_not_count_as_one_that_fell(attacked):
+    """No light changes the logits of the classifier."""
+
+    def constant(images: Tensor) -> Tensor:
+        nothing = 0 * images.mean((1, 2, 3))
+        return torch.stack([nothing + 2, nothing], dim=1)
+
+    classifier = augment.Classifier(constant, 8, ("orange", "other"))
+    checks = augment.check(attacked("lighting", classifier=classifier, max_steps=2))
+    assert checks["cost"] == checks["cost_before"]
+    assert checks["cost_fell"] == 0
+    assert checks["zero_gradient"] == 1
+
+
 def test_checks_are_the_same_when_they_are_repeated(slow_attack):
     assert augment.check(slow_attack) == augment.check(slow_attack)
 
@@ -121,20 +135,38 @@ def linear(make_scene, make_linear) -> AttackResult:
     return augment.attack(classifier, shown, settings=settings)
 
 
-def test_a_ball_holds_an_adversary_from_the_radius_on_at_which_a_linear_classifier_errs(linear):
-    """Within ε in every pixel, the gap of two logits falls by at most ε times |w₀ - w₁|₁.
+def smallest_radii(linear: AttackResult) -> Tensor:
+    """Return the radius (E,) from which on each example has an adversary.
 
+    Within ε in every pixel, the gap of two logits falls by at most ε times |w₀ - w₁|₁.
     Each view has pixels of its own, and the worse of both decides.
     """
     weight = linear.classifier.function[1].weight
     gap = linear.logits_before[..., 0] - linear.logits_before[..., 1]
     slope = (weight[0] - weight[1]).abs().sum()
-    needed_radii = (gap / slope).amax(1)
+    return (gap / slope).amax(1)
+
+
+def test_a_ball_holds_an_adversary_from_the_radius_on_at_which_a_linear_classifier_errs(linear):
+    needed_radii = smallest_radii(linear)
     scales = []
     for radius in needed_radii.tolist():
         scales += [0.98 * radius / 0.05, 1.02 * radius / 0.05]
     for row in augment.success_by_radius(linear, scales):
         assert torch.equal(row["adversarial"], row["radii"]["pixels"] > needed_radii)
+
+
+def test_steps_grow_with_the_radius(linear):
+    """Two steps of a quarter of the radius lead half as far as the ball reaches."""
+    pixels = StepSettings("linf", 0.05, "sign", 0.25 * 0.05)
+    half_way = replace(linear, settings=replace(linear.settings, pixels=pixels))
+    needed_radii = smallest_radii(linear)
+    for radius in needed_radii.tolist():
+        scales = [2 * 0.98 * radius / 0.05, 2 * 1.02 * radius / 0.05]
+        # The descent within a larger ball begins where that within a smaller one has ended.
+        for scale in scales:
+            [row] = augment.success_by_radius(half_way, [scale])
+            assert torch.equal(row["adversarial"], 0.5 * 0.05 * scale > needed_radii)
 
 
 def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_draws_find(linear):

@@ -10,6 +10,7 @@ from oracles import draw_uniform, random_directions
 from scipy import optimize
 
 from renderer.light.harmonics import basis, quadrature
+from renderer.light.highlights import NARROWER, highlight_window, window_without_ringing
 from renderer.light.window import nonnegative_window
 
 # Error of the irradiance of a point source, relative to its root mean square,
@@ -24,6 +25,19 @@ ERRORS = {
     19: 0.0394,
     20: 0.0366,
 }
+
+
+def test_light_whose_narrower_highlights_do_not_ring_keeps_its_coefficients():
+    """A point of light under the window for the narrower highlight has no dark rings."""
+    degree = 12
+    roughness = 0.4
+    direction = torch.tensor([[0.3, -0.5, 0.8]], dtype=torch.float64)
+    window = highlight_window(degree, roughness, NARROWER)
+    point = basis(direction, degree)[0] * window
+    point[0] *= 1 + 1e-6
+    assert (window_without_ringing(point[:, None], roughness) == 1).all()
+    ringing = basis(direction, degree)[0]
+    assert (window_without_ringing(ringing[:, None], roughness) != 1).any()
 
 
 def band_factors(degree: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from oracles import draw_uniform, named_mesh
@@ -315,6 +316,31 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
         image = rendered(mesh, FROM_ABOVE, size, samples, vertices=vertices, **options)
         (found,) = torch.autograd.grad(image.sum(), vertices)
         assert relative_error(found[:, :2], expected[:, :2]) < bound
+
+
+# ---------------------------------------------------------------------------- shadows
+
+
+def test_a_growing_square_in_shadow_gains_its_perimeter_times_its_dark_radiance():
+    """High walls around the square, outside of the image, hide most of the sky."""
+    floor = square(0.5, 0.0)
+    rim = 3.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    low = np.column_stack([rim, np.full(4, -1.0)])
+    high = np.column_stack([rim, np.full(4, 9.0)])
+    walls = []
+    for here, there in [(0, 1), (1, 2), (2, 3), (3, 0)]:
+        walls += [[here, there, 4 + here], [there, 4 + there, 4 + here]]
+    mesh = concatenate([floor, renderer.Mesh.plain(np.concatenate([low, high]), walls)])
+    vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+    options = {"light": soft_front_light(1.0), "background": 0.0, "albedo_scale": 1.0}
+    image = rendered(mesh, FROM_ABOVE, 16, 8, vertices=vertices, shadows=True, **options)
+    (gradient,) = torch.autograd.grad(image[0].sum(), vertices)
+    outward = torch.from_numpy(2 * floor.vertices[:, :2])
+    gained = float((gradient[:4, :2] * outward).sum())
+    pixels_per_area = (16 / FROM_ABOVE.width) ** 2
+    radiance = float(image.detach()[0].sum()) / pixels_per_area  # The area of the square is 1.
+    assert 0.05 < radiance < 0.5
+    assert gained == pytest.approx(4 * radiance * pixels_per_area, rel=0.05)
 
 
 # ---------------------------------------------------------------------------- local light

@@ -37,6 +37,11 @@ def numbered(count: int, classes: int = 1) -> Split:
     return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
 
 
+@pytest.mark.parametrize(("count", "rows"), [(3, [0, 4, 8]), (9, [*range(9)]), (20, [*range(9)])])
+def test_a_sample_is_spread_evenly_over_the_images(count, rows):
+    assert numbered(9).sample(count)[:, 0, 0, 0].tolist() == rows
+
+
 def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size, (value, value, value)).save(path)
