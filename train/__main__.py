@@ -12,6 +12,7 @@ from train.command import SWEEP_FLAGS, Command, import_function, read_settings
 from train.help import HelpText
 from train.runs import run_names  # noqa: F401  (conf/train.yaml names the folders of a sweep by it)
 from train.settings import ExperimentSettings
+from train.system.verbosity import take_flag
 
 
 class TrainCommand(Command):
@@ -25,7 +26,7 @@ class TrainCommand(Command):
             if "TORCHELASTIC_RUN_ID" in os.environ:
                 advice = "start a sweep with pnb-train --multirun"
                 raise InputError(f"torchrun trains one run in several processes: {advice}")
-            words = self.words(sys.argv[1:])
+            words = self.words(take_flag(sys.argv[1:]))
             import_function("train.commands.sweep:sweep")(super().__call__, words)
 
     def work(self, config: DictConfig) -> None:

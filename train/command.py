@@ -46,6 +46,7 @@ from renderer.errors import InputError
 from renderer.settings import Settings
 from train.former_keys import replace_former_key
 from train.help import CONF, HelpText, types_below, without_none
+from train.system.verbosity import take_flag
 
 # Exit status after an error of the user.
 USER_ERROR = 2
@@ -115,6 +116,7 @@ class Command:
         """Start the command with the words of the command line."""
         with exits_on_sigterm(), self.one_line():
             set_up_process()
+            sys.argv[1:] = take_flag(sys.argv[1:])
             if not HELP_FLAGS.isdisjoint(sys.argv):
                 print(self.format_help([word for word in sys.argv[1:] if word not in HELP_FLAGS]))
                 skip_last_collection()

@@ -15,15 +15,17 @@ import torch
 import yaml
 
 from renderer.errors import InputError
-from train import command
+from train import command, console
 from train.command import USER_ERROR, Command
 from train.command_settings import LightSettings
+from train.commands.experiment import logged_to
 from train.help import HelpText
 from train.runs.checkpoint import LAST
 from train.runs.run_lock import locked
 from train.system import user_errors as errors
 from train.system.hashing import content_hash
 from train.system.user_errors import user_message, writable_folder
+from train.system.verbosity import take_flag
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -85,14 +87,18 @@ class TestTrainingOfTwoArms:
         """Check the output, the log and the files of a training."""
         errors = re.sub(r".* \.\.\.\n", "", printed.err)  # Announcements end with dots.
         assert errors == ""
-        table_lines = [line for line in printed.out.splitlines() if line.startswith("|")]
-        names = [line.split("|")[1].strip() for line in table_lines]
-        methods = [name for name in names if name in ("none", "adversarial")]
-        assert methods == ["none", "adversarial"] * 2
+        lines = printed.out.splitlines()
+        assert len(lines) <= 15
+        heads = [line for line in lines if line.startswith("| network")]
+        assert [head.split() for head in heads] == [
+            ["|", "network", "|", "none", "|", "adversarial", "|"]
+        ]
         for run in (folder, folder / "none"):
             assert (run / LAST).is_file()
             assert (run / "photographs" / "contact_sheet.png").is_file()
-        assert (folder / "train.log").read_text() == printed.out
+        log = (folder / "train.log").read_text()
+        assert log.endswith(printed.out)
+        assert "epoch 1/" in log
 
 
 @pytest.mark.parametrize(
@@ -389,3 +395,20 @@ def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(errors.tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
     with pytest.raises(InputError, match=rf"out={tmp_path} .*No space left on device"):
         writable_folder(tmp_path, "out")
+
+
+@pytest.mark.parametrize(
+    ("words", "printed"),
+    [(["seed=1"], "result\n"), (["-v", "seed=1"], "detail\nresult\n")],
+    ids=["plain", "verbose"],
+)
+def test_details_are_in_the_log_and_printed_if_asked_for(
+    capsys, monkeypatch, tmp_path, words, printed
+):
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    assert take_flag(words) == ["seed=1"]
+    with logged_to(tmp_path / "train.log"):
+        console.debug("detail")
+        console.info("result")
+    assert capsys.readouterr().out == printed
+    assert (tmp_path / "train.log").read_text() == "detail\nresult\n"

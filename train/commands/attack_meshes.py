@@ -15,7 +15,13 @@ from augment.attack_settings import AttackSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.attack_files import LINES, require_renderers, save
-from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
+from augment.attacks.checks import (
+    check,
+    require_transferable,
+    success_by_radius,
+    transfer,
+    warnings,
+)
 from augment.attacks.descent import Criterion
 from augment.attacks.eot import preprocessed_model
 from augment.attacks.search import find_scene
@@ -48,6 +54,7 @@ from train.runs.saved_networks import load_chosen, load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, keys_of, writable_folder
+from train.system.verbosity import is_verbose
 
 # Settings that `find_scene` may change, in the order in which they are printed.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
@@ -142,6 +149,7 @@ def run(settings: AttackExperimentSettings) -> None:
             write_sweeps(sweeps, norms, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         write_config(out, settings, command=command_line("attack"))
+    print(f"images, adversaries and numbers: {out}")
 
 
 def _start_rasterizer(settings: AttackExperimentSettings) -> Rasterizer:
@@ -168,7 +176,10 @@ def _write_attack(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> None:
-    """Check the attack on one mesh, write its files into a folder, and print its summary."""
+    """Check the attack on one mesh, write its files into a folder, and print its summary.
+
+    With --verbose, print what the checks found, too.
+    """
     name = mesh_attack.name
     result = mesh_attack.result
     if mesh_attack.scene != settings.scene:
@@ -176,8 +187,13 @@ def _write_attack(
         print(f"{name} is misclassified in the given scene, but not with {changes}")
     checks = check(result) if settings.attack.checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
-    print(format_attack(name, result, checks, lines))
-    print(f"images, adversaries and numbers: {folder}\n")
+    if is_verbose():
+        print(format_attack(name, result, checks, lines))
+        print(f"images, adversaries and numbers: {folder}\n")
+    else:
+        print(format_attack(name, result, None))
+        for warning in warnings(checks) if checks else ():
+            print(f"warning: {warning}")
     if targets:
         table = write_transfers(targets.transfer(result), folder / TRANSFERS)
         print(f"{table}\n")

@@ -5,12 +5,13 @@ from pathlib import Path
 from augment.classifiers import Classifier
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from train.command_settings import EvaluateSettings
-from train.evaluation.scores.scoring import format_scores
+from train.evaluation.scores.scoring import format_overall, format_scores
 from train.functions.evaluate import evaluate as evaluate_network
 from train.runs.saved_networks import load_chosen, load_run
 from train.settings import label_names
 from train.system.device import choose_device
 from train.system.user_errors import keyed
+from train.system.verbosity import is_verbose
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -37,7 +38,8 @@ def evaluate(settings: EvaluateSettings) -> None:
             out=settings.out,
             overwrite=settings.overwrite,
         )
-    print(f"{format_scores(scores)}\n\ntable, scores and image: {Path(settings.out)}")
+    text = format_scores(scores) if is_verbose() else format_overall(scores)
+    print(f"{text}\ntable, scores and image: {Path(settings.out)}")
 
 
 def _load_network(settings: EvaluateSettings) -> Classifier:

@@ -15,7 +15,7 @@ from augment import distributed
 from augment.settings import MODES
 from train import console
 from train.command import program, read_settings
-from train.report.comparison import format_table
+from train.report.comparison import format_result, format_table
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.report.summary import summarize
@@ -25,6 +25,7 @@ from train.runs.run_lock import sole_writer
 from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
+from train.system.verbosity import is_verbose
 from train.training.run import load_runs
 
 # Folders of conf/ from which an override can choose a file.
@@ -115,12 +116,14 @@ def _train_methods(
     for run in load_runs(methods, command):
         method = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"
-        console.info("\n== augment=%s: %s%s", method, MODES[method], purpose)
+        console.debug("\n== augment=%s: %s%s", method, MODES[method], purpose)
         run.fit()
         run.score()
         run.export()
     if distributed.rank() == 0:
-        console.info("\n%s", format_table([summarize(path) for path in methods]))
+        summaries = [summarize(path) for path in methods]
+        console.debug("\n%s\n", format_table(summaries))
+        console.info("%s\n", format_result(summaries))
         console.info("%s", report_of([folder], folder))
 
 
@@ -151,7 +154,9 @@ class _Terminal(_QuietHandler, logging.StreamHandler):
 
 @contextmanager
 def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
-    """Log to the console and to a file until the block ends.
+    """Log to a file, and what is no detail also to the console, until the block ends.
+
+    With --verbose, the console shows details, too.
 
     Args:
         path: The file. If its folder does not exist, it is made.
@@ -167,12 +172,15 @@ def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
     root = logging.getLogger()
     level = root.level
     root.setLevel(logging.INFO)
+    console.setLevel(logging.DEBUG)
+    terminal.setLevel(logging.DEBUG if is_verbose() else logging.INFO)
     for handler in (terminal, file):
         root.addHandler(handler)
     try:
         yield
     finally:
         root.setLevel(level)
+        console.setLevel(logging.NOTSET)
         for handler in (terminal, file):
             root.removeHandler(handler)
             handler.close()

@@ -69,7 +69,7 @@ def load_shapes(
         if cached is None:
             cached = {"images": _render(part, count, seed, settings)}
             cache.write(key, cached)
-        console.info("%s images: %d", part, len(cached["images"]))
+        console.debug("%s images: %d", part, len(cached["images"]))
         labels = torch.arange(len(CLASSES)).repeat_interleave(count)
         splits.append(Split(cached["images"], labels))
     return DataSet(CLASSES, splits[0], splits[1], rendered=True)

@@ -34,6 +34,7 @@ from train.report.summary import (
     group_by_method,
     label_title,
     run_tables,
+    score_table,
     seconds_table,
 )
 from train.settings import PHOTOGRAPHS
@@ -387,6 +388,24 @@ def format_table(runs: Sequence[RunSummary]) -> str:
         sheets += [f"image: {run.folder / name / CONTACT_SHEET}" for name in run.photographs]
     parts = [_format_tables(tables), "; ".join(captions), "\n".join(sheets)]
     return "\n\n".join(part for part in parts if part)
+
+
+def format_result(runs: Sequence[RunSummary]) -> str:
+    """Write the one table that pnb-train prints without --verbose.
+
+    Args:
+        runs: Finished runs.
+
+    Returns:
+        Markdown table of the scores on the first photographs, with a row for each metric. If
+        there are no photographs, the table shows the accuracy.
+    """
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    scored = [score_table(title, group) for title, group in groups.items()]
+    (table, *_) = scored or run_tables(methods, groups)
+    header, *rows = zip(*[table.known.header, *table.known.rows], strict=True)
+    return str(Table(table.title, header, rows))
 
 
 def _format_tables(tables: Sequence[Table]) -> str:

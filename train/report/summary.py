@@ -35,6 +35,10 @@ MAX_NAMED = 30
 LONGEST_NAME = 56
 # Name of a network that runs began with, in place of that of a method.
 INITIAL = "the initial network"
+# Names of both networks if nothing but one method with renders is compared with
+# the network that it began with.
+BEFORE_HARDENING = "before hardening"
+AFTER_HARDENING = "after hardening"
 
 
 @dataclass(frozen=True)
@@ -315,6 +319,8 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
     for run in (*_initial_networks(runs), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
     heads = [group[0] for group in groups.values()]
+    if len(heads) == 2 and heads[0].method == INITIAL and heads[1].method != "none":
+        return dict(zip((BEFORE_HARDENING, AFTER_HARDENING), groups.values(), strict=True))
     varied = {}
     for method in {head.method for head in heads}:
         varied[method] = varied_settings([head for head in heads if head.method == method])

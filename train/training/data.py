@@ -35,7 +35,7 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
     """
     name = settings.data.name
     require_choice("data.name", name, SOURCES)
-    console.info("data: %s", name)
+    console.debug("data: %s", name)
     with main_process_first(), keyed(**keys_of("data", settings.data)):
         data = _load(name, settings, initial)
     with keyed("data.path"):

@@ -214,13 +214,15 @@ def choose_validation(
         return ValidationPart(fraction, own)
     begun = settings.train.init_from
     if not isinstance(known, float) or own | {"fraction": known} != stored:
-        console.info("validation: %s does not say whether it learned from these images, too", begun)
+        console.debug(
+            "validation: %s does not say whether it learned from these images, too", begun
+        )
         return ValidationPart(fraction, None)
     if asked is None:
         fraction = known
     if fraction > known:
         left_out = f"it left out only data.validation={known}"
-        console.info("validation: %s learned from part of it: %s", begun, left_out)
+        console.debug("validation: %s learned from part of it: %s", begun, left_out)
     return ValidationPart(fraction, own | {"fraction": min(fraction, known)})
 
 

@@ -407,7 +407,7 @@ class Trainer:
         self.history.append({"epoch": self.epoch, **metrics})
         if log:
             log.scalars(metrics, self.epoch)
-        console.info("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
+        console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
         """Raise InputError if the loss or a weight is NaN or infinite."""

@@ -89,7 +89,7 @@ def _build_scene(
     """Build the scene of a run's meshes, in the first process before the others."""
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
-    console.info("rasterizer: %s", rasterizer.description)
+    console.debug("rasterizer: %s", rasterizer.description)
     with (
         phases("operators"),
         main_process_first(),

@@ -132,7 +132,7 @@ class Run:
     def fit(self) -> None:
         """Score the initial network, if there is one, and train to the last epoch."""
         torch.set_num_threads(self._threads)  # Other runs may have been loaded since.
-        console.info(
+        console.debug(
             "%d images, %d classes; %s, %s, threads: %d, processes: %d",
             (~self.held_out).sum(),
             len(self.data.classes),
@@ -162,7 +162,7 @@ class Run:
         if self.log:
             for name in self.settings.evaluate.folders:
                 scores = self._score_photographs(trainer.selected, name, self.folder)
-                console.info("%s: %s", name, format_scores(scores))
+                console.debug("%s: %s", name, format_scores(scores))
                 self._scores |= _photograph_scores(name, scores)
             self.log.scalars(self._scores)
         return self._scores
@@ -252,7 +252,7 @@ class Run:
         if self.data.labeled:
             images = describe_test_images(settings, self.data)
             begun = settings.train.init_from
-            console.info("before: %s has accuracy %.4f on %s", begun, accuracy, images)
+            console.debug("before: %s has accuracy %.4f on %s", begun, accuracy, images)
         for name in settings.evaluate.folders:
             self._score_photographs(predict, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
@@ -280,7 +280,7 @@ class Run:
         if best["epoch"] != trainer.epoch:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
-        console.info(
+        console.debug(
             "accuracy %.4f (epoch %d, selected), %.4f (the last) on %s",
             selected,
             best["epoch"],
@@ -299,7 +299,7 @@ class Run:
         if self.data.labeled:
             answered = Split(self.data.test.images, answers).to(self.trainer.device)
             agreement = evaluate(self.trainer.selected, answered)["accuracy"]
-        console.info(
+        console.debug(
             "agreement with %s on %d held-out images: %.4f",
             self.settings.train.init_from,
             len(answers),

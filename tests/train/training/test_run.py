@@ -668,7 +668,7 @@ class TestValidationImages:
 
     def record_of_run(self, tiny, caplog, initial: Path, fraction: str, folder: Path):
         """Load a run that starts from a network, and return the record of its validation."""
-        caplog.set_level("INFO", "train")
+        caplog.set_level("DEBUG", "train")
         caplog.clear()
         settings = tiny(
             *WITHOUT_RENDERS,

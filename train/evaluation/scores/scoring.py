@@ -388,6 +388,25 @@ def format_scores(scores: Scores) -> str:
     return "\n\n".join(paragraphs)
 
 
+def format_overall(scores: Scores) -> str:
+    """Write the scores of all images as one Markdown table, with 95 % intervals.
+
+    Args:
+        scores: Scores of a model on photographs.
+
+    Returns:
+        The table below a line that counts the images, and notes about thresholds and files.
+    """
+    positives = len(scores.pooled.all.positives)
+    negatives = len(scores.pooled.all.negatives)
+    title = f"{positives} images of {scores.label}, {negatives} of other things"
+    rows = []
+    for table in (_counted_table(scores), _ranked_table(scores)):
+        rows += list(zip(table.header[1:], table.rows[0][1:], strict=True))
+    table = Table(f"{title}; 95 % intervals", ["metric", scores.label], rows)
+    return "\n".join([str(table), *_notes(scores)])
+
+
 def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
     """Name the metrics that tables show: of all images, each label, and each mesh or source."""
     yield "all", scores.overall

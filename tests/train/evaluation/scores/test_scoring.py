@@ -25,6 +25,7 @@ from train.evaluation.scores.scoring import (
     Scores,
     choose_operating_points,
     evaluate_photographs,
+    format_overall,
     format_scores,
     score,
     write,
@@ -488,9 +489,9 @@ class TestPhotographsThatCannotBeRead:
             "unreadable": 1,
             "left_out": 1,
         }
-        text = format_scores(scores)
-        assert "orange/broken.jpg" in text
-        assert "orange/photo.HEIC" in text
+        for text in (format_scores(scores), format_overall(scores)):
+            assert "orange/broken.jpg" in text
+            assert "orange/photo.HEIC" in text
 
 
 class ModeRecorder(torch.nn.Module):
