@@ -30,8 +30,13 @@ from renderer.settings import (
 OTHER = "other"
 # Sub-folder of a run with the scores on photographs, if evaluate.photos gives no names.
 PHOTOGRAPHS = "photographs"
+# Sub-folder of a run with renders that are kept aside, and that with their scores.
+KEPT_ASIDE = "kept_aside"
+LABORATORY = "laboratory"
+# Number of patterns of these renders.
+KEPT_ASIDE_PATTERNS = 5
 # Names that evaluate.photos cannot give. They name other sub-folders and scores of a run.
-RESERVED = ("renders", "test", "before")
+RESERVED = ("renders", "test", "before", KEPT_ASIDE)
 WIDERESNET = "wideresnet"
 # Value of train.freeze with which the last layer alone is trained, as by Kirichenko
 # et al. (2023).
@@ -316,9 +321,22 @@ class EvaluationSettings(Settings):
         is_text=True,
     )
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
+    laboratory_setups: int = setting(
+        0,
+        "If photos is null: number of draws of light and camera of path-traced renders that are "
+        "kept aside, of other instances and patterns than in training. Both networks are scored "
+        "on them. A multiple of 5. 0: none.",
+        minimum=0,
+        maximum=MAX_IMAGES,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.laboratory_setups % KEPT_ASIDE_PATTERNS:
+            expected = f"must be a multiple of the {KEPT_ASIDE_PATTERNS} patterns"
+            raise InputError(
+                f"laboratory_setups={self.laboratory_setups} {expected}", "laboratory_setups"
+            )
         photos = self.photos
         is_mapping = isinstance(photos, dict)
         is_mapping = is_mapping and all(isinstance(folder, str) for folder in photos.values())

@@ -25,7 +25,7 @@ from train.evaluation.scores.metrics import (
 )
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import CONTACT_SHEET
-from train.evaluation.tables import Estimate, Table, format_interval
+from train.evaluation.tables import Estimate, Table, format_interval, fraction
 from train.report.summary import (
     INITIAL,
     RunSummary,
@@ -288,10 +288,17 @@ def difference(
         _have_equal_seeds(group, reference),
     )
     change = estimate(after - before, replicates)
+    assert change.low is not None and change.high is not None
+    margin = 0.0
+    if change.low == change.high:
+        # All replicates are equal, as if both methods agree on every image. Then
+        # the interval has the images that may differ unseen (Wilson 1927).
+        image_count = min(len(pools[0].positives), len(pools[0].negatives))
+        margin = fraction(0, max(1, image_count)).high or 0.0
     return Difference(
         value=change.value,
-        low=change.low,
-        high=change.high,
+        low=max(-1.0, change.low - margin),
+        high=min(1.0, change.high + margin),
         before=before,
         after=after,
     )

@@ -37,7 +37,7 @@ from train.report.summary import Methods, RunSummary, Scored
 from train.runs.epoch_metrics import attack_success
 from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import RENDERS
-from train.settings import PHOTOGRAPHS, published
+from train.settings import KEPT_ASIDE, LABORATORY, PHOTOGRAPHS, published
 from train.system.user_errors import user_message
 
 # Name of the file.
@@ -202,20 +202,26 @@ def _sha256(script: str) -> str:
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
-    """Write the page of finished runs, and return the last line that their command prints.
+    """Write the page of finished runs, and return the last lines that their command prints.
 
     An error must not make a command fail whose runs are finished and saved. It
-    is therefore part of the line.
+    is therefore part of the lines.
 
     Args:
         folders: Folders of the runs.
         out: Folder that report.html is written to.
 
     Returns:
-        The path of the page, or why there is no page.
+        What hardening changed, if that was measured, and the path of the page,
+        or why there is no page.
     """
     try:
-        return f"report: {write_report(folders, out)}"
+        lines = [f"report: {write_report(folders, out)}"]
+        groups = summary.group_by_images(summary.group_by_method(summary.find(folders).runs))
+        screen = _first_screen(groups)
+        if screen is not None:
+            lines = [screen.answer, *screen.sentences, *lines]
+        return "\n".join(lines)
     except Exception as error:
         return f"no report: {user_message(error) or traceback.format_exc()}"
 
@@ -358,7 +364,8 @@ def images_folder(run: RunSummary, name: str) -> Path | None:
     named = photos if isinstance(photos, Mapping) else {PHOTOGRAPHS: photos}
     folder = named.get(name)
     if not folder:
-        return None
+        rendered = run.folder / KEPT_ASIDE
+        return rendered if name == LABORATORY and rendered.is_dir() else None
     start = run.config.get("working_folder") or ""
     candidates = (published(Path(folder)), Path(start) / folder)
     return next(filter(Path.is_dir, candidates), None)

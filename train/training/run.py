@@ -21,8 +21,10 @@ from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from train import console
 from train.data.cache import TensorCache, cache_folder
-from train.data.photographs import find_photographs, require_outside
+from train.data.photographs import DESCRIPTION, find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
+from train.evaluation.laboratory.kept_aside import kept_aside_settings
+from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import METRICS
 from train.evaluation.scores.predictions import BATCH, Model, Predictor, compute_logits
 from train.evaluation.scores.scoring import Scores, evaluate_photographs, format_scores
@@ -31,7 +33,7 @@ from train.runs import checkpoint
 from train.runs.run_config import require_same_run, write_config
 from train.runs.run_log import BEFORE, RunLog, remove_run
 from train.runs.saved_networks import WEIGHTS, export
-from train.settings import ExperimentSettings
+from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.system.device import (
     MixedPrecision,
     choose_device,
@@ -90,6 +92,8 @@ class Run:
         self.initial = initial
         self.command = command
         self._scores: dict[str, float] = {}
+        # The folders of photographs and renders on which the networks are scored.
+        self.scored_folders = settings.evaluate.folders
         # The threads that the run trains with.
         self._threads = 1
         # The classes that the initial network gives the test images, shape (N,).
@@ -143,6 +147,8 @@ class Run:
         )
         is_first = distributed.rank() == 0
         self.log = RunLog(self.folder, self.trainer.history) if is_first else None
+        if is_first:
+            self._render_kept_aside()
         if self.trainer.initial:
             self._score_initial(self.trainer.initial)
         split = self.data.train.to(self.trainer.device)
@@ -160,7 +166,7 @@ class Run:
         if self._answers is not None and CLASSIFIER in trainer.architecture:
             self._scores["test/agreement"] = self._agreement(self._answers)
         if self.log:
-            for name in self.settings.evaluate.folders:
+            for name in self.scored_folders:
                 scores = self._score_photographs(trainer.selected, name, self.folder)
                 console.debug("%s: %s", name, format_scores(scores))
                 self._scores |= _photograph_scores(name, scores)
@@ -253,9 +259,25 @@ class Run:
             images = describe_test_images(settings, self.data)
             begun = settings.train.init_from
             console.debug("before: %s has accuracy %.4f on %s", begun, accuracy, images)
-        for name in settings.evaluate.folders:
+        for name in self.scored_folders:
             self._score_photographs(predict, name, self.folder / BEFORE)
         self._scores["test/accuracy_before"] = accuracy
+
+    def _render_kept_aside(self) -> None:
+        """Render the images that are kept aside, unless there are photographs or the renders."""
+        if self.scored_folders or not self.settings.evaluate.laboratory_setups:
+            return
+        folder = self.folder / KEPT_ASIDE
+        is_complete = self.settings.train.resume and (folder / DESCRIPTION).exists()
+        if not is_complete:
+            classes = self.data.classes
+            settings = kept_aside_settings(self.settings, classes, self.data.size, folder)
+            try:
+                write_laboratory(settings)
+            except InputError as error:
+                console.warning("no renders are kept aside: %s", error)
+                return
+        self.scored_folders = {LABORATORY: folder}
 
     def _predicted_classes(self, model: Model, split: Split) -> Tensor:
         """Return the classes that a model gives the images of a split, shape (N,)."""
@@ -312,7 +334,7 @@ class Run:
         asked = self.settings.evaluate
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),
-            asked.folders[name],
+            self.scored_folders[name],
             self.settings.label,
             folder / name,
             asked.skip_unreadable,

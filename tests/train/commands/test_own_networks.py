@@ -173,6 +173,7 @@ def harden(here, monkeypatch) -> Callable[..., Path]:
             "train.threads=1",
             "train.cache=null",
             "renderer.shadows=false",
+            "evaluate.laboratory_setups=0",
         ]
         data = [
             "data.path=photos",

@@ -114,6 +114,7 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
         "train.batch_size=8",
         "train.cache=null",
         "train.device=cpu",
+        "evaluate.laboratory_setups=0",
     ]
     completed_run(main.read(overrides), tmp_path / "run")
     expected = torch.load(tmp_path / "run" / "weights.pt")

@@ -206,22 +206,6 @@ def test_an_exception_of_the_report_is_printed_with_its_traceback_and_ends_no_tr
     assert last.startswith("ZeroDivisionError")
 
 
-@pytest.fixture(scope="module")
-def browser():
-    """Start the system's Chromium, or playwright's own."""
-    api = pytest.importorskip("playwright.sync_api")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    paths = [shutil.which(name) for name in names]
-    installed = next(filter(None, paths), None)
-    with api.sync_playwright() as playwright:
-        try:
-            chromium = playwright.chromium.launch(executable_path=installed, args=["--no-sandbox"])
-        except api.Error as error:
-            pytest.skip(f"no Chromium: {error.message.splitlines()[0]}")
-        yield chromium
-        chromium.close()
-
-
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
 def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dark(
     page,
@@ -231,9 +215,12 @@ def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dar
 ):
     view = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
     urls = []
+    errors = []
+    view.on("console", lambda message: errors.append(message.text))
     view.on("request", lambda request: urls.append(request.url))
     view.goto(page.as_uri())
     assert view.evaluate("document.documentElement.scrollWidth") <= width
     assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
     assert [url for url in urls if not url.startswith("data:")] == [page.as_uri()]
+    assert errors == []
     view.close()

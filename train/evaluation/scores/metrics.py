@@ -246,8 +246,22 @@ class Pool:
         estimates = []
         values = auc_and_recalls(*self.scores)
         for value, replicates in zip(values, self._ranked_replicates, strict=True):
-            estimates.append(estimate(float(value), replicates))
+            metric = estimate(float(value), replicates)
+            if metric.low == metric.high:
+                metric = self._widened(metric)
+            estimates.append(metric)
         return estimates
+
+    def _widened(self, metric: Estimate) -> Estimate:
+        """Replace an interval of zero width by Wilson's, as if each object had one image."""
+        groups = (self.ranked.positives, self.ranked.negatives)
+        object_count = min(len(np.unique(_object_indices(group))) for group in groups)
+        assert metric.value is not None
+        wilson = fraction(round(metric.value * object_count), object_count)
+        assert wilson.low is not None and wilson.high is not None
+        low = min(wilson.low, metric.value)
+        high = max(wilson.high, metric.value)
+        return Estimate(value=metric.value, low=low, high=high)
 
     @property
     def _can_rank(self) -> bool:

@@ -1,0 +1,38 @@
+"""Renders that are kept aside share no instance and no pattern with training."""
+
+import pytest
+
+from train.__main__ import main as train_command
+from train.command_settings import TRAINED_PATTERNS
+from train.evaluation.laboratory.kept_aside import kept_aside_settings
+from train.settings import ExperimentSettings
+
+
+@pytest.fixture
+def settings() -> ExperimentSettings:
+    """Read the settings of the hardening of a classifier by an orange and other fruit."""
+    words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
+    return train_command.read([*words, "scene.meshes=[solid:orange:0,solid:orange]"])
+
+
+def test_no_instance_and_no_pattern_is_one_of_training(settings, tmp_path):
+    aside = kept_aside_settings(settings, ["orange", "apple"], 32, tmp_path)
+    trained = {item.mesh for item in settings.objects.values()}
+    meshes = [item["mesh"] for item in aside.meshes]
+    assert trained.isdisjoint(meshes)
+    assert all(len(mesh.split(":")) == 3 for mesh in meshes)
+    assert set(aside.patterns).isdisjoint(TRAINED_PATTERNS)
+
+
+def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path):
+    aside = kept_aside_settings(settings, ["orange", "Sweet pepper"], 32, tmp_path)
+    labels = {item["label"] for item in aside.meshes}
+    assert {"orange", "Sweet pepper", "other_apple", "other_lemon"} <= labels
+    assert "other_orange" not in labels
+
+
+def test_a_class_that_cannot_be_generated_has_its_meshes_of_training(tmp_path):
+    words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
+    own = train_command.read([*words, "label=mug", "scene.meshes=[mug.glb]"])
+    aside = kept_aside_settings(own, ["mug"], 32, tmp_path)
+    assert [item["mesh"] for item in aside.meshes if item["label"] == "mug"] == ["mug.glb"]

@@ -1,0 +1,144 @@
+"""Chromium shows the page of an audit without errors, in light and dark, wide and narrow."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from PIL import Image
+
+import augment
+from train.auditing import audit, lights
+from train.auditing.audit import run_audit
+from train.command_settings import AuditSettings
+
+CLASSES = ("orange", "other")
+# Least contrast of text by WCAG 2.1, level AA, section 1.4.3; and of large text.
+CONTRAST = 4.5
+CONTRAST_OF_LARGE_TEXT = 3.0
+# The lowest contrast of visible text to the page, divided by what its size needs.
+LOWEST_CONTRAST = """([needed, neededIfLarge]) => {
+  const channels = (text) => text.match(/[\\d.]+/g).map(Number);
+  const luminance = (color) => {
+    const linear = color.slice(0, 3).map((value) => {
+      const c = value / 255;
+      return c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+    });
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2];
+  };
+  const background = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const color = channels(getComputedStyle(e).backgroundColor);
+      if (color.length === 3 || color[3] > 0) return color;
+    }
+    return [255, 255, 255];
+  };
+  let lowest = Infinity;
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const element = walker.currentNode.parentElement;
+    if (!walker.currentNode.data.trim() || !element.checkVisibility()) continue;
+    const style = getComputedStyle(element);
+    const [a, b] = [luminance(channels(style.color)), luminance(background(element))];
+    const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+    const size = parseFloat(style.fontSize);
+    const isLarge = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+    lowest = Math.min(lowest, ratio / (isLarge ? neededIfLarge : needed));
+  }
+  return lowest;
+}"""
+
+
+def darker_than(limit: float, name: str) -> augment.Classifier:
+    """Make a classifier that takes images darker than a limit on average for an orange."""
+
+    def logits(images: torch.Tensor) -> torch.Tensor:
+        excess = 20 * (images.mean((1, 2, 3)) - limit)
+        return torch.stack([-excess, excess], dim=1)
+
+    return augment.Classifier(logits, 8, CLASSES, name)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Path:
+    """Audit two classifiers with light from all around alone, on four images."""
+    folder = tmp_path_factory.mktemp("audit")
+    for label in CLASSES:
+        (folder / "lab" / label).mkdir(parents=True)
+        for name, color in {"black": "black", "gray": "#808080"}.items():
+            Image.new("RGB", (8, 8), color).save(folder / "lab" / label / f"{name}.png")
+    settings = AuditSettings(
+        classifier="original",
+        meshes=["solid:orange:0"],
+        laboratory=str(folder / "lab"),
+        environments=[],
+        budget=0.1,
+        device="cpu",
+        out=str(folder / "out"),
+    )
+    networks = {
+        "classifier": darker_than(0.52, "original"),
+        "hardened": darker_than(0.45, "hardened"),
+    }
+    kind = lights.KINDS["lighting"]._replace(radii=(0.1, 3.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lights, "STEPS", 3)
+        patch.setattr(lights, "ADDITIONAL_STEPS", 3)
+        for name in ("skylight", "projector", "lamps"):
+            patch.delitem(lights.KINDS, name)
+        patch.setitem(lights.KINDS, "lighting", kind)
+        patch.setattr(audit, "LIGHTS", 1)
+        return run_audit(settings, networks)
+
+
+@pytest.fixture(params=[(1280, "light"), (400, "light"), (1280, "dark"), (400, "dark")])
+def view(request, page, browser) -> Iterator[Any]:
+    """Open the page, and fail at its end if the console has an error."""
+    width, scheme = request.param
+    opened = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    errors = []
+    opened.on("console", lambda message: errors.append(message.text))
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.goto(page.as_uri())
+    yield opened
+    opened.close()
+    assert errors == []
+
+
+def test_the_slider_changes_the_picture_the_light_and_the_prediction(view):
+    before = [view.get_attribute(name, "src") for name in ("#object", "#ball")]
+    assert view.text_content("#predicted") == "✓ orange"
+    view.focus("#light")
+    view.keyboard.press("End")
+    after = [view.get_attribute(name, "src") for name in ("#object", "#ball")]
+    assert view.text_content("#predicted") == "✗ other"
+    assert all(one != other for one, other in zip(before, after, strict=True))
+
+
+def test_details_open_and_the_page_never_scrolls_sideways(view):
+    width = view.viewport_size["width"]
+    details = view.locator("details.section")
+    assert details.count() > 3
+    for index in range(details.count()):
+        item = details.nth(index)
+        assert item.get_attribute("open") is None
+        item.locator("summary").first.click()
+        assert item.get_attribute("open") is not None
+    assert view.evaluate("document.documentElement.scrollWidth") <= width
+    assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
+
+
+def test_links_lead_to_a_place_in_the_page(view):
+    script = "[...document.links].every(link => document.querySelector(link.hash))"
+    assert view.evaluate(script)
+
+
+def test_text_has_the_contrast_of_wcag_aa(view):
+    view.evaluate("document.querySelectorAll('details').forEach(item => { item.open = true })")
+    limits = [CONTRAST, CONTRAST_OF_LARGE_TEXT]
+    assert view.evaluate(LOWEST_CONTRAST, limits) >= 1
+
+
+def test_a_page_with_a_slider_has_at_most_a_megabyte(page):
+    assert page.stat().st_size <= 2**20
