@@ -43,7 +43,7 @@ def run(heading: str, **names) -> dict[str, object]:
 
 def test_every_block_of_python_is_run_here():
     assert BLOCKS.keys() == {
-        "Attack a classifier",
+        "Attack a network",
         "Render",
         "Your own training loop",
         "Many lights and views",
@@ -76,13 +76,15 @@ def test_load_block_recognizes_an_orange(folder):
     assert run("Load")["predicted"] == "orange"
 
 
-def test_attack_block_saves_what_it_found(folder):
-    names = run("Attack a classifier")
+def test_attack_block_fools_a_network_of_torchvision_in_three_views(folder):
+    names = run("Attack a network")
     result = names["result"]
-    assert names["after"].shape == names["before"].shape == (1, 3, 3, 32, 32)
+    assert result.logits_before.argmax(-1).eq(0).all()  # orange
+    assert result.logits.argmax(-1).eq(1).all()
+    assert result.success.all()
+    assert (folder / "attack.png").is_file()
     assert (folder / "adversaries" / "attack.jsonl").is_file()
     assert (folder / "adversaries" / "example_000" / "light.json").is_file()
-    assert result.success.all()
 
 
 class Photographs(Dataset):
