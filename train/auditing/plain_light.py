@@ -15,7 +15,7 @@ from train.auditing.lights import LIGHT, Views, is_correct
 # Lights that have nothing unusual: that of the scene, and even light.
 PLAIN_LIGHTS = (LIGHT, UNIFORM)
 # Factors of the size of the objects that are tried.
-SIZES = (1.0, 1.4, 0.7)
+SIZES = (1.0, 0.75, 1.2)
 # Least fraction of recognized views at which the search ends.
 ENOUGH = 0.75
 

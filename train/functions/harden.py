@@ -162,6 +162,8 @@ def _read_settings(
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
+    # The function returns a network, and nobody would see the scores.
+    settings.evaluate.laboratory_setups = 0
     given = {name: _as_mapping(name, section) for name, section in sections.items()}
     merged = OmegaConf.merge(settings, changes, given)
     if "hard_negatives" not in changes["scene"]:

@@ -160,7 +160,9 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
         ]
     if not any(known.values()):
         return None
-    styles = {method: style(index) for index, method in enumerate(methods)}
+    # One network has the color of networks after hardening, as on all charts.
+    first = 1 if len(methods) == 1 else 0
+    styles = {method: style(index) for index, method in enumerate(methods, first)}
     means = []
     for method, pairs in known.items():
         areas = [auc_and_recalls(*pair)[0] for pair in pairs]
