@@ -109,6 +109,7 @@ class Compared(NamedTuple):
         names: Names of both networks in the legend.
         subjects: The same two networks in sentences.
         place: Where the images are from, to begin a sentence.
+        change: What the second network differs by, such as "hardening".
     """
 
     label: str
@@ -117,6 +118,7 @@ class Compared(NamedTuple):
     names: tuple[str, str]
     subjects: tuple[str, str]
     place: str
+    change: str = "hardening"
 
     def difference(self, name: str) -> compare.Difference | None:
         """Subtract a metric of the original network from that of the hardened network."""
@@ -173,7 +175,7 @@ def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> Fir
     if recall is None or false_positives is None or auc is None:
         return None
     return FirstScreen(
-        answer=_answer(recall, false_positives, auc),
+        answer=_answer(compared.change, recall, false_positives, auc),
         sentences=_sentences(compared, recall, false_positives),
         numbers=numbers,
         rows=rows,
@@ -205,21 +207,23 @@ def _direction(change: compare.Difference) -> int:
 
 
 def _answer(
+    change: str,
     recall: compare.Difference,
     false_positives: compare.Difference,
     auc: compare.Difference,
 ) -> str:
-    """Say in a few words whether hardening helped."""
+    """Say in a few words whether a change helped."""
+    subject = change[0].upper() + change[1:]
     match _direction(auc):
         case 1 if _direction(false_positives) > 0:
-            return "Hardening helped, at a price."
+            return f"{subject} helped, at a price."
         case 1:
-            return "Hardening helped."
+            return f"{subject} helped."
         case -1:
-            return "Hardening did harm."
+            return f"{subject} did harm."
     if _direction(recall) > 0 and _direction(false_positives) > 0:
-        return "Hardening finds more, and mistakes more; a gain is not proven."
-    return "It is not proven that hardening helped."
+        return f"{subject} finds more, and mistakes more; a gain is not proven."
+    return f"It is not proven that {change} helped."
 
 
 def _sentences(

@@ -220,7 +220,7 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
         groups = summary.group_by_images(summary.group_by_method(summary.find(folders).runs))
         screen = _first_screen(groups)
         if screen is not None:
-            lines = [screen.answer, *screen.sentences, *lines]
+            lines = [" ".join([screen.answer, *screen.sentences]), *lines]
         return "\n".join(lines)
     except Exception as error:
         return f"no report: {user_message(error) or traceback.format_exc()}"
@@ -344,6 +344,7 @@ def _compare_on(group: Scored) -> FirstScreen | None:
         after=evaluations[method],
         names=names,
         subjects=subjects,
+        change="hardening" if initial else f"“{method}”",
         place=place_of(images, scored.name),
     )
     return compare_networks(compared, rows)
