@@ -1,6 +1,7 @@
 """Cameras and lights are found again in path-traced images, and in images of this renderer."""
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,41 @@ def irradiance_error(
     expected = operator.radiance(light)
     difference = operator.radiance(found.light) - expected
     return float(difference.norm() / expected.norm())
+
+
+@dataclass
+class NearbyFit:
+    """A fit of a small render that starts 3° from its camera.
+
+    Attributes:
+        found: What is found.
+        error: Error of the irradiance of the visible surface.
+    """
+
+    found: FittedScene
+    error: float
+
+
+def nearby_fit(brightness: float) -> NearbyFit:
+    """Fit a mushroom under a light of some brightness, of which an image shows values up to 1."""
+    mesh = renderer.normalize(renderer.solid("mushroom"))
+    light = brightness * positive_light("eucalyptus")
+    [image] = renderer.render(mesh, FAR, light, 24, 0.0, samples=8)
+    mask = coverage_of(mesh, FAR, 24)
+    start = replace(FAR, polar=FAR.polar + 3, azimuth=FAR.azimuth - 3)
+    found = fit_scene(image.clamp(0, 1), mask, mesh, start=start)
+    return NearbyFit(found, irradiance_error(found, mesh, FAR, light))
+
+
+def test_a_renders_camera_and_light_are_found_from_a_camera_nearby():
+    fit = nearby_fit(brightness=1.0)
+    require_same_camera(fit.found.camera, FAR)
+    assert fit.error < 0.05
+
+
+def test_light_is_found_from_an_image_with_overexposed_parts():
+    """A sixth of the values of the object are 1 and tell no more than that they are bright."""
+    assert nearby_fit(brightness=9.0).error < 0.055
 
 
 @pytest.mark.slow

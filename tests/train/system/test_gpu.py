@@ -6,7 +6,7 @@ import torch
 from tests.runs import completed_run
 from train.runs import checkpoint
 from train.runs.run_log import read_metrics
-from train.training.loop import Trainer
+from train.training import loop
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
@@ -43,18 +43,18 @@ def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, 
 
 @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
 def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
-    """Steps that synchronize raise an error; phases and the ends of epochs may."""
-    step = Trainer._step
+    """Between two batches, what synchronizes raises an error. Making a batch may synchronize."""
+    training_batches = loop.training_batches
 
-    def asynchronous(self, *batch):
-        # The first steps compile, which waits for the GPU.
-        is_compiled = self._under_way.step > 3
-        torch.cuda.set_sync_debug_mode("error" if is_compiled else "default")
-        try:
-            return step(self, *batch)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
+    def watched(*arguments):
+        for index, batch in enumerate(training_batches(*arguments)):
+            # The first steps compile, which waits for the GPU.
+            torch.cuda.set_sync_debug_mode("error" if index > 3 else "default")
+            try:
+                yield batch
+            finally:
+                torch.cuda.set_sync_debug_mode("default")
 
-    monkeypatch.setattr(Trainer, "_step", asynchronous)
+    monkeypatch.setattr(loop, "training_batches", watched)
     few = ("augment=none", "train.epochs=1", "train.batch_size=4")
     weights_of(tiny("train.device=cuda", *few, f"train.ema_decay={ema_decay}"), tmp_path)
