@@ -1,7 +1,7 @@
 """Losses: the cost that an attack decreases, and the losses of training.
 
 A label is a class, or any class but one. The latter is a complementary label, and it is written
-−1 − class. If several classes are under study, `absent` holds further classes that images of a
+−1 − class. If there are several positive classes, `absent` holds further classes that images of a
 complementary label do not show.
 """
 

@@ -339,7 +339,7 @@ class AuditSettings(ClassifierSettings):
     meshes: list[Any] = setting([], "Meshes of the class.")
     hard_negatives: list[Any] = setting(
         [],
-        "Meshes of other classes, in the same lighting. []: generated fruit and other things, but "
+        "Meshes of other classes, in the same lighting. []: generated fruit and balls, but "
         "none with the name of the class.",
     )
     photos: str | None = setting(None, "Folder of photographs, as pnb-evaluate takes it.")

@@ -186,7 +186,7 @@ TWO_CLASSES = [
                 "label=[orange,pear,apple]",
                 "scene.hard_negatives=['solid:fruit',{mesh: 'solid:apple', label: apple}]",
             ],
-            "leaves no class of the network for other things",
+            "has all classes of the network",
         ),
         (["augment=folder", "augment.folder=/no/lab"], "augment.folder: /no/lab is not a folder"),
         (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),

@@ -56,8 +56,8 @@ class Photograph:
         path: The path in the folder.
         label: The class, or a name that begins with "other_".
         source: Where the image comes from, if that is known.
-        hard_negatives: The sources of other things that the image is ranked against, besides its
-            own source.
+        hard_negatives: The sources of negatives that the image is ranked against, in addition to
+            its own source.
         mesh: The name of the object, if that is known.
     """
 
@@ -293,12 +293,14 @@ def _has_class_folders(
         if others == names or any(_is_like(name, label) for label in labels):
             suggestions = nearest(name, classes)
             problem = f"is not named after a class of the model (such as {suggestions})"
-            advice = f"rename it, to {OTHER_PREFIX}{name} if it shows other things"
+            advice = f"rename it, to {OTHER_PREFIX}{name} if it shows hard negatives"
             raise InputError(f"{folder / name} {problem}: {advice}")
     if others:
         count = f"{len(others)} of {len(names)} folders in {folder}"
         shown = ", ".join(others)
-        _warn_once(f"{count} are of no class of the model and count as other things: {shown}")
+        _warn_once(
+            f"{count} are not named after a class of the model and count as negatives: {shown}"
+        )
     loose = [path for path in paths if len(path.parts) == 1]
     if names and loose:
         problem = f"{folder / loose[0]} lies beside class folders"

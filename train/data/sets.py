@@ -84,8 +84,8 @@ class DataSet:
         classes: The names of the classes, in label order.
         train: The images to learn from.
         test: The images to score on.
-        labeled: Whether the labels are known. Otherwise all of them are 0, and the answers of
-            the network that a run begins with take their place.
+        labeled: Whether the labels are known. Otherwise all labels are 0 at first. A run
+            replaces them with the predictions of its initial network.
         rendered: Whether the images are renders of solids.
     """
 

@@ -54,8 +54,8 @@ def audit(
             pairs of these and the class.
         label: Class of the meshes, a name or an index. None if a mesh is in a
             pair with its class, or is named by it.
-        hard_negatives: Meshes of other things in the same lighting, also with a
-            class or without. Without any, generated fruit and balls.
+        hard_negatives: Meshes of other classes, rendered in the same lighting,
+            with or without a class. None for generated fruit and balls.
         hardened: Another network of the same arguments to show beside it.
         classes: Names of the classes of plain networks, in the order of their
             outputs. None for "0", "1" and so on.

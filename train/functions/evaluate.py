@@ -56,8 +56,8 @@ def evaluate(
         network: A classifier, or a plain network from images to logits, such as
             a `torch.nn.Module`.
         folder: Folder with a sub-folder of photographs for each class. Other
-            sub-folders show other things. "pretrained/laboratory" is installed.
-        label: Class under study, or several: names or indices. Recall counts
+            sub-folders show negatives. "pretrained/laboratory" is installed.
+        label: Positive class, or several: names or indices. Recall counts
             the photographs of a class that the network finds. None for all
             classes that have a sub-folder.
         classes: Names of the classes of a plain network, in the order of its
@@ -115,8 +115,8 @@ def evaluate(
                 points = _choose_points(
                     predictor, calibrate, labels, false_positive_rate, skip_unreadable
                 )
-            answers = predictor.predict(folder, labels, skip_unreadable)
-            scores = scoring.score(answers, by, points)
+            predictions = predictor.predict(folder, labels, skip_unreadable)
+            scores = scoring.score(predictions, by, points)
             if target:
                 scoring.write(scores, target)
     return scores
@@ -125,7 +125,7 @@ def evaluate(
 def _choose_labels(
     classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
 ) -> list[str]:
-    """Return the names of the classes under study."""
+    """Return the names of the positive classes."""
     if label is not None:
         return [classifier.classes[classifier.label(name)] for name in label_names(label)]
     labels = class_folders(folder, classifier.classes)

@@ -72,7 +72,7 @@ def harden(
     """Train a copy of a network to recognize objects under unusual lighting.
 
     This is `pnb-train experiment=classifier`: the last layer learns from
-    renders, and the network keeps its answers on photographs.
+    renders, and its predictions for photographs stay nearly the same.
 
     Args:
         network: A plain network from images to logits, in evaluation mode, or
@@ -83,8 +83,8 @@ def harden(
         photographs: Folder of any photographs, with labels or without.
         label: Class of the meshes, a name or an index. None if each mesh is in
             a pair with its class, or is named by it.
-        hard_negatives: Meshes of other things, which the network must not take
-            for the class. None for generated fruit.
+        hard_negatives: Meshes of other classes, which the network must not
+            confuse with the class. None for generated fruit.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
         size: Pixels per side of the images of a plain network. None for 224.

@@ -58,7 +58,7 @@ def as_mappings(
 def studied_classes(
     label: str | int | None, meshes: Sequence[dict[str, Any]], classifier: Classifier
 ) -> list[str]:
-    """Return the classes under study.
+    """Return the positive classes.
 
     Args:
         label: A class, or None for those of the meshes.
@@ -78,11 +78,11 @@ def studied_classes(
 
 
 def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
-    """Check that no hard negative is of a class under study.
+    """Check that no hard negative is of a positive class.
 
     Args:
         hard_negatives: Hard negatives as `as_mappings` returns them.
-        labels: Classes under study.
+        labels: Positive classes.
 
     Raises:
         InputError: If one is of such a class, by its label or by its name.
@@ -94,8 +94,8 @@ def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[st
         is_studied = name in labels and (len(labels) == 1 or not item.get("label"))
         if is_studied:
             raise InputError(
-                f"hard_negatives[{index}] is {item['mesh']}, of the class {name} under study: "
-                "name it in meshes, or leave it out"
+                f"hard_negatives[{index}] is {item['mesh']}, of the positive class {name}: "
+                "move it to meshes, or remove it"
             )
 
 

@@ -158,7 +158,7 @@ class RunLog:
         """
         labels = []
         for index in attack_examples.labels:
-            labels.append(classes[index] if index >= 0 else "other things")
+            labels.append(classes[index] if index >= 0 else "negative")
         columns = {}
         for index, name in enumerate(("before", "after")):
             images = attack_examples.images[index]

@@ -142,8 +142,9 @@ class Trainer:
     ):
         _require_equal_shares(settings)
         if settings.ranking_weight and not service.positive_classes:
-            needed = "name some in the scene, or give a folder of images of other things"
-            raise InputError(f"ranking_weight ranks hard negatives: {needed}", "ranking_weight")
+            fault = f"ranking_weight={settings.ranking_weight} requires hard negatives"
+            remedy = "add some to the scene, or set a folder of images that has some"
+            raise InputError(f"{fault}: {remedy}", "ranking_weight")
         self.settings = settings
         self.architecture = architecture
         self.service = service

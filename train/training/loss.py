@@ -14,7 +14,7 @@ class TrainingLoss:
     """The loss of a batch of images, some of which are renders.
 
     It is the mean of the label loss. With their weights in the settings, two terms are added: the
-    ranking loss of the classes under study, and the divergence from a teacher's predictions.
+    ranking loss of the positive classes, and the divergence from a teacher's predictions.
 
     Args:
         model: The network, from images in [0, 1] to logits.
@@ -23,7 +23,7 @@ class TrainingLoss:
             loss ranks against the others. Empty without a ranking loss.
         teacher: The network whose predictions are kept; None without distillation.
         labeled: Whether the labels of the data are known. Otherwise only renders have a label
-            loss, and the teacher's answers are the labels of all other images.
+            loss, and the teacher's predictions are the labels of all other images.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class TrainingLoss:
     def _changes(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
         """Return the divergence of each image's prediction from the teacher's, shape (B,).
 
-        On renders, the classes under study may change, and only the others are compared. Without
-        classes under study, renders have no divergence.
+        On renders, the predictions of the positive classes may change, and only the other classes
+        are compared. Without positive classes, renders have no divergence.
         """
         changes = kl_divergence(logits, targets) * ~rendered
         if self._positive_classes:

@@ -38,8 +38,8 @@ def build_service(
         The service. Without renders it has no examples.
 
     Raises:
-        InputError: A mesh, a background, a light or a class does not exist, or no class is left
-            for other things.
+        InputError: If a mesh, a background, a light or a class does not exist, or if no class is
+            left for the negatives.
     """
     scene: Scene | None = None
     images: Tensor | None = None
@@ -65,8 +65,8 @@ def build_service(
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
 
     if len(positive_classes) == len(data.classes) and (labels < 0).any():
-        problem = f"label={settings.label} leaves no class of the network for other things"
-        raise InputError(f"{problem}: leave these out")
+        problem = f"label={settings.label} has all classes of the network, so that none is left"
+        raise InputError(f"{problem} for negatives without a class: remove them, or label them")
     return AugmentationService(
         settings.augment,
         scene,
@@ -128,7 +128,7 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, T
         The images, uint8, shape (N, 3, size, size), and their class numbers, shape (N,).
 
     Raises:
-        InputError: The folder cannot be read, or it has no image of a class under study.
+        InputError: The folder cannot be read, or it has no image of a positive class.
     """
     folder = Path(str(settings.augment.folder))
     positive_classes = label_names(settings.label)

@@ -97,7 +97,7 @@ class Run:
         # The threads that the run trains with.
         self._threads = 1
         # The classes that the initial network gives the test images, shape (N,).
-        self._answers: Tensor | None = None
+        self._initial_predictions: Tensor | None = None
 
     def load(self) -> None:
         """Check the inputs, build the network and its renders, and restore a checkpoint if asked.
@@ -163,8 +163,8 @@ class Run:
         """
         trainer = self.trainer
         self._scores |= self._test_scores()
-        if self._answers is not None and CLASSIFIER in trainer.architecture:
-            self._scores["test/agreement"] = self._agreement(self._answers)
+        if self._initial_predictions is not None and CLASSIFIER in trainer.architecture:
+            self._scores["test/agreement"] = self._agreement(self._initial_predictions)
         if self.log:
             for name in self.scored_folders:
                 scores = self._score_photographs(trainer.selected, name, self.folder)
@@ -236,25 +236,25 @@ class Run:
         )
 
     def _score_initial(self, model: MixedPrecision) -> None:
-        """Score the network that the run begins with, and label unlabeled data by its answers."""
+        """Score the initial network, and label unlabeled data by its predictions."""
         settings = self.settings
         # The code of a foreign function may change unseen, so its logits are not stored.
         is_foreign = settings.model.name.startswith(PYTHON)
         cache = TensorCache(None if is_foreign else cache_folder(settings.train.cache))
         predict = CachedModel(model, self.trainer.device, cache)
         test = self.data.test
-        self._answers = self._predicted_classes(predict, test)
+        self._initial_predictions = self._predicted_classes(predict, test)
         if not self.data.labeled:
             # The loss asks the teacher about the images that the network learns from.
             labels = self.data.train.labels.clone()
             held_out = self.data.train[self.held_out]
             labels[self.held_out] = self._predicted_classes(predict, held_out)
             train = Split(self.data.train.images, labels)
-            test = Split(test.images, self._answers)
+            test = Split(test.images, self._initial_predictions)
             self.data = replace(self.data, train=train, test=test)
         if distributed.rank() > 0:
             return
-        accuracy = (self._answers == test.labels).float().mean().item()
+        accuracy = (self._initial_predictions == test.labels).float().mean().item()
         if self.data.labeled:
             images = describe_test_images(settings, self.data)
             begun = settings.train.init_from
@@ -315,16 +315,16 @@ class Run:
             "test/epoch": best["epoch"],
         }
 
-    def _agreement(self, answers: Tensor) -> float:
+    def _agreement(self, initial_predictions: Tensor) -> float:
         """Return the fraction of test images that both networks predict as the same class."""
         agreement = self._scores["test/accuracy"]
         if self.data.labeled:
-            answered = Split(self.data.test.images, answers).to(self.trainer.device)
+            answered = Split(self.data.test.images, initial_predictions).to(self.trainer.device)
             agreement = evaluate(self.trainer.selected, answered)["accuracy"]
         console.debug(
             "agreement with %s on %d held-out images: %.4f",
             self.settings.train.init_from,
-            len(answers),
+            len(initial_predictions),
             agreement,
         )
         return agreement
@@ -373,7 +373,9 @@ def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | No
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
             missing = "set train.init_from and train.distillation_weight"
-            problem = f"data.name={settings.data.name}: a network keeps its answers on it"
+            problem = (
+                f"data.name={settings.data.name} has no labels, and requires a network to imitate"
+            )
             raise InputError(f"{problem}: {missing}")
         return replace(data, classes=initial.classes)
     if initial and (data.rendered or initial.is_classifier):
@@ -465,7 +467,7 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
         Text such as "the test images of cifar100".
     """
     if not data.labeled:
-        return f"the answers of {settings.train.init_from} to held-out photographs"
+        return f"the predictions of {settings.train.init_from} for held-out photographs"
     kind = "rendered solids" if data.rendered else f"the test images of {settings.data.name}"
     # The test images are read only at the end of the run, so the classes are
     # counted in the training images.

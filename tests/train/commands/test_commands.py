@@ -55,7 +55,7 @@ class TestEvaluation:
         return here / "1e3"
 
     def test_prints_how_many_photographs_were_scored(self, scores, capsys):
-        assert "1 images of orange, 1 of other things" in capsys.readouterr().out
+        assert "1 images of orange, 1 negatives" in capsys.readouterr().out
 
     def test_writes_its_files(self, scores):
         assert {path.name for path in scores.iterdir()} == {

@@ -147,7 +147,7 @@ def test_folders_of_no_class_of_the_model_count_as_other_things_and_are_named(tm
         ("other_bee/c.jpg", "other_bee"),
     ]
     assert "1 of 3 folders" in caplog.text
-    assert "count as other things: lion" in caplog.text
+    assert "count as negatives: lion" in caplog.text
 
 
 def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns(tmp_path, caplog):

@@ -5,7 +5,7 @@ A `Pool` holds predictions that are scored together and computes their
 and those of each label, source and mesh. Below them are the statistics that
 they use: the bootstrap, the AUC, and the recall at a given false-positive rate.
 
-A label is the name of a class under study. For a prediction about a label, an
+A label is the name of a positive class. For a prediction about a label, an
 image is positive if it shows this class, and negative otherwise.
 """
 
@@ -98,7 +98,7 @@ class Metrics:
         top5: Fraction of the positives whose class is among the five most
             probable classes.
         false_positive_rate: Fraction of the negatives that are predicted as the
-            class under study.
+            positive class.
         recall_at_threshold: Fraction of the positives whose log-odds exceed the
             threshold. None without a threshold.
         false_positive_rate_at_threshold: Fraction of the negatives whose
@@ -166,7 +166,7 @@ class Pool:
     of these predictions count.
 
     Attributes:
-        positives: Predictions for photographs that show the class under study.
+        positives: Predictions for photographs that show the positive class.
         negatives: Predictions for all other photographs.
         ranked: Predictions for the ROC curve. They may include other sources or
             meshes than `positives` and `negatives`.
@@ -399,7 +399,7 @@ class Pooled:
     def by_mesh(self) -> dict[str, Pool]:
         """Pool of the images of each mesh.
 
-        The images of a mesh of a class under study are ranked against the
+        The images of a mesh of a positive class are ranked against the
         negatives of all meshes. The images of any other mesh are ranked against
         the positives of all meshes.
         """

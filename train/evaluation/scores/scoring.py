@@ -46,7 +46,7 @@ SUMMARY = "summary.json"
 CONTACT_SHEET = "contact_sheet.png"
 # Number of wrong classes that are named for each class, the most common ones.
 WRONG_CLASSES = 5
-# Words after the number of other things, if there are several labels.
+# Words after the number of negatives, if there are several labels.
 COUNTED_EACH = ", once for each of these classes"
 
 
@@ -59,7 +59,7 @@ class ClassScores:
         recall: Fraction of them that are predicted as their class. It is
             unknown if the model lacks the class.
         top5: Fraction whose class is among the five most probable classes.
-        predicted_label: Fraction that is predicted as a class under study.
+        predicted_label: Fraction that is predicted as a positive class.
         most_common_wrong: Number of photographs by the wrong class that they
             are predicted as, for the most common of these classes.
     """
@@ -76,7 +76,7 @@ class Scores:
     """Scores of a model on a folder of photographs.
 
     Attributes:
-        answers: Predictions that are scored.
+        predicted: Predictions that are scored.
         pooled: Pools of these predictions.
         points: Operating point of each label, or none.
         overall: Metrics of all photographs. With several labels, a photograph
@@ -87,7 +87,7 @@ class Scores:
         by_class: Scores of the photographs of each class.
     """
 
-    answers: FolderPredictions
+    predicted: FolderPredictions
     pooled: Pooled
     points: Sequence[OperatingPoint]
     overall: Metrics
@@ -99,7 +99,7 @@ class Scores:
     @property
     def label(self) -> str:
         """Positive classes in words, such as "orange" or "orange or lemon"."""
-        return " or ".join(self.answers.labels)
+        return " or ".join(self.predicted.labels)
 
     @property
     def point_entries(self) -> list[dict[str, Any]]:
@@ -108,7 +108,7 @@ class Scores:
         The entry "in_sample" says whether a point was chosen on the very images
         that are scored.
         """
-        images_hash = self.answers.images_hash
+        images_hash = self.predicted.images_hash
         return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
 
     def to_summary(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class Scores:
 
         Returns:
             Dictionary with these keys:
-            - label, size, images: classes under study, pixels per side, and
+            - label, size, images: positive classes, pixels per side, and
               hash of the photographs;
             - n: numbers of photographs, positives, negatives, unreadable files
               and files that were left out;
@@ -128,20 +128,20 @@ class Scores:
             - by_class: fields of `ClassScores` by class;
             - unreadable, left_out: paths of these files.
         """
-        answers = self.answers
-        has_several = len(answers.labels) > 1
+        predicted = self.predicted
+        has_several = len(predicted.labels) > 1
         summary: dict[str, Any] = {
-            "label": answers.labels if has_several else answers.labels[0],
-            "size": answers.size,
-            "images": answers.images_hash,
+            "label": predicted.labels if has_several else predicted.labels[0],
+            "size": predicted.size,
+            "images": predicted.images_hash,
         }
         summary |= self.overall.to_summary()
         summary["n"] = {
-            "photographs": len(answers.photographs),
+            "photographs": len(predicted.photographs),
             "positives": len(self.pooled.all.positives),
             "negatives": len(self.pooled.all.negatives),
-            "unreadable": len(answers.unreadable),
-            "left_out": len(answers.left_out),
+            "unreadable": len(predicted.unreadable),
+            "left_out": len(predicted.left_out),
         }
         if self.points:
             entries = self.point_entries
@@ -152,8 +152,8 @@ class Scores:
         if self.by_mesh is not None:
             summary["by_mesh"] = _entries(self.by_mesh)
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
-        summary["unreadable"] = answers.unreadable
-        summary["left_out"] = answers.left_out
+        summary["unreadable"] = predicted.unreadable
+        summary["left_out"] = predicted.left_out
         return summary
 
 
@@ -174,7 +174,7 @@ def evaluate_photographs(
     Args:
         predictor: Model that is scored.
         folder: Folder of photographs, as `find_photographs` takes it.
-        label: Class under study, or several.
+        label: Positive class, or several.
         out: Folder that `write` writes to. It must lie outside `folder`.
         skip_unreadable: Whether to leave out photographs that cannot be read.
             Otherwise they are an error.
@@ -188,14 +188,14 @@ def evaluate_photographs(
     folder = as_folder("folder", folder)
     out = as_folder("out", out)
     require_outside(out, folder)
-    answers = predictor.predict(folder, label, skip_unreadable)
-    scores = score(answers)
+    predicted = predictor.predict(folder, label, skip_unreadable)
+    scores = score(predicted)
     write(scores, out)
     return scores
 
 
 def score(
-    answers: FolderPredictions,
+    predicted: FolderPredictions,
     by: str = "source",
     points: Sequence[OperatingPoint] = (),
 ) -> Scores:
@@ -206,7 +206,7 @@ def score(
     photos.csv names them, over objects.
 
     Args:
-        answers: Predictions for the photographs of a folder.
+        predicted: Predictions for the photographs of a folder.
         by: "mesh" to score each mesh, too. Otherwise "source".
         points: Operating point of each label, or none.
 
@@ -217,21 +217,21 @@ def score(
         InputError: If `by` is neither, or if it is "mesh" and no mesh is known.
     """
     require_choice("by", by, GROUPS)
-    if by == "mesh" and not any(item.photograph.mesh for item in answers.predictions):
-        problem = f"by=mesh: {answers.folder} has no {TABLE} with a column mesh"
+    if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
+        problem = f"by=mesh: {predicted.folder} has no {TABLE} with a column mesh"
         raise InputError(f"{problem}: leave it out")
     limits = {point.label: point.threshold for point in points}
-    pooled = Pooled(answers.predictions, thresholds=limits)
-    has_several = len(answers.labels) > 1
+    pooled = Pooled(predicted.predictions, thresholds=limits)
+    has_several = len(predicted.labels) > 1
     return Scores(
-        answers=answers,
+        predicted=predicted,
         pooled=pooled,
         points=points,
         overall=pooled.all.metrics,
         by_label=_metrics_of(pooled.by_label) if has_several else {},
         by_source=_metrics_of(pooled.by_source),
         by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
-        by_class=_score_classes(answers),
+        by_class=_score_classes(predicted),
     )
 
 
@@ -240,12 +240,12 @@ def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
 
-def _score_classes(answers: FolderPredictions) -> dict[str, ClassScores]:
+def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
     """Score the photographs of each class that the folder has."""
     by_class: dict[str, list[Prediction]] = {}
-    for prediction in answers.photographs:
+    for prediction in predicted.photographs:
         by_class.setdefault(prediction.photograph.label, []).append(prediction)
-    return {name: _score_class(by_class[name], answers.labels) for name in sorted(by_class)}
+    return {name: _score_class(by_class[name], predicted.labels) for name in sorted(by_class)}
 
 
 def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
@@ -274,15 +274,15 @@ def write(scores: Scores, out: Path) -> None:
         scores: Scores of a model on photographs.
         out: Folder, which is made if it does not exist.
     """
-    answers = scores.answers
+    predicted = scores.predicted
     out.mkdir(parents=True, exist_ok=True)
     remove_unfinished(out)
-    write_predictions(out / PREDICTIONS, answers.predictions)
+    write_predictions(out / PREDICTIONS, predicted.predictions)
     text = json.dumps(scores.to_summary(), indent=2, ensure_ascii=False, allow_nan=False)
     atomic_write(out / SUMMARY, text + "\n")
-    write_image(out / CONTACT_SHEET, contact_sheet(answers.predictions, answers.images))
+    write_image(out / CONTACT_SHEET, contact_sheet(predicted.predictions, predicted.images))
     pooled = scores.pooled
-    groups = pooled.by_label if len(answers.labels) > 1 else pooled.by_source
+    groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
     curves = {name: pool.scores for name, pool in groups.items()}
     write_roc(out, pooled.all.scores, curves, scores.label)
 
@@ -296,14 +296,14 @@ def choose_operating_points(
 ) -> list[OperatingPoint]:
     """Choose a threshold on the log-odds of each label for a false-positive rate.
 
-    It is the lowest log-odds of an image of other things that at most this
-    fraction of these images exceed. An image that ties with it does not exceed
-    it.
+    The threshold is the lowest log-odds of a negative at which the
+    false-positive rate is at most `rate`. With rate 0.1 and 20 negatives, at
+    most 2 negatives score above the threshold.
 
     Args:
         predictor: Model whose threshold is chosen.
         folder: Folder of photographs, as `find_photographs` takes it.
-        label: Class under study, or several.
+        label: Positive class, or several.
         rate: False-positive rate, in (0, 1).
         skip_unreadable: Whether to leave out photographs that cannot be read.
 
@@ -312,17 +312,17 @@ def choose_operating_points(
 
     Raises:
         InputError: As of `Predictor.predict`, and if the folder has fewer than
-            1 / rate images of other things.
+            1 / rate negatives.
     """
-    answers = predictor.predict(folder, label, skip_unreadable)
+    predicted = predictor.predict(folder, label, skip_unreadable)
     exact_rate = Fraction(str(rate))
     points = []
-    for name in answers.labels:
-        predictions = [item for item in answers.predictions if item.label == name]
+    for name in predicted.labels:
+        predictions = [item for item in predicted.predictions if item.label == name]
         log_odds = np.array([item.log_odds for item in predictions if not item.positive])
         count = len(log_odds)
         if count * exact_rate < 1:
-            fault = f"folder={folder} has {count} images of other things than {name}"
+            fault = f"folder={folder} has {count} negatives for {name}"
             least = math.ceil(1 / exact_rate)
             advice = f"give at least {least} for false_positive_rate={rate}"
             raise InputError(f"{fault}: {advice}", "folder")
@@ -333,7 +333,7 @@ def choose_operating_points(
                 threshold=float(threshold),
                 false_positive_rate=rate,
                 folder=folder.resolve().name,
-                images=answers.images_hash,
+                images=predicted.images_hash,
                 negatives=count,
             )
         )
@@ -379,7 +379,7 @@ def format_scores(scores: Scores) -> str:
     negatives = len(scores.pooled.all.negatives)
     each = COUNTED_EACH if scores.by_label else ""
     paragraphs = [
-        f"{positives} images of {scores.label}, {negatives} of other things{each}",
+        f"{positives} images of {scores.label}, {negatives} negatives{each}",
         str(_counted_table(scores)),
         str(_ranked_table(scores)),
         str(_class_table(scores)),
@@ -455,9 +455,9 @@ def _notes(scores: Scores) -> Iterator[str]:
         label = f" of {point['label']}" if scores.by_label else ""
         threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"
         yield f"{threshold}, chosen for {describe_point(point)}"
-    unreadable = scores.answers.unreadable
+    unreadable = scores.predicted.unreadable
     if unreadable:
         yield f"{len(unreadable)} unreadable: {', '.join(unreadable)}"
-    files = scores.answers.left_out
+    files = scores.predicted.left_out
     if files:
         yield f"{len(files)} left out, of kinds that are not read, like {files[0]}"

@@ -61,7 +61,7 @@ class _Section:
 
 
 def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor) -> Image.Image:
-    """Draw what is right and wrong about each class under study.
+    """Draw what is right and wrong about each positive class.
 
     True positives, false negatives and false positives have a section each, with up to
     PER_SECTION images that are evenly spread by probability.
@@ -166,7 +166,7 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
         by_name: Such scores of each source or each label. The table has a row
             for each point of their curves, after those of all images, whose
             name is empty.
-        label: Classes under study, as axes name them.
+        label: Positive classes, as axes name them.
     """
     # This import takes half a second.
     from matplotlib.figure import Figure

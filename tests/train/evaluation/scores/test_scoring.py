@@ -313,7 +313,7 @@ class TestAnOperatingPoint:
 
     def test_needs_a_negative_per_step_of_its_rate(self, fruit):
         model, classes, folder = fruit
-        with pytest.raises(InputError, match=r"5 images of other things .* at least 10 .*=0\.1$"):
+        with pytest.raises(InputError, match=r"5 negatives .* at least 10 .*=0\.1$"):
             choose_operating_points(Predictor(model, classes), folder, "orange", 0.1)
 
 

