@@ -172,4 +172,6 @@ class AttackSettings(ParameterSettings):
             InputError: If no parameter is set.
         """
         if not self.parameters:
-            raise InputError(f"name what to attack: one or more of {', '.join(PARAMETER_NAMES)}")
+            raise InputError(
+                f"no parameter is attacked: set one or more of {', '.join(PARAMETER_NAMES)}"
+            )

@@ -34,7 +34,7 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
         The cost of each image, shape (N,).
 
     Raises:
-        InputError: A source class has no logit.
+        InputError: If a source class has no logit.
     """
     require_known(source.clamp(min=0), logits)  # NO_CLASS passes as class 0.
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
@@ -83,7 +83,7 @@ def require_known(labels: Tensor, logits: Tensor) -> None:
         logits: The logits, shape (N, classes).
 
     Raises:
-        InputError: A label is of a class beyond those of the logits.
+        InputError: If a label is of a class beyond those of the logits.
     """
     require_range("label", int(_class_of(labels).amax()), 0, logits.shape[1] - 1)
 

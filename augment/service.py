@@ -301,13 +301,13 @@ class AugmentationService:
         return self._adversarial(model, problem, number, shard)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a resumed run needs.
+        """Return the state of the service, with which a run can be resumed.
 
         Returns:
-            A hash of the scene under "scene", which `load_state_dict` compares.
-            With `warm_start`, after an attack, also its D resulting values of
-            each example under "values", shape (E, D). The next attack begins
-            with them.
+            Dictionary with these entries:
+            - "scene": hash of the scene, which `load_state_dict` compares;
+            - "values": with `warm_start`, the D attack values of each example
+              after the last attack, shape (E, D). The next attack starts there.
         """
         state = {"scene": self._scene_hash}
         if self._last_values is not None:
@@ -321,22 +321,20 @@ class AugmentationService:
             state: A result of `state_dict`.
 
         Raises:
-            InputError: If it is the result of a service with another scene, or
-                no result of `state_dict`.
+            InputError: If the state is not a result of `state_dict`, or if the
+                scene of its service was another one.
         """
         expected = "the result of state_dict of a service with the same scene"
         require_kind("state", state, Mapping, expected)
         if "scene" not in state or state.keys() - {"scene", "values"}:
             found = ", ".join(str(key) for key in state) or "nothing"
-            raise InputError(f"state holds {found}: give {expected}")
+            raise InputError(f"state contains {found}: give {expected}")
         values = state.get("values")
         if values is not None:
             values = as_tensor("state", values)
             if values.ndim != 2 or len(values) != len(self.labels):
-                counts = f"{len(values)} examples and the scene has {len(self.labels)}"
-                raise InputError(
-                    f"state: it continues {counts}; resume with the settings of the run"
-                )
+                fault = f"state has values of {len(values)} examples, not of {len(self.labels)}"
+                raise InputError(f"{fault}: resume with the settings of the run")
         if not torch.equal(torch.as_tensor(state["scene"]).cpu(), self._scene_hash):
             remedy = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene: {remedy}")

@@ -35,8 +35,8 @@ LINES = "attack.jsonl"
 JPEG_QUALITY = 90
 RENDERERS = ("reload", MITSUBA)
 
-# Pixels: smaller images of a figure are enlarged by a whole factor to at least
-# this width.
+# Least width in pixels of an image in a figure. Smaller images are enlarged by a
+# whole factor.
 SIDE = 192
 
 
@@ -109,11 +109,12 @@ def require_renderers(names: Sequence[str]) -> None:
         names: Names of renderers.
 
     Raises:
-        InputError: If one is not.
+        InputError: If a name is unknown, or if Mitsuba is not installed.
     """
     for name in names:
         require_choice("verify", name, RENDERERS)
     if MITSUBA in names:
+        # Entering this context imports Mitsuba, or raises an error.
         with mitsuba():
             pass
 
@@ -195,7 +196,16 @@ def _versions(
 
 
 def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
-    """Return the numbers of each example for a version of its images (E, V, 3, size, size)."""
+    """Evaluate another version of the attacked images, such as renders of Mitsuba.
+
+    Args:
+        result: The result of the attack.
+        images: The version of its images, shape (E, V, 3, size, size).
+
+    Returns:
+        For each example, successes, predictions, and differences from the
+        images of the result.
+    """
     logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
     predicted = logits.argmax(2)
     success_in_views = fooled_in_views(

@@ -223,7 +223,7 @@ def transfer(
         have A × V values.
 
     Raises:
-        InputError: As `require_transferable` says, or if a classifier lacks a
+        InputError: See `require_transferable`. Also if a classifier lacks a
             class.
 
     Example:

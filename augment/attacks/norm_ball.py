@@ -128,7 +128,7 @@ def sample(
         InputError: If there is no radius.
     """
     if settings.radius is None:
-        raise InputError("radius=None has no uniform draw: set a radius")
+        raise InputError("random values are drawn from the norm-ball, but radius is None: set it")
     used_on_cpu = None if used is None else used.cpu()
     if settings.norm == "linf":
         offset = 2 * torch.rand(center.shape, generator=generator) - 1

@@ -19,19 +19,19 @@ from augment.settings import SceneSettings
 from renderer.light.basis import harmonics_of
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
-# Limits between which cameras are drawn: polar angle in degrees, and width of the
-# view in world units.
+# Range of the polar angle of random cameras, in degrees, and of the width of their
+# view, in world units.
 POLAR = (20.0, 100.0)
 WIDTH = (1.8, 3.5)
 
-# World units from the middle of a mesh, which all of it is within.
+# A normalized mesh lies within this distance of the origin, in world units.
 CLOSEST = 2.0
 
-# Field of view in degrees of every other camera that is drawn, if the scene is
-# orthographic.
+# Field of view in degrees. If the camera of the scene is orthographic, every
+# second candidate has a perspective camera with this field of view.
 FOV = 45.0
 
-# Gray of a background as things are shown in catalogs.
+# Gray value of a background like in product photographs.
 LIGHT_GRAY = 0.9
 
 # Exposures that are tried, as factors of the exposure of the scene.
@@ -51,10 +51,11 @@ def find_scene(
     cameras: int,
     draws: torch.Generator,
 ) -> Settings:
-    """Search for a scene in which a classifier is right in every image where an attack would begin.
+    """Search for a scene whose images a classifier recognizes before the attack.
 
-    Each camera is tried under the light of the scene, the probes and uniform
-    light at several exposures, and also before light gray.
+    The search tries several cameras. Each is tried in the light of the scene, in
+    the built-in environments and in uniform light, with several exposures, and
+    also in front of a light gray background.
 
     Args:
         classifier: The classifier to attack.
@@ -65,8 +66,8 @@ def find_scene(
         draws: CPU generator of the random cameras.
 
     Returns:
-        The settings of the most confident scene. The settings as they are, if
-        the classifier is right in them, or in no candidate.
+        Settings of the scene with the highest confidence. The given settings,
+        if all images are correct with them, or if no candidate is better.
     """
     [confidence] = _confidences(build(settings), attack, classifier)
     if confidence > 0:
@@ -84,9 +85,10 @@ def find_scene(
 
 
 def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Iterator[Settings]:
-    """Yield the scene from several cameras, its own first.
+    """Yield settings of the scene with several cameras. The first has the camera of the scene.
 
-    If it has one gray as background, the scene before light gray follows each.
+    If the only background is a gray value, each candidate is followed by the
+    same candidate in front of light gray.
     """
     has_one_gray = len(settings.backgrounds) == 1 and not isinstance(settings.backgrounds[0], str)
     for index in range(cameras):
@@ -101,7 +103,7 @@ def _candidates(settings: Settings, cameras: int, draws: torch.Generator) -> Ite
 
 
 def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
-    """Return the scene from another side and another distance, with the same field of view."""
+    """Return a copy of the settings with a camera at a random place and the same field of view."""
     polar, azimuth, width = torch.rand(3, generator=draws).tolist()
     lowest_polar, highest_polar = POLAR
     narrowest, widest = WIDTH
@@ -120,7 +122,7 @@ def _with_random_camera(settings: Settings, draws: torch.Generator) -> Settings:
 def _best_light(
     scene: Scene, settings: Settings, attack: AttackSettings, classifier: Classifier
 ) -> tuple[float, Settings]:
-    """Return the highest confidence, and the settings with the light that reaches it."""
+    """Try lights and exposures, and return the highest confidence and its settings."""
     names = dict.fromkeys([settings.light, *PROBES, UNIFORM])
     degree = harmonics_of(scene.basis).degree
     candidates = []

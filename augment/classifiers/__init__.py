@@ -142,8 +142,8 @@ def load_classifier(
             return load(*arguments)
     if Path(name).suffix.lower() in SUFFIXES:
         if path is not None:
-            fault = f"weights={path} is not for the file {name}, which has its own"
-            raise InputError(f"{fault}: leave it out", "weights")
+            fault = f"weights={path} cannot be combined with {name}, which contains its own weights"
+            raise InputError(f"{fault}: remove weights", "weights")
         with progress_message(f"loading {name}"):
             return load_file(name, facts)
     choices = [f"{known}NAME" if known.endswith(":") else known for known in SOURCES]

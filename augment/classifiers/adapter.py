@@ -565,26 +565,29 @@ def load_python(name: str) -> Classifier:
 
 
 def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[str]]:
-    """Call a function of a user that makes a network.
+    """Call a function of a user that makes a network, and check what it returns.
 
     Args:
-        name: "package.module:function" or "package.module.function", found from
-            the current folder or installed.
+        name: "package.module:function" or "package.module.function". The module
+            is in the current folder or installed.
 
     Returns:
-        The network, which is a module or a function from images
-        (N, 3, size, size), RGB in [0, 1], to logits; the pixels per side of
-        its images; and the names of its classes in the order of its logits.
+        Three values: the network, which maps RGB images (N, 3, size, size) in
+        [0, 1] to logits; the pixels per side of its images; and the names of
+        its classes in the order of the logits.
 
     Raises:
         InputError: If there is no such function, or if the function or its
             module raises or returns something else.
     """
-    module, _, function = name.partition(":") if ":" in name else name.rpartition(".")
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.insert(0, here)
+    separator = ":" if ":" in name else "."
+    module_name, _, function_name = name.rpartition(separator)
+    current_folder = str(Path.cwd())
+    if current_folder not in sys.path:
+        sys.path.insert(0, current_folder)
     try:
-        network, size, classes = getattr(importlib.import_module(module), function)()
+        function = getattr(importlib.import_module(module_name), function_name)
+        network, size, classes = function()
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
@@ -594,10 +597,9 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         reason = f"{kind}: {single_line(error)}, in {place}"  # type: ignore[arg-type]
         expected = "python:package.module:function, which returns (module, size, classes)"
         raise InputError(f"name=python:{name} fails ({reason}): use {expected}", "name") from error
-    ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
-    if not (
-        callable(network) and type(size) is int and ordered and all(type(c) is str for c in classes)
-    ):
+    is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
+    has_names = is_list and all(type(item) is str for item in classes)
+    if not (callable(network) and type(size) is int and has_names):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
         expected = "return (torch.nn.Module, pixels per side, class names)"
         raise InputError(f"name=python:{name} returns ({kinds}): {expected}", "name")

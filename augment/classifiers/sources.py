@@ -25,7 +25,7 @@ from augment.classifiers.plain_networks import NO_FACTS, NetworkFacts, index_nam
 from renderer.errors import InputError, require_file, single_line
 
 if TYPE_CHECKING:
-    # The import takes a second, so other functions import torchvision themselves.
+    # Importing torchvision takes a second. Functions import it when they need it.
     from torchvision.models import WeightsEnum
 
 # These networks convert ImageNet's normalization to the one that they were
@@ -150,7 +150,7 @@ def _fitting_facts(
     facts: NetworkFacts,
     source: str | Path,
 ) -> NetworkFacts | None:
-    """Return facts with as many classes as the weights have, if the classifier has another number.
+    """Return facts with the number of classes that the weights have, or None if it fits already.
 
     Raises InputError if the facts name another number of classes than the
     weights have. `head` is the name of a weight of the last layer. This weight

@@ -137,10 +137,10 @@ def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 
 @dataclass(eq=False, repr=False)
 class DirectRenderer:
-    """Renders views of objects without transfer operators of these views.
+    """Renders objects directly, without precomputed transfer operators.
 
     Attributes:
-        objects: The objects. Methods take the index of one of them.
+        objects: The objects. The argument `number` of methods is an index into them.
         settings: Settings of the images.
         rasterizer: The rasterizer.
         basis: Basis of the lights.

@@ -199,14 +199,14 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
 
 
 def add_specular_layer(item: SceneObject, gloss: Gloss) -> SceneObject:
-    """Replace the gloss of an object.
+    """Return a copy of an object with another specular material.
 
     Args:
-        item: The object.
-        gloss: Its new gloss. Props and table keep theirs.
+        item: Object, which may have props and a table.
+        gloss: Specular material of the object. Props and table keep their own.
 
     Returns:
-        The object with the new gloss.
+        The copy.
     """
     own_mesh = select_faces(item.mesh, slice(item.own))
     return _with_mesh(item, gloss.on(own_mesh))
@@ -252,15 +252,15 @@ def _load_with_color(item: MeshSettings) -> Mesh:
     if kind == "solid":
         mesh = _build_solid(item.mesh, name)
     else:
-        # The import of trimesh takes half a second.
+        # Importing trimesh takes half a second.
         from renderer.io.meshes import load_mesh
 
         mesh = load_mesh(item.mesh, up=item.up, gloss=item.gloss == "file")
     if item.color is None:
         return mesh
     if _has_colors(mesh):
-        remedy = "leave color out; albedo_scale brightens or dims them"
-        raise InputError(f"{item.mesh} brings colors of its own: {remedy}")
+        remedy = "remove color, and set albedo_scale to make them brighter or darker"
+        raise InputError(f"color is set, but {item.mesh} has its own colors: {remedy}")
     colored = Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
     return replace(colored, gloss=mesh.gloss, skin=mesh.skin)
 

@@ -3,6 +3,7 @@
 The objects are rasterized once. After that, a change of the light costs a matrix product.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -81,13 +82,18 @@ class Relighting:
     beside: int = 0
 
     def __post_init__(self) -> None:
-        """Assign an operator to each image, and a stack to each operator."""
+        """Assign an operator to each image, and a stack to each operator.
+
+        Images of the same view share an operator. Each stack has as many
+        operators as fit into `STACKED`.
+        """
+        # The operators of an object are neighbors, so that a stack has few objects.
         self._views_of_operators = sorted(dict.fromkeys(self.views), key=itemgetter(0))
         operator_of_view = {view: index for index, view in enumerate(self._views_of_operators)}
         self._operator_of_image = torch.tensor([operator_of_view[view] for view in self.views])
         self._operators_per_stack = max(1, STACKED // self.settings.size**2)
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
-        self._stack_count = -(-len(self._views_of_operators) // self._operators_per_stack)
+        self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
         self._built: dict[int, _BuiltStack] = {}
 
     @property

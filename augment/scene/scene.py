@@ -68,7 +68,7 @@ class Scene:
         attack_bytes: The memory that an attack on the light needs beside the operators.
 
     Raises:
-        InputError: An argument is of another kind, shape or range, or memory is too small.
+        InputError: If an argument is of another kind, shape or range, or memory is too small.
 
     Example:
         >>> from augment.scene.build import build_scene
@@ -148,8 +148,8 @@ class Scene:
     def _build_relighting(self) -> Relighting:
         """Prepare the operators of all views, which are built when they are first needed."""
         views = [(row.object, camera) for row in self.examples for camera in row.cameras]
-        # This is no method of `self`: a reference back would keep the scenes of all epochs in
-        # memory.
+        # `build` must not refer to `self`. Python would otherwise free the scenes of earlier
+        # epochs late, because of the circular reference.
         build = partial(
             build_operators,
             settings=self.settings,
@@ -284,7 +284,7 @@ class Scene:
             The conditions.
 
         Raises:
-            InputError: There is no such example.
+            InputError: If there is no such example.
         """
         return Conditions(self.lights[self._as_examples(examples)])
 
@@ -301,15 +301,15 @@ class Scene:
             The images, with values in [0, 1], shape (A, V, 3, size, size).
 
         Raises:
-            InputError: There is no such example, or the conditions are of other examples or hold
-                NaN.
+            InputError: If there is no such example, if the conditions belong to other examples, or
+                if they contain NaN.
         """
         expected = "conditions, such as scene.conditions(examples)"
         require_kind("conditions", conditions, Conditions, expected)
         if conditions.light.shape[1:] != (self.basis.size, 3):
-            given = f"light has shape {tuple(conditions.light.shape)}"
-            shape = (len(self), self.basis.size, 3)
-            raise InputError(f"conditions: {given}, give one of each example, such as {shape}")
+            fault = f"conditions.light has shape {tuple(conditions.light.shape)}"
+            remedy = f"use one light for each example, such as {(len(self), self.basis.size, 3)}"
+            raise InputError(f"{fault}: {remedy}")
         examples = self._as_examples(examples, len(conditions.light))
         layers = list(self._layers(conditions, examples))
         behind = self._background[examples].repeat_interleave(self.views)
@@ -343,7 +343,11 @@ class Scene:
         return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Give the covered pixels of all images in the way that the conditions need."""
+        """Render the covered pixels of all images, by the method that the conditions allow.
+
+        Changed surfaces are rendered directly, changed positions of lamps are
+        added image by image, and changed light alone uses transfer operators.
+        """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
         surface = (conditions.vertices, conditions.albedo, conditions.gloss)
@@ -354,7 +358,7 @@ class Scene:
         return self._relit(light, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """Give the layers of stacked operators, with one matrix product for each stack."""
+        """Render images with transfer operators, one matrix product for each stack of operators."""
         views = torch.arange(self.views, device=examples.device)
         images = (examples[:, None] * self.views + views).flatten()
         if self.views > 1:
@@ -364,7 +368,7 @@ class Scene:
     def _under_moved_lamps(
         self, light: Tensor, positions: Tensor, examples: Tensor
     ) -> Iterator[Layer]:
-        """Give the layers of all other light by operators, and add the lamps image by image."""
+        """Render images with transfer operators, and add the light of moved lamps to each."""
         movable_light = self.basis.movable_light
         assert movable_light is not None
         where, lamps = movable_light

@@ -25,16 +25,18 @@ from renderer.settings import ImageSettings
 from renderer.transport.lamp_paths import unoccluded
 from renderer.transport.rays import Rays, sphere
 
-# The directions of the sky that are traced from a point of table or wall.
+# Number of directions in which rays are traced from a point of table or wall to
+# the sky.
 DIRECTIONS = 48
-# The pixels between the points where the sky's shadow is computed. The shadow is soft.
+# Distance in pixels of the points at which the shadow of the sky is computed. The
+# shadow is soft, so it is interpolated between them.
 COARSE = 2
-# The directions over the sphere with which integrals are computed.
+# Number of directions on the sphere with which integrals are computed.
 NODES = 2**12
 # The distance from which the rays of an orthographic camera start, in world units.
 FAR = 1e3
-# The component of a ray towards a surface, at most. A ray that never reaches the surface then
-# meets it far away.
+# Largest component of a ray along the normal of a surface. A ray that is parallel to the surface
+# or leaves it is changed to this value, so that it meets the surface far away.
 FALLING = -1e-9
 
 
@@ -62,7 +64,7 @@ class _SeenPoints:
 
     Attributes:
         points: The points, shape (S, P, 3).
-        is_on_wall: Whether each lies on the wall, bool, shape (S, P).
+        is_on_wall: Mask of the points on the wall, shape (S, P). The others are on the table.
     """
 
     points: Tensor
@@ -71,11 +73,12 @@ class _SeenPoints:
 
 @per_degree
 def _upper(degree: int) -> tuple[Tensor, Tensor]:
-    """Return what a table leaves of a light, and what it adds.
+    """Compute the harmonics of light from above and from below the horizon.
 
-    The first is a matrix (size, size): it turns the coefficients of a light into those of its
-    part above the horizon. The second has the coefficients (size,) of light of radiance 1 from
-    everywhere below the horizon. Both are projected onto the harmonics of the degree.
+    Returns:
+        Matrix (size, size) that multiplies the coefficients of a light and gives the coefficients
+        of its part above the horizon. Coefficients (size,) of light with radiance 1 in all
+        directions below the horizon.
     """
     directions = sphere(NODES)
     radiance = Harmonics(degree).radiance(directions)
@@ -94,8 +97,8 @@ def above_table(lights: Tensor, lamps: Tensor, albedo: Tensor) -> Tensor:
         albedo: The albedo of the table, shape (E, 3).
 
     Returns:
-        The coefficients of the light from above, and of what the table reflects of it and of the
-        lamp, shape (E, K, 3).
+        The coefficients of the light, shape (E, K, 3): the light from above, and the part of this
+        light and of the lamp's that the table reflects.
     """
     harmonics = Harmonics(degree_of(lights[0]))
     upper, below = _upper(harmonics.degree)
@@ -130,14 +133,14 @@ def irradiance(
         The irradiance, shape (3, size, size).
 
     Raises:
-        InputError: Embree is not installed.
+        InputError: If Embree is not installed.
     """
     turn = _turn(camera)
     normals = torch.stack([turn[2], turn[0]])
     directions, radiance, irradiance_of_sky = _directions(degree_of(sky))
     sky = _turned(sky, camera.azimuth)
 
-    # The shadow of a lamp has edges, so that each pixel has several samples.
+    # Shadows of lamps have sharp edges, which need several samples per pixel.
     fine = image if lamp.any() or lights else replace(image, samples=1)
     seen = _surfaces(camera, fine, room, normals)
     arriving = (irradiance_of_sky @ sky).clamp(min=0)

@@ -43,16 +43,16 @@ MAX_LIGHT_ANGLE = 70.0
 def vary(
     scene: Scene, settings: VariationSettings, draws: torch.Generator, once: bool = False
 ) -> Scene:
-    """Draw the examples of a scene anew around its own examples.
+    """Return a scene whose examples differ at random from the examples of a scene.
 
     All views of one example are moved in the same way.
 
     Args:
-        scene: The scene.
-        settings: What is drawn, and from which ranges.
-        draws: The generator of the random numbers.
-        once: Whether the new examples are rendered in one lighting only. No
-            transfer operators are built for them then.
+        scene: Scene to vary.
+        settings: Ranges of the random changes.
+        draws: CPU generator of the random numbers.
+        once: Whether the new examples are rendered in one lighting only. If so,
+            no transfer operators are built for them.
 
     Returns:
         The new scene, or the given scene if the settings vary nothing.
@@ -73,9 +73,8 @@ def vary(
     is_on_table = torch.zeros(len(scene), dtype=torch.bool)
     if settings.tables:
         if scene.views > 1 or any(item.ground is not None for item in scene.objects):
-            raise InputError(
-                "tables are for one view of objects that stand on none: leave ground out, or tables"
-            )
+            fault = "tables require one view per example and objects without a table of their own"
+            raise InputError(f"{fault}: set views=1 and remove ground, or set tables=0")
         is_on_table = torch.rand(len(scene), generator=draws) < settings.tables
     if settings.moves or settings.backgrounds is not None:
         scene = _vary_geometry(scene, settings, draws, once, is_on_table)

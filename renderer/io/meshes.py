@@ -146,7 +146,7 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
         identity matrix.
 
     Raises:
-        InputError: As for `load_mesh`, if the file cannot be read.
+        InputError: See `load_mesh`. Also if the file cannot be read.
     """
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")

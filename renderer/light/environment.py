@@ -147,7 +147,7 @@ def read_panorama(path: str | Path) -> Tensor:
         most `NEGATIVE` times the maximum becomes zero.
 
     Raises:
-        InputError: As for `read_map`. Also if the map has fewer than
+        InputError: See `read_map`. Also if the map has fewer than
             `FEWEST_ROWS` rows, is not about twice as wide as high (such as a
             mirror ball), or has more negative radiance.
     """

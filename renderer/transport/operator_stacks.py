@@ -165,7 +165,7 @@ class TransferOperators(Sequence[TransferOperator]):
             shape of the lights.
 
         Raises:
-            InputError: As for `image`, or if the gradient of the loss has
+            InputError: See `image`. Also if the gradient of the loss has
                 another shape than the images.
         """
         lights = as_tensor("lights", lights)

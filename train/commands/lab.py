@@ -14,7 +14,7 @@ def render_laboratory(settings: LabSettings) -> None:
         settings: The settings of the command.
 
     Raises:
-        InputError: The folder holds results, or a setting is wrong.
+        InputError: If the folder holds results, or a setting is wrong.
     """
     require_replaceable(Path(settings.out), "out", settings.overwrite)
     count = write_laboratory(settings)

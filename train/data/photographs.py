@@ -180,7 +180,7 @@ def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
         The names of the classes, sorted.
 
     Raises:
-        InputError: The folder is missing.
+        InputError: If the folder is missing.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a folder of photographs")
@@ -203,7 +203,7 @@ def find_unlabeled(folder: Path) -> list[Photograph]:
         The images, sorted by path.
 
     Raises:
-        InputError: There is no such folder, or it holds no image.
+        InputError: If there is no such folder, or it holds no image.
     """
     paths, _ = _image_files(folder)
     return [Photograph(path, "", None) for path in paths]
@@ -373,7 +373,7 @@ def load_photographs(
         paths of the others.
 
     Raises:
-        InputError: An image is broken or oversized and is not to be skipped, no image can be
+        InputError: If an image is broken or oversized and is not to be skipped, no image can be
             read, or memory is too small.
     """
     shape = (len(photographs), 3, size, size)

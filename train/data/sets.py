@@ -191,7 +191,7 @@ def load_cifar100(path: str) -> DataSet:
         The data set.
 
     Raises:
-        InputError: It is not there and cannot be downloaded.
+        InputError: If it is not there and cannot be downloaded.
     """
     from torchvision.datasets import CIFAR100  # torchvision takes a second to import
 
@@ -221,7 +221,7 @@ def load_npz(path: str) -> DataSet:
         The data set.
 
     Raises:
-        InputError: It is not such a file, or it would need pickle, which runs code.
+        InputError: If it is not such a file, or it would need pickle, which runs code.
     """
     if not Path(path).is_file():
         raise InputError(f"path={path} does not exist: give the path of an .npz file", "path")
@@ -288,7 +288,7 @@ def load_folder(
         The data set.
 
     Raises:
-        InputError: The folder holds no such folders, or an image is broken.
+        InputError: If the folder holds no such folders, or an image is broken.
     """
     root = Path(path)
     if not root.is_dir():
@@ -340,7 +340,7 @@ def load_unlabeled(
         The data set, without classes. Every label is 0.
 
     Raises:
-        InputError: The folder holds no image, or an image is broken.
+        InputError: If the folder holds no image, or an image is broken.
     """
     found = find_unlabeled(Path(path))
     _, images = _read(Path(path), found, size, skip_unreadable, workers)

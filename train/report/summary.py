@@ -204,7 +204,7 @@ def summarize(folder: Path) -> RunSummary:
         Settings and scores.
 
     Raises:
-        InputError: For a folder without these, or if a file lacks an entry of
+        InputError: If the folder lacks these, or if a file lacks an entry of
             the tables.
     """
     folder = published(folder)
@@ -673,7 +673,7 @@ def find(folders: Sequence[Path]) -> Findings:
         What is in the folders and below them.
 
     Raises:
-        InputError: For a folder that is missing, and if nothing is found.
+        InputError: If the folder is missing, or if nothing is found.
     """
     for folder in folders:
         if not folder.is_dir():

@@ -50,7 +50,7 @@ def load(path: Path) -> dict[str, Any]:
         The state that `save` wrote, on the CPU.
 
     Raises:
-        InputError: The file is missing, damaged or not a checkpoint.
+        InputError: If the file is missing, damaged or not a checkpoint.
     """
     require_file(path, "give a run folder that holds a checkpoint")
     try:
@@ -75,7 +75,7 @@ def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
         The same state.
 
     Raises:
-        InputError: It lacks finite weights or an architecture, or comes from a later version.
+        InputError: If it lacks finite weights or an architecture, or comes from a later version.
     """
     try:
         version = state["architecture"].get("version", 1)
@@ -106,7 +106,7 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         The state, and the fault of a newer file if that is damaged.
 
     Raises:
-        InputError: There is no whole checkpoint.
+        InputError: If there is no whole checkpoint.
     """
     try:
         return load(folder / LAST), None

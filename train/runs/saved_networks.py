@@ -60,7 +60,7 @@ def load_network(
         The classifier.
 
     Raises:
-        InputError: There is no such network, or the weights are not for it.
+        InputError: If there is no such network, or the weights are not for it.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(RUN):
@@ -97,7 +97,7 @@ def load_run(
         The network.
 
     Raises:
-        InputError: There is no such network, `weights` is given, or `model` is missing.
+        InputError: If there is no such network, `weights` is given, or `model` is missing.
 
     Example:
         >>> load_run("pretrained/best").size
@@ -188,7 +188,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
         The file and its content.
 
     Raises:
-        InputError: There is no such file, or it is damaged.
+        InputError: If there is no such file, or it is damaged.
     """
     path = selected_file(run)
     if path is None:

@@ -44,7 +44,7 @@ def choose_device(name: str) -> torch.device:
         The device.
 
     Raises:
-        InputError: The device is not available.
+        InputError: If the device is not available.
     """
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
@@ -122,7 +122,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
         One of PRECISIONS. bfloat16 on a CPU that emulates it is warned of.
 
     Raises:
-        InputError: There is no such precision.
+        InputError: If there is no such precision.
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     if device.type == "cuda":
@@ -190,7 +190,7 @@ def compiles(choice: str, device: torch.device) -> bool:
         Whether to compile.
 
     Raises:
-        InputError: The choice is "always" on a CPU, which has no graphs to replay.
+        InputError: If the choice is "always" on a CPU, which has no graphs to replay.
     """
     if choice == "always" and device.type == "cpu":
         problem = "choice=always is for a GPU, whose graphs it replays"

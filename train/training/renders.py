@@ -128,7 +128,7 @@ def load_renders(settings: ExperimentSettings, data: DataSet) -> tuple[Tensor, T
         The images, uint8, shape (N, 3, size, size), and their class numbers, shape (N,).
 
     Raises:
-        InputError: The folder cannot be read, or it has no image of a positive class.
+        InputError: If the folder cannot be read, or it has no image of a positive class.
     """
     folder = Path(str(settings.augment.folder))
     positive_classes = label_names(settings.label)

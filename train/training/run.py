@@ -405,7 +405,7 @@ def build_trainer(
         The trainer, ready for `Trainer.fit`.
 
     Raises:
-        InputError: The network, the renders or the initial weights do not fit together.
+        InputError: If the network, the renders or the initial weights do not fit together.
     """
     keys = keys_of("train", settings.train)
     with keyed(**keys):

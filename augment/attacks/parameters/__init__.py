@@ -45,22 +45,22 @@ def parameter_class(name: str) -> type[Parameter]:
 
 
 def make_parameter(name: str, scene: Scene, settings: StepSettings, **options: Any) -> Parameter:
-    """Create the parameter of a scene with which an attack changes a quantity.
+    """Create an attack parameter by its name.
 
     Args:
-        name: Name of the quantity, such as "pose".
+        name: Name of the parameter, such as "pose".
         scene: Scene to attack.
-        settings: Norm-ball, steps and units of the attack, of the type that the
-            class of the quantity takes.
-        options: Further arguments of the class, such as `nonnegative` of
-            `Lighting`.
+        settings: Norm-ball, steps and units of the attack. Their class is the
+            type of the field `name` of `ParameterSettings`.
+        options: Further arguments of the parameter's class, such as
+            `nonnegative` of `Lighting`.
 
     Returns:
         The parameter.
 
     Raises:
-        InputError: If there is no such quantity, or if the scene lacks what is
-            to be changed.
+        InputError: If there is no such parameter, or if the scene does not have
+            the attacked thing, such as lamps.
     """
     if name in LOCAL_LIGHTS:
         return LocalLight(scene, settings, name)

@@ -98,8 +98,9 @@ class Material(Parameter):
         """Return a copy of the conditions with the given gloss and hue of the objects.
 
         Args:
-            values: Average roughness, metallic and specular factor, and rotation of
-                the hue, divided by the units of the settings, shape (A, 4).
+            values: Attack values, shape (A, 4). The columns are the average
+                roughness, metallic factor and specular factor, and the rotation
+                of the hue. Each is divided by its unit in the settings.
             conditions: Conditions of the A examples.
             examples: Indices of the examples in the scene, shape (A,).
 

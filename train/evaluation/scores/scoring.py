@@ -183,7 +183,7 @@ def evaluate_photographs(
         Scores, with intervals.
 
     Raises:
-        InputError: As of `Predictor.predict`, and if `out` is inside `folder`.
+        InputError: See `Predictor.predict`. Also if `out` is inside `folder`.
     """
     folder = as_folder("folder", folder)
     out = as_folder("out", out)
@@ -311,7 +311,7 @@ def choose_operating_points(
         Operating point of each label.
 
     Raises:
-        InputError: As of `Predictor.predict`, and if the folder has fewer than
+        InputError: See `Predictor.predict`. Also if the folder has fewer than
             1 / rate negatives.
     """
     predicted = predictor.predict(folder, label, skip_unreadable)
