@@ -1,6 +1,6 @@
-"""Classifier and scenes to labeled images. Knows no OpenGL, no optimizer and no data set.
+"""Renders labeled images for a classifier and attacks it. Optimizers and data sets are in `train`.
 
-The public names stand in `__init__.pyi`.
+The public names are listed in `__init__.pyi`.
 """
 
 from renderer.lazy import attach

@@ -1,4 +1,4 @@
-"""Processes that train together: their numbers, and the examples that each of them attacks."""
+"""Divides examples among the processes of a distributed training, and gathers their results."""
 
 import torch
 import torch.distributed as dist

@@ -1,8 +1,8 @@
 """Losses: the cost that an attack decreases, and the losses of training.
 
-A label is a class, or any class but one. The latter is a complementary label, and it is written
-−1 − class. If there are several positive classes, `absent` holds further classes that images of a
-complementary label do not show.
+A label is the index of a class. A complementary label says that an image does not show a class. It
+is written as −1 − class. If there are several positive classes, `absent` contains the other classes
+that images with a complementary label do not show, either.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> T
 
 
 def complementary_label(label: int) -> int:
-    """Return the label of an image that shows no class, and in particular not this one.
+    """Return the complementary label of a class.
 
     Args:
         label: The class that it does not show.
@@ -122,7 +122,7 @@ def label_loss(
 def log_odds(logits: Tensor, label: int) -> Tensor:
     """Compute the log-odds of a class, log(p / (1 − p)), where p is its probability.
 
-    They are finite even where p rounds to 0 or 1.
+    The result is finite even if p rounds to 0 or 1.
 
     Args:
         logits: The logits, shape (N, classes).
@@ -158,7 +158,7 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
 
 
 def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
-    """Compute how far the predictions of a network are from another's.
+    """Compute the divergence of a network's predictions from the predictions of another network.
 
     This is the Kullback–Leibler divergence Σ q log(q / p) of the probabilities p of the network
     from the probabilities q of the other one: the loss of distillation (Hinton et al. 2015) at
@@ -178,7 +178,7 @@ def kl_divergence(logits: Tensor, predictions: Tensor) -> Tensor:
 
 
 def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) -> Tensor:
-    """Say which predictions agree with the labels.
+    """Return a mask of the predictions that agree with the labels.
 
     Args:
         predicted: The predicted classes, int64, shape (N,).
@@ -196,5 +196,5 @@ def is_correct(predicted: Tensor, labels: Tensor, absent: Sequence[int] = ()) ->
 
 
 def _class_of(labels: Tensor) -> Tensor:
-    """Return the class of each label, also of the complementary ones."""
+    """Return the class of each label. A complementary label gives the class that is not shown."""
     return torch.where(labels < 0, -1 - labels, labels)

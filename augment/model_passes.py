@@ -1,4 +1,4 @@
-"""Passes of batches through a classifier: their size, and the state that they leave it in."""
+"""Chooses the batch size of passes through a classifier, and restores the classifier's state."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 @dataclass
 class BatchSize:
-    """Number of images per pass through a classifier, which is halved when memory runs out.
+    """Number of images per pass through a classifier. It is halved when memory runs out.
 
     Attributes:
         images: The number of images, at least 1. It does not grow again.
@@ -65,7 +65,7 @@ class BatchSize:
 
 @cache
 def warn_once(images: int) -> None:
-    """Warn of a smaller number of images per pass, once for each number."""
+    """Warn that passes have fewer images, once for each number of images."""
     logger = logging.getLogger(__name__)
     logger.warning("memory ran out: the attack goes on with %d images per pass", images)
 

@@ -122,7 +122,7 @@ class Renders(Dataset[tuple[Tensor, int]]):
 
 @dataclass(eq=False, repr=False)
 class AugmentationService:
-    """Renders the examples of a scene anew for each regeneration.
+    """Renders the examples of a scene for a training loop, again in each regeneration.
 
     With `settings.warm_start`, each attack begins with the result of the
     previous one.
@@ -528,12 +528,12 @@ def _describe_scene(scene: Scene) -> list[object]:
 
 
 def _rounded(values: Iterable[float]) -> list[str]:
-    """Write numbers with three digits, which do not show rounding errors."""
+    """Write numbers with three digits, so that rounding errors do not change the text."""
     return [f"{float(value):.3g}" for value in values]
 
 
 class CheckedNetwork(nn.Module):
-    """A network of the training loop. Its outputs are checked.
+    """Network of the training loop whose outputs are checked.
 
     Attributes:
         model: The network.

@@ -1,4 +1,4 @@
-"""Adversaries: examples of an attack with all that they show, as values and as folders."""
+"""Examples after an attack, with their light, shapes, cameras and images, and files of them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ RGBE_TOLERANCE = 2.0**-8
 
 @dataclass(frozen=True)
 class Adversary:
-    """V views of one object, before an attack and after it, with everything that they show.
+    """Example of an attack: V views of one object, with light, shape and images before and after.
 
     Attributes:
         shown: The object with its attacked shape and colors, in the coordinates
@@ -139,7 +139,7 @@ class Adversary:
 
     @torch.no_grad()
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
-        """Render the images after the attack again.
+        """Render the images of the attacked example.
 
         Args:
             rasterizer: A rasterizer or its name. None for the default one.
@@ -175,7 +175,7 @@ def _as_numpy(values: Tensor) -> np.ndarray:
 
 
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
-    """Write an adversary, which `reload` reads, and a scene for Mitsuba.
+    """Write the files of an adversary for `reload`, and a scene for Mitsuba.
 
     The scene for Mitsuba leaves out negative light. Maps are written only of
     light that is negative nowhere.
@@ -339,7 +339,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 
 
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
-    """Return the camera of a description, whose fields tell its class."""
+    """Create the camera of a description. The keys of the description tell its class."""
     described = angles_in_degrees(description, angle_unit)
     # Files of earlier versions have the former name of the clipping range.
     if "reach" in described:

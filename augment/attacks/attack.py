@@ -1,4 +1,4 @@
-"""One call that attacks a classifier through a scene: its settings and its result."""
+"""The function `attack`, which attacks a classifier through a scene, and its result."""
 
 from __future__ import annotations
 
@@ -228,9 +228,9 @@ def attack(
     seed: int = 0,
     force: bool = False,
 ) -> AttackResult:
-    """Change a scene until a classifier errs, example by example.
+    """Change the examples of a scene until a classifier misclassifies them.
 
-    The classifier is left as it was found.
+    The mode and the gradient flags of the classifier are restored afterwards.
 
     Args:
         classifier: The classifier to attack, or a plain network from images of
@@ -238,31 +238,33 @@ def attack(
             lies on its device.
         scene: The scene, with E examples of V views. Its labels are names or
             indices of classes.
-        target: A class, a class for each of the views that share what is
-            attacked, or "least_likely" for the class of each image's lowest
-            confidence. None for any error.
-        settings: What is changed, and within which norm-balls. By default, the
-            light is changed without a limit.
+        target: Class that the attack leads images to. A list has one class for
+            each view, and requires views that share the attacked values.
+            "least_likely" is the class with the lowest confidence. None accepts
+            any misclassification.
+        settings: Attacked parameters with their norm-balls, and the steps. By
+            default, the light is changed without a limit.
         classes: Names of the classes of a plain network, in the order of its
             outputs. None for "0", "1" and so on.
-        normalization: What a plain network needs in front of it: "imagenet", or
-            mean and standard deviation of the channels red, green and blue, in
-            units of [0, 1]. None if it takes images in [0, 1], or normalizes
-            them itself.
+        normalization: Normalization of images for a plain network: "imagenet",
+            or mean and standard deviation of the channels red, green and blue,
+            in units of [0, 1]. None if the network takes images in [0, 1], or
+            normalizes them itself.
         value_range: Values of black and white that a plain network takes before
             normalization.
         seed: Seed of the restarts and of the noise.
-        force: Whether to attack also what the classifier gets wrong before.
+        force: Whether examples that are misclassified before the attack are
+            accepted, and attacked too.
 
     Returns:
         The images, logits and successes of the E examples, before the attack
         and after it.
 
     Raises:
-        InputError: If an argument is of another type, an example is
-            misclassified before the attack, the classifier lacks a class, or a
-            target is the right class of an example. If a plain network is in
-            training mode, would normalize images twice, or does not return a
+        InputError: If an argument has a wrong type, if an example is
+            misclassified before the attack, if the classifier lacks a class, or
+            if a target is the true class of an example. Also if a plain network
+            is in training mode, normalizes images twice, or does not return a
             row of logits for each image.
 
     Example:
@@ -298,7 +300,7 @@ def _attack(
     seed: int,
     force: bool,
 ) -> AttackResult:
-    """Change a scene until a classifier errs, as `attack` does."""
+    """Attack a `Classifier`, see `attack`."""
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_parameters()
     settings = with_optimizer(settings, classifier)
@@ -435,7 +437,7 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
 
 
 def source_labels(scene: Scene, logits: Tensor, classifier: Classifier) -> Tensor:
-    """Return the right class of each view.
+    """Return the true class of each view.
 
     Args:
         scene: The scene, with E examples of V views.
@@ -529,13 +531,13 @@ def target_labels(
 
 
 def _target_names(target: object) -> list[str]:
-    """Return the names of a list of target classes, and refuse everything else."""
+    """Return the names in a list of target classes, or raise InputError if it is no list."""
     advice = "the name or the index of a class, or one for each view"
     return [str(name) for name in as_list("target", target, str | Integral, advice)]
 
 
 def random_starts(problem: AttackProblem, count: int, seed: int) -> Iterator[Tensor]:
-    """Draw the values with which restarts begin.
+    """Draw the initial attack values of restarts.
 
     Args:
         problem: The attacked parameters, each with a radius.
@@ -555,10 +557,10 @@ def final_images(
     examples: Tensor,
     images: Tensor,
 ) -> Tensor:
-    """Return the images of a descent with the shadows and bounces of the attacked shape.
+    """Return the images after a descent, with the shadows and bounces of the attacked shape.
 
-    While shape, colors or gloss change, a descent holds shadows and bounces
-    fixed. Then the images are rendered again.
+    During a descent that changes shape, colors or gloss, shadows and bounces
+    stay fixed. This function then renders the images again.
 
     Args:
         problem: The attacked scene and the parameters that were changed.

@@ -139,7 +139,7 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
 
 
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
-    """Return what is told of an example, for JSON."""
+    """Return the numbers of an example for attack.jsonl."""
     descent = result.descent
     classes = result.classifier.classes
     before = predictions(result.logits_before[example], classes)
@@ -265,11 +265,11 @@ def render_again(
 
 
 def figure(result: AttackResult, example: int) -> Image.Image:
-    """Draw an example before the attack and after it, with a row for each view.
+    """Draw an example before and after the attack, with a row for each view.
 
-    The columns are the images with their predictions, their difference and, if
-    the light changed, the light. A difference is gray where there is none. All
-    differences are scaled alike, so that the largest reaches black or white.
+    The columns show the images with their predictions, their difference and, if
+    the light changed, the light. Pixels without a difference are gray. All
+    differences have the same scale, with which the largest is black or white.
 
     Args:
         result: The result of an attack.
@@ -284,11 +284,11 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     largest = differences.abs().amax((1, 2, 3)).tolist()
     # Differences of less than a step of 8 bits stay as small as they are.
     scale = 1 / max(1 / 255, *largest)
-    told = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
+    captions = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
     columns = {
         "initial": tiles_of(before, _captions(result, result.logits_before, example), SIDE),
         "adversarial": tiles_of(after, _captions(result, result.logits, example), SIDE),
-        "difference": tiles_of((1 + scale * differences) / 2, told, SIDE),
+        "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
         **_columns_of_light(result, example),
     }
     return draw_grid(list(zip(*columns.values(), strict=True)), list(columns))

@@ -1,4 +1,4 @@
-"""The worth of an attack's result: random search, more steps, success by radius, and transfer."""
+"""Checks of an attack: random search, more steps, success by radius, and transfer."""
 
 from __future__ import annotations
 
@@ -56,11 +56,12 @@ CHECKED = {
 def check(result: AttackResult) -> dict[str, Any]:
     """Compare an attack with random draws and with longer descents.
 
-    There are as many draws as the attack has steps or, without gradients,
-    queries. They are as far from the start as the attack may go (uniform in the
-    norm-balls) or, without a radius, went. The longer searches have 3 and 10
-    times as many steps or queries. A success counts as in the result, with the
-    noise of a sensor.
+    Random search has one draw for each step of the attack or, if the classifier
+    has no gradients, for each query. It draws uniformly from the norm-balls.
+    Without a radius, it draws values at the same distance from the start as the
+    values that the attack found. The longer searches have 3 and 10 times as many
+    steps or queries. All successes are counted with the noise of a camera, as in
+    the result.
 
     Args:
         result: The result of `augment.attack`.
@@ -197,10 +198,11 @@ def transfer(
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
 ) -> list[dict[str, Any]]:
-    """Show adversaries to other classifiers, from other sides and on other objects.
+    """Evaluate adversaries with other classifiers, other cameras and other objects.
 
-    The A adversaries are the clean-correct examples with success. Added pixels
-    and the background are resized for another classifier.
+    The A adversaries are the successful examples that were classified correctly
+    before the attack. For a classifier of another image size, backgrounds and
+    pixel offsets are resized.
 
     Args:
         result: The result of `augment.attack`.
@@ -331,7 +333,7 @@ class Successes:
         return Successes(result.success_before.clone(), result.success_before.clone())
 
     def clone(self) -> Successes:
-        """Return a copy, which changes on its own."""
+        """Return an independent copy."""
         return Successes(self.counted.clone(), self.without_noise.clone())
 
     @property
@@ -392,7 +394,7 @@ def _success_by_draws(
     found: Successes,
     draw: Callable[[], Tensor],
 ) -> Successes:
-    """Return what was found, and what as many draws (E, D) as the attack had steps add to it."""
+    """Add the successes of random draws (E, D), one draw for each step or query of the attack."""
     found = found.clone()
     for _ in progress(range(_count_draws(result)), "random search"):
         left = found.left
@@ -442,12 +444,12 @@ def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
 
 
 def _fraction(values: Tensor) -> float:
-    """Return the mean of values (N,), which is 0 of none."""
+    """Return the mean of values (N,), or 0 if there are none."""
     return float(values.double().mean()) if len(values) else 0.0
 
 
 def _as_scales(scales: Sequence[float]) -> list[float]:
-    """Return factors of radii as a list, and refuse everything else."""
+    """Return factors of radii as a list, or raise InputError."""
     listed = as_list("scales", scales, object, "a list of factors of the radii")
     if not listed:
         raise InputError("scales is empty: give factors of the radii")
@@ -470,7 +472,7 @@ def _descend_further(
     values: Tensor,
     found: Successes,
 ) -> None:
-    """Attack the examples that are left from their values (E, D), which change, as does `found`."""
+    """Attack the examples without success further. This changes `found` and the values (E, D)."""
     left = found.left
     if not len(left):
         return
@@ -488,7 +490,7 @@ def _descend_further(
 
 
 def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> dict[str, Tensor]:
-    """Return which clean-correct examples a method of search found, with noise and without."""
+    """Return masks of the clean-correct examples with success, with noise and without."""
     is_clean = result.clean_correct
     return {
         method: found.counted[is_clean].cpu(),
@@ -498,7 +500,7 @@ def _of_clean_examples(method: str, found: Successes, result: AttackResult) -> d
 
 @dataclass(frozen=True)
 class _Adversaries:
-    """Adversaries of an attack, with what they were before it.
+    """Adversaries of an attack, with their examples before the attack.
 
     Attributes:
         result: The attack.
@@ -574,7 +576,7 @@ class _Adversaries:
         return Criterion(source, self._labels(targets, classifier))
 
     def _labels(self, names: list[list[str]], classifier: Classifier) -> Tensor:
-        """Return the classes (A, V) of names of classes, A lists of V."""
+        """Convert A lists of V class names to indices (A, V)."""
         indices = [classifier.label(name) for views in names for name in views]
         return torch.tensor(indices).long().view(-1, self.result.problem.scene.views)
 

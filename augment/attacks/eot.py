@@ -1,4 +1,4 @@
-"""Images as a classifier gets them: with 8 bits, sensor noise, or random transformations."""
+"""Preprocessing of images before a classifier: 8 bits, sensor noise, random transformations."""
 
 import io
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ class Quantized(nn.Module):
 
 
 def _round_to_bytes(images: Tensor) -> Tensor:
-    """Return images in [0, 1], rounded to 8 bits, in their own type."""
+    """Round images in [0, 1] to 8 bits, and keep their dtype."""
     return to_unit(to_bytes(images)).to(images)
 
 

@@ -1,4 +1,4 @@
-"""The search for a scene in which a classifier is right to begin with."""
+"""Search for a scene whose images a classifier recognizes before an attack."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -158,10 +158,11 @@ def _confidences(
     classifier: Classifier,
     groups: int = 1,
 ) -> Tensor:
-    """Return the lowest confidence in the right class where an attack would begin.
+    """Return the lowest confidence in the true class among the images of each group.
 
-    The examples are in as many groups of equal size, shape (groups,). An error
-    counts as a confidence of 0.
+    The images are rendered with the initial attack values. The examples are
+    divided into groups of equal size. A misclassified image counts as a
+    confidence of 0. The result has shape (groups,).
     """
     problem = build_problem(attack, scene)
     images = problem.images(problem.start)

@@ -1,6 +1,6 @@
-"""Makes a classifier of a network that a user hands over as it is.
+"""Makes a classifier of a user's plain network.
 
-A plain network knows neither the size of its images nor the names of its
+A plain network contains neither the size of its images nor the names of its
 classes. The number of its classes is found by calling it once.
 """
 
@@ -71,7 +71,7 @@ def as_facts(
     size: int | None = None,
     normalization: Normalization = None,
 ) -> NetworkFacts:
-    """Check what a user says about a network.
+    """Check the classes, size and normalization that a user gives for a network.
 
     Args:
         classes: Names of the classes, or a text file with a name in each line.
@@ -113,7 +113,7 @@ def require_no_facts(name: str, facts: NetworkFacts) -> None:
 
 
 def index_names(count: int) -> tuple[str, ...]:
-    """Return the names of classes that nobody has named: "0", "1" and so on."""
+    """Return names for classes without names: "0", "1" and so on."""
     return tuple(str(index) for index in range(count))
 
 

@@ -100,7 +100,7 @@ def build_torchvision(
     facts: NetworkFacts = NO_FACTS,
     published: "WeightsEnum | None" = None,
 ) -> Classifier:
-    """Build a classifier of `torchvision.models` with fresh weights.
+    """Build a classifier of `torchvision.models` with random weights.
 
     Args:
         model: Name of the network in `torchvision.models`.
@@ -347,7 +347,7 @@ def build_timm(
     facts: NetworkFacts = NO_FACTS,
     pretrained: bool = False,
 ) -> Classifier:
-    """Build a network of timm with fresh weights, or with those that timm downloads.
+    """Build a network of timm with random weights, or with those that timm downloads.
 
     Args:
         model: Name of the network in timm.

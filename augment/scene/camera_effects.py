@@ -1,4 +1,4 @@
-"""Random effects of a camera on images, and random patterns of a projector on what it sees."""
+"""Random camera effects on images, and random projected patterns on the scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The rows of a scene, and the light, shape and colors that they are rendered with."""
+"""Examples of a scene, and the light, shape and colors with which they are rendered."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OF_FACES = ("albedo", "gloss", "hue")
 
 @dataclass(frozen=True)
 class Example:
-    """A row of a scene: an object from V cameras before a background.
+    """Example of a scene: an object from V cameras in front of a background.
 
     Attributes:
         object: The index of the object in the scene's list.
@@ -38,7 +38,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Conditions:
-    """The light, shape and colors that A examples are rendered with.
+    """Light, shape and colors with which A examples are rendered.
 
     N and F are the numbers of vertices and faces of the largest mesh. A smaller mesh has the
     first rows of them.

@@ -171,7 +171,7 @@ def degree_of_scene(reached: Smoothest, given: int | None, pixels: int) -> int:
 
 
 def _affordable_degree(reached: Smoothest, pixels: int) -> int:
-    """Return the degree that shows all gloss, or the highest from 6 on that fits in memory."""
+    """Return the degree that the gloss needs, or else the highest one that fits in memory."""
     degree = max(DEGREE, reached.degree)
     cpu = torch.device("cpu")
     while degree > DEGREE and not has_memory(operator_bytes(degree, pixels), cpu):

@@ -156,7 +156,7 @@ class DirectRenderer:
     cached: bool = True
 
     def __post_init__(self) -> None:
-        """Begin with nothing kept."""
+        """Create empty caches."""
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         self._rays: dict[int, Rays] = {}
@@ -294,7 +294,7 @@ class DirectRenderer:
     def transport_near(
         self, example: int, number: int, camera: Camera, vertices: np.ndarray
     ) -> FrozenTransport:
-        """Find shadows and bounces of a shape near the one of an example, or compute them.
+        """Return shadows and bounces of a shape that is close to the shape of an example.
 
         Args:
             example: Index of the example. One moved shape is kept for each.

@@ -24,7 +24,7 @@ from renderer.transport.operators import TransferOperator
 
 
 class Layer(NamedTuple):
-    """The radiance of B images of a batch at P pixels. Each object of them lies in these pixels.
+    """Radiance of B images at P pixels. The objects of the images cover only these pixels.
 
     Attributes:
         rows: Which rows of the batch the images are: a slice, or indices (B,)

@@ -326,9 +326,9 @@ class Scene:
         return images
 
     def _as_examples(self, examples: object, count: int | None = None) -> Tensor:
-        """Convert indices of examples, `count` of them, and raise InputError for others.
+        """Convert `count` indices of examples to a tensor, or raise InputError.
 
-        On a GPU, the range of the indices goes unchecked, since the host would wait for it.
+        On a GPU, the range of the indices is not checked, because the CPU would wait for the GPU.
         """
         indices = as_integers("examples", examples)
         if indices.ndim != 1 or count not in (None, len(indices)):
@@ -390,7 +390,7 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Give the layer of each view, which is shaded anew."""
+        """Render each view directly."""
         views = [*product(range(len(examples)), range(self.views))]
         counted = progress(views, "rendering views") if len(views) > UNCOUNTED_VIEWS else views
         for image, (row, view) in enumerate(counted):
@@ -416,7 +416,7 @@ _ARGUMENTS = tuple(name for name in signature(Scene).parameters)
 
 
 def _require_examples(examples: Sequence[Example], objects: Sequence[SceneObject]) -> None:
-    """Raise InputError unless there are examples, and objects of all their numbers."""
+    """Raise InputError if there are no examples, or if an example names an absent object."""
     if not examples:
         raise InputError("examples is empty: give at least one mesh, one view and one background")
     if max(example.object for example in examples) >= len(objects):

@@ -224,7 +224,7 @@ def project_along_light(
 ) -> Tensor:
     """Compute where light from a direction meets what a camera sees.
 
-    The camera sees the mesh, the table or the wall in the middle of each pixel.
+    The camera sees the mesh, the table or the wall at the center of each pixel.
 
     Args:
         room: The table and the wall.
@@ -262,7 +262,7 @@ def project_along_light(
 
 
 def _near(points: Tensor, directions: Tensor, radius: float) -> Tensor:
-    """Say which rays come nearer to the origin than a radius.
+    """Return a mask of the rays that come nearer to the origin than a radius.
 
     The rays start at points (..., 3) in one direction (3,) or in D directions (3, D).
     """
@@ -275,10 +275,14 @@ def _near(points: Tensor, directions: Tensor, radius: float) -> Tensor:
 
 @per_degree
 def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose directions above a table and a wall that faces +x.
+    """Choose directions above a table and in front of a wall that faces +x.
 
-    The directions (2, D, 3) are as dense as their cosine (Malley's method). With them come the
-    harmonics (2, D, size) there, and the irradiance of each surface by each harmonic (2, size).
+    The density of the directions is proportional to the cosine (Malley's method).
+
+    Returns:
+        Directions for table and wall, shape (2, D, 3). Values of the harmonics in these
+        directions, shape (2, D, size). Irradiance of both surfaces per unit of each harmonic,
+        shape (2, size).
     """
     index = torch.arange(DIRECTIONS, dtype=torch.float64)
     squared = (index + 0.5) / DIRECTIONS

@@ -1,4 +1,4 @@
-"""Draw the examples of a scene anew: objects, cameras, lighting, backgrounds and camera effects."""
+"""Random variation of a scene: objects, cameras, lighting, backgrounds and camera effects."""
 
 import math
 from collections.abc import Sequence
@@ -194,7 +194,7 @@ def _draw_background_files(folder: Path, count: int, size: int, draws: torch.Gen
 
 
 def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
-    """Give example i the background i."""
+    """Return copies of the examples in which example i has background i."""
     return [replace(example, background=index) for index, example in enumerate(examples)]
 
 

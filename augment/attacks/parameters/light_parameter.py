@@ -70,9 +70,9 @@ def environment_light(scene: Scene) -> tuple[slice, Harmonics | LocalBasis]:
         Rows of the environment lighting among the coefficients of all lights,
         and its basis.
     """
-    # The environment lighting comes first, before projector and lamps.
-    first_light, *_ = parts_of(scene.basis)
-    return first_light
+    # The environment lighting is the first light of a basis.
+    lights = parts_of(scene.basis)
+    return lights[0]
 
 
 def replace_light(conditions: Conditions, rows: slice, coefficients: Tensor) -> Conditions:

@@ -62,7 +62,7 @@ class Material(Parameter):
         # have a unit of 1 instead.
         self._unit = torch.where(attacked_mask, units, 1)
 
-        # F is the number of faces of the largest mesh below.
+        # Below, F is the number of faces of the largest mesh.
         materials = [initial_materials(item) for item in scene.objects]
         averages = [material.average() for material in materials]
         # Shape (objects, 3).
