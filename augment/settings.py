@@ -82,7 +82,7 @@ class MeshSettings(Settings):
 
 
 def _is_gloss(values: object) -> bool:
-    """Tell whether a value is a list of one to three numbers from 0 to 1."""
+    """Return whether a value is a list of one to three numbers from 0 to 1."""
     if not isinstance(values, Sequence) or isinstance(values, str):
         return False
     return 1 <= len(values) <= 3 and all(is_number(item) and 0 <= item <= 1 for item in values)

@@ -119,7 +119,13 @@ def times_in_turn(
 
 
 def make_timer(call: Callable[[], object], device: str) -> Timer:
-    """Return a timer of a call with the clock that suits the device."""
+    """Return a timer of a call with the clock that suits the device.
+
+    Args:
+        call: Call to time.
+        device: "cpu" for the processor time of this process. Any other device
+            for wall-clock time, synchronized with the GPU.
+    """
     names = {"call": call}
     if device == "cpu":
         return Timer("call()", globals=names, timer=time.process_time)

@@ -114,7 +114,7 @@ LOCAL_LIGHTS = {
 
 @dataclass(frozen=True)
 class Load:
-    """What the tables of costs render, and how often.
+    """Mesh and sizes that the tables of costs render, and numbers of repetitions.
 
     Attributes:
         mesh: Mesh to render.
@@ -257,6 +257,12 @@ def time_build(mesh: Mesh, size: int, samples: int, case: Case) -> float:
 
     The time is averaged over VIEWS views. It is measured twice, and the smaller
     result counts.
+
+    Args:
+        mesh: Mesh to render.
+        size: Pixels per side of the image.
+        samples: Samples per side of a pixel.
+        case: Local lights of the operator.
     """
     cameras = orbit_cameras(VIEWS, 2.2)
     call = partial(build, mesh, size, samples, case, cameras)

@@ -93,7 +93,12 @@ def harmonics(unit_normals: Tensor, degree: int) -> Iterator[tuple[int, Tensor]]
 
 
 def normalization(l: int, m: int) -> float:
-    """Return the factor that gives the harmonics of degree l and order ±m the norm 1."""
+    """Return the factor that gives the harmonics of degree l and order ±m the norm 1.
+
+    Args:
+        l: Degree, at least 0.
+        m: Order, from 0 to l.
+    """
     ratio = math.factorial(l - m) / math.factorial(l + m)
     return math.sqrt((2 if m else 1) * (2 * l + 1) / (4 * math.pi) * ratio)
 

@@ -440,7 +440,12 @@ def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
 
 
 def draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw the points of a panel by setting or, if the degrees differ, by degree."""
+    """Draw the points of a panel by setting or, if the degrees differ, by degree.
+
+    Args:
+        axes: Axes to draw on.
+        rows: Rows of the panel.
+    """
     has_degrees = len({row["degree"] for row in rows}) > 1
     # The front and the defaults come first in the legend.
     points: dict[str, list[tuple[float, float]]] = {"front": [], "default": []}

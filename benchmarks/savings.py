@@ -173,7 +173,13 @@ class RenderGradient:
 
     @classmethod
     def by_vertices(cls, view: View, mesh: Mesh, **options: Any) -> "RenderGradient":
-        """Differentiate the image by the vertices of the view."""
+        """Differentiate the image by the vertices of the view.
+
+        Args:
+            view: View to render.
+            mesh: Mesh of the view.
+            options: Further arguments of `renderer.render`.
+        """
         vertices = view.vertices().requires_grad_()
         return cls(view, mesh, [vertices], vertices=vertices, **options)
 

@@ -138,7 +138,7 @@ def cut_irradiance(normals: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class VisibleSurface:
-    """What a camera sees of a mesh.
+    """Samples of a mesh that a camera sees.
 
     Attributes:
         fragments: The S visible samples.

@@ -92,7 +92,13 @@ def last_epoch(run: Path, *overrides: str, launcher: Sequence[str] = ()) -> dict
 
 
 def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
-    """Train on the data set of the command line, and return the metrics of the last epoch."""
+    """Train on the data set of the command line, and return the metrics of the last epoch.
+
+    Args:
+        run: Folder of the run.
+        options: Parsed command line.
+        overrides: Further settings, such as "augment=none".
+    """
     settings = [
         "data=npz",
         f"data.path={options.data}",
@@ -126,7 +132,15 @@ def collate(
     transform: Callable[[Image.Image], Tensor],
     batch: list[tuple[Image.Image, int]],
 ) -> tuple[Tensor, Tensor]:
-    """Transform the images of a batch, and stack images and labels."""
+    """Transform the images of a batch, and stack images and labels.
+
+    Args:
+        transform: Transformation of an image to a tensor.
+        batch: Pairs of an image and its label.
+
+    Returns:
+        Images, shape (N, 3, H, W), and labels, shape (N,).
+    """
     images = [transform(image) for image, _ in batch]
     labels = [label for _, label in batch]
     return torch.stack(images), torch.tensor(labels)
@@ -237,7 +251,12 @@ def make_loader(
 
 
 def make_network(class_count: int, options: argparse.Namespace) -> WideResNet:
-    """Make the network that `python -m train` trains, but with torch's own dropout."""
+    """Make the network that `python -m train` trains, but with torch's own dropout.
+
+    Args:
+        class_count: Number of classes.
+        options: Parsed command line with depth, width and dropout.
+    """
     network = WideResNet(
         class_count,
         options.depth,
@@ -283,7 +302,12 @@ def measure_speed(options: argparse.Namespace) -> Iterator[Row]:
 
 
 def train_certain_network(run: Path, options: argparse.Namespace) -> Path:
-    """Train a network without renders, make it certain of class 0, and return its run folder."""
+    """Train a network without renders, make it certain of class 0, and return its run folder.
+
+    Args:
+        run: Folder of the run.
+        options: Parsed command line.
+    """
     train(run, options, "augment=none")
     state = checkpoint.load(run / checkpoint.BEST)
     make_certain(state["model"]["head.weight"], state["model"]["head.bias"])

@@ -340,13 +340,23 @@ def time_in_turn(
 
 
 def require_same_bits(values: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
-    """Raise AssertionError unless pairs of tensors are equal to the bit."""
+    """Raise AssertionError unless pairs of tensors are equal to the bit.
+
+    Args:
+        values: Computed tensors.
+        expected: Reference of each tensor.
+    """
     for value, expected_value in zip(values, expected, strict=True):
         torch.testing.assert_close(value, expected_value, rtol=0, atol=0)
 
 
 def require_close(values: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
-    """Raise AssertionError unless pairs of tensors differ by rounding of float32 sums alone."""
+    """Raise AssertionError unless pairs of tensors differ by rounding of float32 sums alone.
+
+    Args:
+        values: Computed tensors.
+        expected: Reference of each tensor.
+    """
     for value, expected_value in zip(values, expected, strict=True):
         tolerance = 2e-5 * float(expected_value.abs().max())
         torch.testing.assert_close(value, expected_value, rtol=0, atol=tolerance)

@@ -98,7 +98,7 @@ def single_line(error: Exception) -> str:
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Tell whether an error says that memory ran out, on a GPU or on the CPU.
+    """Return whether an error reports that the memory of a GPU or of the CPU ran out.
 
     Args:
         error: Error of any class.
@@ -236,7 +236,7 @@ def require_bounded(**tensors: Tensor) -> None:
 
 
 def is_whole(value: object) -> bool:
-    """Tell whether a value is a whole number of Python or NumPy.
+    """Return whether a value is a whole number of Python or NumPy.
 
     Args:
         value: Any value.
@@ -249,7 +249,7 @@ def is_whole(value: object) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a value is one real number of Python, NumPy or torch.
+    """Return whether a value is one real number of Python, NumPy or torch.
 
     Args:
         value: Any value.
@@ -265,7 +265,7 @@ def is_number(value: object) -> bool:
 
 
 def is_flag(value: object) -> bool:
-    """Tell whether a value is True or False, or the number 1 or 0.
+    """Return whether a value is True or False, or the number 1 or 0.
 
     Args:
         value: Any value.

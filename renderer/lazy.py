@@ -1,6 +1,6 @@
 """Imports the public names of a package when they are first used (PEP 562).
 
-The names stand once, as imports in the stub `__init__.pyi` beside the package's
+The names are listed only once, as imports in the stub `__init__.pyi` beside the package's
 `__init__.py`. Type checkers and editors read the same stub.
 """
 

@@ -189,8 +189,10 @@ class _Part:
     def read(self, photograph: Array, beyond: int | None) -> Array:
         """Return the pixels of a photograph (H, W, C) in this part.
 
-        Pixels beyond the photograph have the value `beyond`, or that of the nearest
-        pixel if it is None.
+        Args:
+            photograph: Photograph, shape (H, W, C).
+            beyond: Value of pixels beyond the photograph. None for the value of
+                the nearest pixel.
         """
         height, width = photograph.shape[:2]
         columns = np.arange(self.left, self.right)

@@ -317,7 +317,7 @@ _CHECKS: dict[Any, Callable[[object], bool]] = {
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Tell whether a value is of an annotated type."""
+    """Return whether a value is of an annotated type."""
     check = _CHECKS.get(hint)
     if check is not None:
         return check(value)

@@ -71,7 +71,7 @@ def as_tensor(name: str, value: object) -> Tensor:
 
 
 def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
-    """Tell whether a value is a list or tuple of at least one tensor, and of tensors only."""
+    """Return whether a value is a list or tuple of at least one tensor, and of tensors only."""
     if not isinstance(value, list | tuple) or not value:
         return False
     return all(isinstance(item, Tensor) for item in value)

@@ -597,11 +597,11 @@ def fooled_in_views(
 ) -> Tensor:
     """Decide which views count as a success.
 
-    Attacks, their checks, sweeps, transfers and files all decide by this
-    function. A view counts if it reaches the criterion as it is and in each of the
-    images that a camera stores of it (`augment.attacks.eot.stored`). An example
-    has the same noise wherever it is counted under a seed, so that a search
-    with many tries does not draw the noise again.
+    Attacks, their checks, sweeps, transfers and files all use this function. A
+    view is a success if it meets the criterion without noise and in each image
+    that a camera stores (`augment.attacks.eot.stored`). The noise of an example
+    depends only on the seed and its index. A search with many tries therefore
+    cannot succeed by drawing the noise again.
 
     Args:
         model: Classifier with its preprocessing. It maps images (N, 3, H, W) in
@@ -611,12 +611,12 @@ def fooled_in_views(
         examples: Indices of the A examples, on which their noise depends,
             shape (A,), int64.
         criterion: Source and target classes of the A examples.
-        settings: Settings of the attack. With `sensor_noise=0`, the images as
-            they are decide.
+        settings: Settings of the attack. With `sensor_noise=0`, only the images
+            without noise count.
         seed: Seed of the noise.
 
     Returns:
-        Whether each view counts, shape (A, V), bool, on the device of
+        Mask of the views that are a success, shape (A, V), on the device of
         `predicted`.
     """
     fooled = criterion.reached_in_views(predicted)

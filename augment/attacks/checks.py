@@ -139,10 +139,10 @@ def warnings(checks: Mapping[str, Any]) -> list[str]:
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
     """Search norm-balls around the start of an attack, from the smallest to the largest.
 
-    Each ball is searched by descent and at random. A success at one radius
-    counts at all larger radii. Only the other examples are attacked again, from
-    where they ended at the radius before, for `max_steps` more steps, and get
-    as many uniform draws.
+    Each ball is searched by descent and by uniform random draws. A success at
+    one radius counts at all larger radii. The remaining examples are attacked
+    again at the next radius. They start from their values at the previous
+    radius, take `max_steps` more steps, and get as many random draws.
 
     Args:
         result: The result of `augment.attack`.

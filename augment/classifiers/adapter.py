@@ -530,7 +530,7 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
 
 
 def _are_indices(classes: Sequence[str]) -> bool:
-    """Tell whether the names of classes are "0", "1" and so on."""
+    """Return whether the names of classes are "0", "1" and so on."""
     return [*classes] == [str(index) for index in range(len(classes))]
 
 

@@ -195,7 +195,7 @@ def device_of(network: object) -> torch.device:
 
 @contextmanager
 def gradient_flags_kept(network: object) -> Iterator[None]:
-    """Let the parameters of a network require gradients as before, when the block ends.
+    """Restore `requires_grad` of a network's parameters at the end of a `with` block.
 
     Args:
         network: A module. Other values are ignored.

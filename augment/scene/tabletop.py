@@ -201,10 +201,10 @@ def _from_local_lights(
 def _blocked_sky(
     room: Room, seen: _SeenPoints, normals: Tensor, directions: Tensor, radiance: Tensor
 ) -> Tensor:
-    """Return the irradiance that the object takes from the seen points, shape (P, 3).
+    """Return the irradiance of the sky that the object blocks at the seen points, shape (P, 3).
 
-    The points have one sample per pixel. The directions (2, D, 3) are those of table and wall,
-    and the radiance (2, D, 3) of each is weighted for its part of the irradiance.
+    There is one point per pixel. The sky is sampled in D directions for the table and for the
+    wall, shape (2, D, 3). The radiance, shape (2, D, 3), contains the weight of each direction.
     """
     points = seen.points[0]
     is_on_wall = seen.is_on_wall[0]

@@ -68,7 +68,7 @@ class View:
 
 @dataclass(frozen=True)
 class Setup:
-    """What a benchmark works on.
+    """Options, classifier and scene of a benchmark.
 
     Attributes:
         options: Parsed command line.

@@ -83,7 +83,13 @@ def format_counts(hits: int, n: int) -> str:
 
 
 def format_percentages(value: float, low: float, high: float) -> str:
-    """Write a fraction and the ends of its interval in percent, such as "89 % [81, 94]"."""
+    """Write a fraction and the ends of its interval in percent, such as "89 % [81, 94]".
+
+    Args:
+        value: Fraction in [0, 1].
+        low: Lower end of its interval.
+        high: Upper end of its interval.
+    """
     return f"{100 * value:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
 
 
@@ -326,7 +332,13 @@ def draw_norm_balls(records: Sequence[Row], path: Path) -> None:
 
 
 def draw_space(axes: Axes, space: str, balls: Sequence[Row]) -> None:
-    """Draw the fraction of successes in the balls of a space with Wilson intervals."""
+    """Draw the fraction of successes in the balls of a space with Wilson intervals.
+
+    Args:
+        axes: Axes to draw on.
+        space: Name of the attacked space, such as "lighting".
+        balls: One row for each radius.
+    """
     radii = [ball["radius"] for ball in balls]
     for method in ("adversarial", "random", "search"):
         rates = [tables.fraction(ball[method], ball["n"]) for ball in balls]

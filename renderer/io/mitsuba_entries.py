@@ -109,7 +109,16 @@ def sensor(
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
-    """Describe a camera of the renderer, see `sensor`."""
+    """Describe a camera of the renderer, see `sensor`.
+
+    Args:
+        camera: Camera to describe.
+        size: Pixels per side of the image.
+        pixel_format: Channels of the image, such as "rgba".
+
+    Returns:
+        The sensor as a dictionary for Mitsuba.
+    """
     if isinstance(camera, PerspectiveCamera):
         film_center = (-camera.principal_right / 2, camera.principal_up / 2)
         pose = pose_of(camera)

@@ -397,7 +397,16 @@ class SplitLight(NamedTuple):
 
 
 def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
-    """Divide coefficients (size, 3) of a basis into environment light and local lights."""
+    """Divide coefficients (size, 3) of a basis into environment light and local lights.
+
+    Args:
+        basis: Basis of all lights.
+        coefficients: Coefficients of the basis, shape (size, 3).
+
+    Returns:
+        The coefficients of the environment light, and each local light with its
+        coefficients.
+    """
     environment = basis.environment
     return SplitLight(
         environment=None if environment is None else coefficients[environment.rows],

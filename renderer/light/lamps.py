@@ -1,4 +1,4 @@
-"""Lamps: points that shine all around, or discs that throw soft shadows."""
+"""Lamps: points that emit in all directions, or discs that cast soft shadows."""
 
 from __future__ import annotations
 

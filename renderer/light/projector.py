@@ -91,7 +91,16 @@ class Projector(LocalBasis):
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find one path for each point within the pattern."""
+        """Find one path for each point within the pattern.
+
+        Args:
+            points: Points of surfaces, shape (N, 3).
+            normals: Unit normals at the points, shape (N, 3).
+            positions: Not used, because a projector cannot be moved.
+
+        Returns:
+            Paths from pixels of the pattern to points.
+        """
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]
         right, up, back = ((points - source) @ axes.T).unbind(1)

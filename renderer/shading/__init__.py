@@ -1,1 +1,1 @@
-"""How a surface reflects light: diffuse shading, gloss and its lobes."""
+"""Reflection of light by surfaces: diffuse shading, gloss and its lobes."""

@@ -1,1 +1,1 @@
-"""What surfaces are made of: albedo, textures, and the reflectance of rough materials."""
+"""Albedo, textures, and the reflectance of rough materials."""

@@ -1,1 +1,1 @@
-"""What a camera sees: rasterizers, the samples of each face, and the edges of what is seen."""
+"""Visible surfaces: rasterizers, the samples of each face, and silhouette edges."""

@@ -242,7 +242,7 @@ def _warn_once(text: str) -> None:
 
 
 def is_hidden(name: str) -> bool:
-    """Say whether a file or folder belongs to the system rather than to the user.
+    """Return whether a file or folder belongs to the system rather than to the user.
 
     Args:
         name: The name of the file or folder.

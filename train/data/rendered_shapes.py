@@ -48,7 +48,7 @@ def load_shapes(
     seed: int,
     cache: TensorCache | None = None,
 ) -> DataSet:
-    """Render images of every solid in even light, or read them from a cache.
+    """Render images of every solid in soft front lighting, or read them from a cache.
 
     Args:
         train: The number of training images of each class. An instance of a solid has 20.

@@ -1,1 +1,1 @@
-"""What Python callers do with a network: load, evaluate, audit and harden it."""
+"""Functions for any network: `load`, `evaluate`, `audit` and `harden`."""

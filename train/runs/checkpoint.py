@@ -92,7 +92,7 @@ def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def exists(folder: Path) -> bool:
-    """Say whether a folder holds a checkpoint to resume from."""
+    """Return whether a folder holds a checkpoint to resume from."""
     return any((folder / name).exists() for name in (LAST, PREVIOUS))
 
 

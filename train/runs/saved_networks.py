@@ -150,7 +150,7 @@ def of_one_architecture(path: Path) -> Iterator[None]:
 
 
 def is_classifier(name: str) -> bool:
-    """Say whether `train.init_from` names a classifier, rather than a run or a file.
+    """Return whether `train.init_from` names a classifier, rather than a run or a file.
 
     Args:
         name: The name.

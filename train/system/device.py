@@ -149,7 +149,7 @@ def _has_depthwise_layer(network: nn.Module | None) -> bool:
 
 
 def _computes_in_bfloat16() -> bool:
-    """Say whether this CPU has instructions for bfloat16."""
+    """Return whether this CPU has instructions for bfloat16."""
     if platform.machine() in ("x86_64", "AMD64"):
         return torch.cpu._is_avx512_bf16_supported()
     return torch.ops.mkldnn._is_mkldnn_bf16_supported()
@@ -178,7 +178,7 @@ class MixedPrecision(nn.Module):
 
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
-    """Say whether to compile the passes of a network.
+    """Return whether to compile the passes of a network.
 
     Args:
         choice: "always", "never", or "auto". "auto" compiles on one GPU if torch.compile works

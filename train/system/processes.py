@@ -140,7 +140,7 @@ class SignalHandler:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:
-        """Say whether to stop now, since a process of the run got a signal.
+        """Return whether to stop now because a process of the run got a signal.
 
         Several processes tell each other without waiting. They hear of a signal that came before
         they were asked the last time.

@@ -109,7 +109,7 @@ class Averages:
             self._soup.update_parameters(self._ema.module if self._ema else self._model)
 
     def is_kept(self, accuracy: float) -> bool:
-        """Say whether the selected network replaces the one that was kept before.
+        """Return whether the selected network replaces the one that was kept before.
 
         Args:
             accuracy: Its accuracy on the validation images, between 0 and 1.

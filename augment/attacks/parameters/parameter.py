@@ -22,7 +22,7 @@ class Parameter(ABC):
     constructor of a subclass computes the values at which an attack starts. The
     subclass defines `apply`, which puts values into the conditions under which
     a scene is rendered. If not all values are feasible, it also overrides
-    `domain`.
+    `project_feasible`.
 
     Attributes:
         name: Name of the quantity in settings, messages and files.
