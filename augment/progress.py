@@ -26,11 +26,11 @@ def progress(
 ) -> Iterator[Item]:
     """Yield items, and show on the standard error stream how many of them are done.
 
-    The first sign comes after `PATIENCE` seconds, also before the first item is
-    done. On a terminal, it is a bar. Elsewhere it is a line that comes again,
-    each time after twice as long, up to `LONGEST_WAIT` seconds. It tells how
-    many items are done and how much time is left. Of several processes, only
-    the first one shows progress.
+    Progress is shown after `PATIENCE` seconds, even if no item is done by then.
+    A terminal shows a bar. Other streams get a line with the number of items and
+    the remaining time. The line is repeated after intervals that double up to
+    `LONGEST_WAIT` seconds. If there are several processes, only the first one
+    shows progress.
 
     Args:
         items: The items.

@@ -499,7 +499,7 @@ def _explain_choice(file: str) -> str:
 
 
 def _explain_overflow(words: Sequence[str]) -> str | None:
-    """Explain a whole number that no float holds."""
+    """Return an error message if a word is a whole number that is too large for a float."""
     for word in words:
         key, _, value = word.partition("=")
         if value.lstrip("-").isdigit() and len(value) > MAX_DIGITS:

@@ -50,7 +50,7 @@ from renderer.validation import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# This name stands in place of a target class.
+# Value of `target` for the class with the lowest confidence.
 LEAST_LIKELY = "least_likely"
 # Pixels per side of the ball that shows the light.
 BALL_SIZE = 96
@@ -158,9 +158,10 @@ class AttackResult:
         return self.problem.conditions(self.descent.values, self.problem.all_examples)
 
     def plot(self, example: int = 0, view: int = 0) -> Figure:
-        """Draw one view: before, the light after the attack, after, and the probabilities.
+        """Draw a view of an example as a figure with four parts.
 
-        The light is shown as a white ball in it.
+        They are the image before the attack, a white ball in the attacked
+        light, the image after the attack, and the probabilities of classes.
 
         Args:
             example: Index of the example.
@@ -526,7 +527,9 @@ def target_labels(
     indices = [class_index(classifier.classes, name, f"target={name}") for name in names]
     labels = torch.tensor(indices, device=logits.device).expand(len(logits), view_count)
     if torch.eq(labels, source).any():
-        raise InputError(f"target={target} is the right class of an example: name another class")
+        raise InputError(
+            f"target={target} is the true class of an example: choose another target class"
+        )
     return labels
 
 

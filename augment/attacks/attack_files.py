@@ -176,7 +176,8 @@ def _versions(
     Args:
         result: The attack.
         paths: Folder of each example.
-        renderers: Renderers that render the examples again from these folders.
+        renderers: Names of the renderers that render the examples again from
+            these folders.
     """
     images = result.images.cpu()
     versions = {

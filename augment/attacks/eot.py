@@ -162,7 +162,7 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
 
 
 def _moved(images: Tensor, movements: Tensor) -> Tensor:
-    """Shift, rotate and scale images. Pixels from outside repeat the border.
+    """Shift, rotate and scale images. Pixels beyond the border repeat it.
 
     Args:
         images: Images, shape (N, 3, H, W).

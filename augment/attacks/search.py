@@ -37,7 +37,7 @@ LIGHT_GRAY = 0.9
 # Exposures that are tried, as factors of the exposure of the scene.
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
 
-# Confidence in every image at which the search ends.
+# The search ends when the confidence is at least this high in all images.
 CONFIDENCE_TO_STOP = 0.5
 
 Settings = TypeVar("Settings", bound=SceneSettings)
@@ -140,9 +140,9 @@ def _best_light(
 
 
 def _under_lights(scene: Scene, skies: Tensor) -> Scene:
-    """Return the examples of a scene under each environment light (N, coefficients, 3) in turn.
+    """Return a scene with N copies of the examples, one for each environment light.
 
-    Projector and lamps stay as they are.
+    The lights have shape (N, K, 3). Projector and lamps do not change.
     """
     count = len(skies)
     sky = skies.repeat_interleave(len(scene), dim=0).to(scene.lights.device)

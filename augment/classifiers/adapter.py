@@ -515,12 +515,13 @@ def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:
     if name in classes:
         return classes.index(str(name))
     text = str(name)
-    if isinstance(name, str) and not name.isdecimal() and _are_indices(classes):
+    is_index = text.isascii() and text.isdecimal()
+    if isinstance(name, str) and not is_index and _are_indices(classes):
         remedy = f"give an index from 0 to {len(classes) - 1}, or name the classes"
         raise InputError(
             f"{subject}: {name!r} is a name, but the classes have only indices: {remedy}"
         )
-    if text.isascii() and text.isdecimal():
+    if is_index:
         if int(text) < len(classes):
             return int(text)
         indices = f"indices go from 0 to {len(classes) - 1}"

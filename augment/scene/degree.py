@@ -35,7 +35,8 @@ NOTICED = 0.05
 # The lowest degree that shades the sides of an object about right. The irradiance of a point
 # source is off by 0.09 for this degree, and by 0.42 or more for lower degrees.
 SHADED = 2
-# Beyond this degree, the irradiance of no lighting is off by more than `NOTICED`.
+# Degree of the reference for irradiance errors. At higher degrees, the irradiance of
+# every lighting differs from it by less than `NOTICED`.
 COMPARED = 8
 # The roughness that stands for surfaces without gloss.
 MATTE = 1.0

@@ -33,8 +33,8 @@ from train.settings import CIRCUMSTANCES, INPUTS, ExperimentSettings, dotted, ma
 CONFIG = "config.yaml"
 # Packages whose versions config.yaml records, in addition to Python and torch.
 PACKAGES = ("torchvision", "numpy")
-# Overrides that a recorded command lacks. They name the folder of the run, and
-# a command that resumes a run sets them anew.
+# Settings that are not recorded with the command of a run, because each command
+# that resumes the run sets them.
 NOT_RECORDED = ("run=", "train.resume=")
 
 

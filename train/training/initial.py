@@ -149,7 +149,7 @@ def _classifier(settings: ExperimentSettings, name: str) -> Initial:
 
 
 def initial_of(classifier: Classifier, size: int | None) -> Initial:
-    """Make the network that a run begins with of a classifier that has no name to build it by.
+    """Create the initial network of a run from a classifier in memory.
 
     Args:
         classifier: The classifier.

@@ -500,11 +500,11 @@ class Trainer:
             self._under_way = self._restored_epoch(state["under_way"])
 
     def _restored_epoch(self, state: Mapping[str, Any]) -> EpochState:
-        """Restore an epoch that had begun."""
+        """Restore the state within an epoch."""
         images = to_unit(state["images"]).to(self.device)
         labels = state["labels"].to(self.device)
         renders = Renders(images, labels, state["diagnostics"][-1])
-        # The sums are over all processes, so that one process counts them.
+        # The sums are over all processes. Only one process may add them.
         sums = state["sums"].to(self.device) * (distributed.rank() == 0)
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 

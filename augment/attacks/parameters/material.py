@@ -68,7 +68,7 @@ class Material(Parameter):
         # Shape (objects, 3).
         self._average_gloss = torch.stack(averages).to(scene.lights)
         if all(material.is_uniform() for material in materials):
-            # A single row then stands for all faces, which saves memory.
+            # One row then replaces the rows of all faces, which saves memory.
             materials = [material.first_face() for material in materials]
         # Shapes (objects, F, 3) and (objects, F), or F = 1 for a single row.
         face_gloss = _stack_padded([material.face_gloss for material in materials])

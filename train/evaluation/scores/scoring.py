@@ -352,15 +352,15 @@ def operating_points(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def describe_point(point: Mapping[str, Any]) -> str:
-    """Say at which false-positive rate, and on which images, an operating point was chosen.
+    """Describe the false-positive rate and the images for which an operating point was chosen.
 
     Args:
         point: Entry `operating_point` of a summary.
 
     Returns:
-        Text such as "5.0% FPR on photographs, 120 others".
+        Text such as "5.0% FPR on photographs, 120 negatives".
     """
-    images = f"{point['folder']}, {point['negatives']} others"
+    images = f"{point['folder']}, {point['negatives']} negatives"
     if point.get("in_sample"):
         images = "these very images, in-sample"
     return f"{point['false_positive_rate']:.1%} FPR on {images}"
@@ -430,7 +430,9 @@ def _ranked_table(scores: Scores) -> Table:
     auc = scores.overall.auc
     resampled = "images"
     if auc.has_repeated_objects:
-        counts = f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} others"
+        counts = (
+            f"{auc.positive_objects} of {scores.label} and {auc.negative_objects} hard negatives"
+        )
         resampled = f"objects and images ({counts})"
     rows = []
     for title, metrics in _rows_of(scores):
