@@ -10,8 +10,9 @@ from torch import Tensor
 
 import augment
 from augment.attacks.attack import AttackResult, fooled_in_views
-from augment.attacks.descent import Criterion, descend
+from augment.attacks.descent import Criterion
 from augment.attacks.eot import NOISE_DRAWS, stored
+from augment.attacks.optimizers import descend
 from augment.losses import NO_CLASS
 from augment.service import Renders
 from augment.settings import TrainingAttackSettings
