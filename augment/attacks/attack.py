@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from numbers import Integral
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,11 +37,13 @@ from augment.random_streams import generator
 from augment.scene.conditions import Conditions
 from augment.scene.degree import NOTICED, with_needed_degree
 from augment.scene.scene import Scene
-from renderer.errors import InputError, is_whole, require_range
+from renderer.errors import InputError, is_whole, require_choice, require_range
+from renderer.io.images import write_image
 from renderer.light.harmonics import irradiance_error
 from renderer.rendering import light_sphere
 from renderer.validation import (
     as_list,
+    as_path,
     require_flag,
     require_kind,
     require_seed,
@@ -54,6 +57,9 @@ if TYPE_CHECKING:
 LEAST_LIKELY = "least_likely"
 # Pixels per side of the ball that shows the light.
 BALL_SIZE = 96
+# Formats of animations, and their largest number of frames.
+ANIMATION_SUFFIXES = (".gif", ".webp")
+MAX_FRAME_COUNT = 1000
 
 
 @dataclass(frozen=True)
@@ -176,9 +182,7 @@ class AttackResult:
         # Importing matplotlib takes half a second.
         from augment.attacks.plots import draw_attack
 
-        example_count, view_count = self.images.shape[:2]
-        _require_index("example", example, example_count)
-        _require_index("view", view, view_count)
+        self._require_view(example, view)
         conditions = self.conditions
         basis = self.problem.scene.basis_under(conditions, example)
         before = self.logits_before[example, view].softmax(0)
@@ -191,6 +195,57 @@ class AttackResult:
             after.cpu(),
             self.classifier.classes,
         )
+
+    def save_animation(
+        self, path: str | Path, example: int = 0, view: int = 0, frame_count: int = 20
+    ) -> None:
+        """Save how one view changes from the scene's light to the adversarial light.
+
+        Every frame shows the image, its predicted class with its probability,
+        and a white ball in the light. The values that the attack found (light,
+        shape, colors or pose) are interpolated linearly, so the frames between
+        the first and the last are not steps of the descent.
+
+        Args:
+            path: File to write, with the suffix .gif or .webp.
+            example: Index of the example.
+            view: Index of the view.
+            frame_count: Number of frames, from 2 to 1000. With 20 frames, the
+                file has at most 2 MB.
+
+        Raises:
+            InputError: If the suffix is another, or if there is no such example
+                or view.
+            OSError: If the file cannot be written.
+
+        Example:
+            >>> import norm_balls as nb
+            >>> def logits(images):
+            ...     mean = images.mean((1, 2, 3))
+            ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
+            >>> scene = nb.build_scene([("solid:orange", "0")], 8)
+            >>> settings = nb.AttackSettings(lighting=nb.StepSettings(step_size=0.5), max_steps=2)
+            >>> result = nb.attack(logits, scene, settings=settings)
+            >>> result.save_animation("attack.gif", frame_count=4)
+            >>> Path("attack.gif").exists()
+            True
+        """
+        from augment.attacks.animation import draw_frames, frame_times
+
+        path = as_path("path", path)
+        require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
+        self._require_view(example, view)
+        require_whole("frame_count", frame_count)
+        require_range("frame_count", frame_count, 2, MAX_FRAME_COUNT)
+        first, *others = draw_frames(self, example, view, frame_count)
+        times = frame_times(frame_count)
+        write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
+
+    def _require_view(self, example: int, view: int) -> None:
+        """Raise InputError if there is no such example or view."""
+        example_count, view_count = self.images.shape[:2]
+        _require_index("example", example, example_count)
+        _require_index("view", view, view_count)
 
     def _repr_png_(self) -> bytes:
         """Draw the first view of the first example, which notebooks show."""

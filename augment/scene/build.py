@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError, as_device, describe, require_bounded
-from renderer.geometry.mesh import Mesh, normalize, require_mesh, subdivide
+from renderer.geometry.mesh import Mesh, require_mesh, subdivide
 from renderer.io.images import gray_or_image
 from renderer.light.basis import Basis, LocalBasis, with_local_lights
 from renderer.light.harmonics import degree_of
@@ -46,6 +47,8 @@ def build_scene(
     size: int,
     views: int = 1,
     *,
+    cameras: Sequence[Camera] | None = None,
+    normalize: bool = True,
     shared: bool = False,
     scene: SceneSettings | None = None,
     renderer: RendererSettings | None = None,
@@ -61,6 +64,14 @@ def build_scene(
             `ObjectSettings`. A mesh is a file, solid:NAME or a `Mesh`.
         size: Pixels per side of the images.
         views: Number of cameras on the circle.
+        cameras: Cameras of every mesh instead of a circle, such as those of
+            `renderer.load_cameras`. They replace `views`.
+        normalize: Whether the cameras see each mesh moved to the origin and
+            scaled to span [-1, 1]. If False, they see it where it is, in the
+            units of its file. The scene then moves and scales the cameras with
+            the mesh, so that lengths in settings (such as positions of lamps and
+            shifts of poses) always have the object's center as their origin and
+            its `SceneObject.extent` as their unit.
         shared: Whether the views of an object in front of a background are one
             example, whose lighting, shape and colors an attack changes for all
             views. By default, each view is an example.
@@ -87,11 +98,25 @@ def build_scene(
         >>> scene = build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], samples=1)
         >>> len(scene), scene.labels[0]
         (12, 'orange')
+
+        A mesh and cameras in world units, as photogrammetry gives them:
+
+        >>> import norm_balls as nb
+        >>> mesh = nb.solid("orange")
+        >>> placed = replace(mesh, vertices=mesh.vertices + [10.0, 0.0, 0.0])
+        >>> view = [[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 15], [0, 0, 0, 1]]
+        >>> camera = nb.PinholeCamera.from_matrix(view, [[40, 0, 16], [0, 40, 16], [0, 0, 1]], 32)
+        >>> scene = nb.build_scene([(placed, "orange")], 32, cameras=[camera], normalize=False)
+        >>> [round(value, 3) for value in scene.objects[0].center]
+        [10.0, 0.0, 0.0]
     """
     require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
     require_kind("renderer", renderer, RendererSettings | None, "RendererSettings(...) or None")
     require_flag("shared", shared)
     require_whole("views", views)
+    require_flag("normalize", normalize)
+    given_cameras = _as_cameras(cameras, views, normalize)
+    views = len(given_cameras) or views
     ImageSettings(size)
     _require_known(options)
     members = _as_meshes(meshes)
@@ -126,12 +151,13 @@ def build_scene(
     rasterizer = renderer_settings.rasterizer
     return Scene.grid(
         objects,
-        _place_cameras(scene_settings, views),
+        given_cameras or _place_cameras(scene_settings, views),
         load_backgrounds(scene_settings.backgrounds, size),
         lights.to(as_device(device)),
         renderer_settings.image(size),
         choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
         shared=shared,
+        placed=not normalize,
         basis=basis,
         lights_of_degree=lights_of_degree,
     )
@@ -173,8 +199,29 @@ def _load_member(
         return load_object(member, vertices)
     mesh, label = member
     if isinstance(mesh, Mesh):
-        return SceneObject(str(label), normalize(subdivide(mesh, vertices)))
+        return SceneObject.from_mesh(str(label), subdivide(mesh, vertices))
     return load_object(ObjectSettings(str(mesh), str(label)), vertices)
+
+
+def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
+    """Check the cameras of `build_scene`, and return them as a list, which is empty for None."""
+    if cameras is None:
+        if not normalize:
+            raise InputError(
+                "normalize=False needs cameras: give cameras=[...] of the mesh's world"
+            )
+        return []
+    expected = "a list of cameras, such as list(renderer.load_cameras(path).values())"
+    given = as_list("cameras", cameras, Camera, expected)
+    if not given:
+        raise InputError(f"cameras is empty: give {expected}")
+    if views not in (1, len(given)):
+        raise InputError(f"views={views} does not fit {len(given)} cameras: leave views out")
+    fixed = [camera.fixed() for camera in given]
+    if not normalize:
+        return fixed
+    # The scene turns all cameras about the origin.
+    return [camera.normalized(np.zeros(3), 1.0) for camera in fixed]
 
 
 def _place_cameras(settings: SceneSettings, count: int) -> list[Camera]:

@@ -10,8 +10,16 @@ from functools import cached_property
 import numpy as np
 
 from augment.settings import MeshSettings, ObjectSettings, PropSettings, require_color
+from renderer.camera import Camera
 from renderer.errors import InputError
-from renderer.geometry.mesh import Mesh, concatenate, normalize, select_faces, subdivide
+from renderer.geometry.mesh import (
+    Mesh,
+    center_and_extent,
+    concatenate,
+    normalize,
+    select_faces,
+    subdivide,
+)
 from renderer.geometry.shapes import solid
 from renderer.shading.gloss import Gloss
 
@@ -34,6 +42,10 @@ class SceneObject:
         own: Number of the object's own faces. None if all faces are its own.
         props: Meshes of the props, which stand on z = 0.
         ground: Color of the table, or None without a table.
+        center: Point of the mesh as it was given that is the origin of `mesh`,
+            shape (3,).
+        extent: Length in the mesh as it was given that is 1 in `mesh`. A vertex v
+            of `mesh` lies at center + extent · v.
     """
 
     label: str
@@ -43,6 +55,29 @@ class SceneObject:
     own: int | None = None
     props: Sequence[Mesh] = ()
     ground: Sequence[float] | None = None
+    center: Sequence[float] = (0.0, 0.0, 0.0)
+    extent: float = 1.0
+
+    @classmethod
+    def from_mesh(
+        cls, label: str, given: Mesh, albedo_scale: float = 1.0, name: str = "the mesh"
+    ) -> SceneObject:
+        """Create an object from a mesh of any size at any place.
+
+        Args:
+            label: Name of its class.
+            given: The mesh. The object has a copy that is moved and scaled to
+                span [-1, 1].
+            albedo_scale: Factor of the albedo of all faces.
+            name: Name of the object in messages.
+
+        Returns:
+            The object, without props and table.
+        """
+        mesh = normalize(given)
+        center, extent = center_and_extent(given)
+        place = tuple(center.tolist())
+        return cls(label, mesh, albedo_scale, name, center=place, extent=float(extent))
 
     @property
     def own_faces(self) -> np.ndarray:
@@ -68,6 +103,19 @@ class SceneObject:
         """Return the height z of the lowest vertex, at which a table is placed."""
         heights = self.mesh.vertices[:, 2]
         return float(heights[self.mesh.faces].min())
+
+    def move_cameras(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+        """Move and scale cameras as the given mesh was moved and scaled to the object's mesh.
+
+        Args:
+            cameras: Cameras of the given mesh.
+
+        Returns:
+            Cameras that show the object's mesh as the others show the given
+            mesh.
+        """
+        center = np.array(self.center)
+        return tuple(camera.normalized(center, 1 / self.extent) for camera in cameras)
 
     def joined(self, others: Sequence[Mesh]) -> SceneObject:
         """Append other meshes to the mesh of the object.
@@ -103,8 +151,8 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
         >>> load_object(ObjectSettings("solid:orange", "orange")).label
         'orange'
     """
-    mesh = normalize(subdivide(_load(item), vertices))
-    loaded = SceneObject(item.label, mesh, item.albedo_scale, item.mesh)
+    mesh = subdivide(_load(item), vertices)
+    loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
     return with_props(loaded, [_load_prop(prop) for prop in item.props])
 
 

@@ -176,6 +176,7 @@ class Scene:
         backgrounds: Tensor,
         *of_scene: Any,
         shared: bool = False,
+        placed: bool = False,
         **options: Any,
     ) -> Scene:
         """Build a scene of every object from every camera over every background, in that order.
@@ -187,18 +188,20 @@ class Scene:
             of_scene: Further arguments of `Scene`, by position.
             shared: Whether the cameras are the views of one example, which share one light and
                 one shape. Otherwise each camera makes an example of its own.
+            placed: Whether the cameras see each object where its mesh was given, and not as it is
+                after normalization. They are then moved and scaled with each object.
             options: Further arguments of `Scene`, by name.
 
         Returns:
             The scene.
         """
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
-        examples = [
-            Example(number, view, background)
-            for number, view, background in product(
-                range(len(objects)), views, range(len(backgrounds))
-            )
-        ]
+        examples = []
+        for number, view, background in product(
+            range(len(objects)), views, range(len(backgrounds))
+        ):
+            seen = objects[number].move_cameras(view) if placed else view
+            examples.append(Example(number, seen, background))
         return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def changed(self, **arguments: Any) -> Scene:

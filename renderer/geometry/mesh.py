@@ -407,18 +407,35 @@ def normalize(mesh: Mesh) -> Mesh:
         1.0
     """
     require_mesh("mesh", mesh)
-    areas = mesh.face_areas()
-    if not areas.sum() > 0:
-        raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
-    centroids = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
-    center = np.average(centroids, axis=0, weights=areas)
+    center, largest = center_and_extent(mesh)
     centered = mesh.vertices - center
-    largest = np.abs(centered).max()
     scaled = (centered / largest).astype(np.float32).astype(np.float64)
     matrix = np.eye(4)
     matrix[:3] = np.column_stack([np.eye(3), -center]) / largest
     skin = mesh.skin and mesh.skin.transformed(matrix)
     return replace(mesh, vertices=scaled, skin=skin)
+
+
+def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
+    """Return the center and the extent that `normalize` brings to the origin and to 1.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        A tuple of
+        - the centroid of the faces, weighted with their areas, shape (3,);
+        - the largest difference of a coordinate from the centroid.
+
+    Raises:
+        InputError: If the surface has no area.
+    """
+    areas = mesh.face_areas()
+    if not areas.sum() > 0:
+        raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
+    centroids = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
+    center = np.average(centroids, axis=0, weights=areas)
+    return center, np.abs(mesh.vertices - center).max()
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:

@@ -4,10 +4,13 @@ import io
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
+from PIL import Image, ImageSequence
 
 import augment
 import renderer
+from augment.attacks.animation import SIDE
+from renderer.io.tiles import MARGIN
 from tests.helpers import bright_or_dark
 
 SIZE = 8
@@ -47,6 +50,38 @@ def test_the_bars_are_the_probabilities_before_and_after(result):
 def test_a_notebook_shows_a_result_as_a_picture(result):
     picture = Image.open(io.BytesIO(result._repr_png_()))
     assert picture.format == "PNG" and picture.width > picture.height
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+def test_an_animation_shows_the_images_from_before_to_after(result, tmp_path, suffix):
+    """The means of the images are compared, since the formats compress with a loss."""
+    path = tmp_path / f"attack.{suffix}"
+    result.save_animation(path, example=1, frame_count=5)
+    means = []
+    with Image.open(path) as animation:
+        for frame in ImageSequence.Iterator(animation):
+            pixels = np.asarray(frame.convert("RGB"), dtype=float) / 255
+            means.append(pixels[MARGIN : MARGIN + SIDE, MARGIN : MARGIN + SIDE].mean())
+    assert len(means) == 5
+    values = [result.images_before[1, 0], result.images[1, 0]]
+    expected = [float(image.mean()) for image in values]
+    assert [means[0], means[-1]] == pytest.approx(expected, abs=0.01)
+    # The light is interpolated linearly, and so is an image in light alone.
+    assert means[2] == pytest.approx((means[0] + means[4]) / 2, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("path", {"path": "attack.mp4"}),
+        ("frame_count", {"frame_count": 1}),
+        ("example", {"example": 2}),
+        ("view", {"view": 1}),
+    ],
+)
+def test_wrong_animations_are_refused(result, tmp_path, name, arguments):
+    with pytest.raises(renderer.InputError, match=f"^{name}"):
+        result.save_animation(**{"path": tmp_path / "attack.gif"} | arguments)
 
 
 @pytest.mark.parametrize(("example", "view"), [(2, 0), (-1, 0), (0, 1), (0.5, 0)])
