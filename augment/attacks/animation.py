@@ -1,19 +1,14 @@
-"""Draws an attack as an animation, from the light of the scene to the adversarial light."""
+"""Draws an attack as an animation: images and lights with captions, frame by frame."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.attack import logits_of
 from renderer.io.tiles import PAPER, Tile, draw_grid, tiles_of
-from renderer.rendering import light_sphere
-
-if TYPE_CHECKING:
-    from augment.attacks.attack import AttackResult
 
 # Pixels per side of the ball that shows the light. Smaller images are enlarged
 # by a whole factor to at least this width.
@@ -27,38 +22,21 @@ PAUSE = 1200
 
 
 def draw_frames(
-    result: AttackResult, example: int, view: int, frame_count: int
+    images: Sequence[Tensor], balls: Sequence[Tensor], captions: Sequence[str]
 ) -> list[Image.Image]:
-    """Draw one view at equal steps from the values before the attack to the values after it.
+    """Draw frames of an image with its caption beside a ball in the light.
 
     Args:
-        result: Result of an attack.
-        example: Index of the example.
-        view: Index of the view.
-        frame_count: Number of frames, at least 2.
+        images: Image of each frame in [0, 1], shape (3, size, size) each.
+        balls: White ball in the light of each frame, shape (3, SIDE, SIDE) each.
+        captions: Line of text below each image.
 
     Returns:
-        Frames of the same size. The first and the last show the images of the
-        result.
+        Frames of the same size.
     """
-    problem = result.problem
-    start = problem.start
-    reached = result.descent.values.to(start)
-    row = problem.all_examples[[example]]
     frames = []
-    for index in range(frame_count):
-        fraction = index / (frame_count - 1)
-        values = start + fraction * (reached - start)
-        if index == 0:
-            image = result.images_before[example, view]
-        elif index == frame_count - 1:
-            image = result.images[example, view]
-        else:
-            image = problem.images(values, row)[0, view]
-        conditions = problem.conditions(values[row], row)
-        basis = problem.scene.basis_under(conditions, 0)
-        ball = light_sphere(conditions.light[0], SIDE, basis=basis)
-        frames.append(draw_grid([[_captioned(result, image), _tile(ball, "light")]]))
+    for image, ball, caption in zip(images, balls, captions, strict=True):
+        frames.append(draw_grid([[_tile(image, caption), _tile(ball, "light")]]))
     return _with_equal_sizes(frames)
 
 
@@ -69,14 +47,6 @@ def frame_times(frame_count: int) -> list[int]:
         frame_count: Number of frames, at least 2.
     """
     return [PAUSE, *[FRAME_TIME] * (frame_count - 2), PAUSE]
-
-
-def _captioned(result: AttackResult, image: Tensor) -> Tile:
-    """Return the tile of an image with its predicted class and the probability of this class."""
-    logits = logits_of(result.preprocessed_model, image[None, None], 1)[0, 0]
-    probability, index = logits.softmax(0).max(0)
-    name = result.classifier.classes[int(index)]
-    return _tile(image, f"{name} {float(probability):.0%}")
 
 
 def _tile(image: Tensor, caption: str) -> Tile:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings
+from augment.attacks import animation
 from augment.attacks.adversary import Adversary
 from augment.attacks.descent import Criterion, DescentResult
 from augment.attacks.eot import NOISE_DRAWS, preprocessed_model, stored
@@ -230,16 +231,42 @@ class AttackResult:
             >>> Path("attack.gif").exists()
             True
         """
-        from augment.attacks.animation import draw_frames, frame_times
-
         path = as_path("path", path)
         require_choice("path: its suffix", path.suffix.lower(), ANIMATION_SUFFIXES)
         self._require_view(example, view)
         require_whole("frame_count", frame_count)
         require_range("frame_count", frame_count, 2, MAX_FRAME_COUNT)
-        first, *others = draw_frames(self, example, view, frame_count)
-        times = frame_times(frame_count)
+        fractions = [index / (frame_count - 1) for index in range(frame_count)]
+        images = [self._image_between(fraction, example, view) for fraction in fractions]
+        balls = [self._ball_between(fraction, example) for fraction in fractions]
+        logits = logits_of(self.preprocessed_model, torch.stack(images)[:, None], 1)
+        found = predictions(logits[:, 0], self.classifier.classes)
+        pairs = zip(found["predicted"], found["confidence"], strict=True)
+        captions = [f"{name} {confidence:.0%}" for name, confidence in pairs]
+        first, *others = animation.draw_frames(images, balls, captions)
+        times = animation.frame_times(frame_count)
         write_image(path, first, save_all=True, append_images=others, duration=times, loop=0)
+
+    def _values_between(self, fraction: float) -> Tensor:
+        """Return values (E, D) at a fraction of the way from before the attack to after it."""
+        start = self.problem.start
+        return start + fraction * (self.descent.values.to(start) - start)
+
+    def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
+        """Render the image (3, size, size) of the values at a fraction of the way."""
+        if fraction == 0:
+            return self.images_before[example, view]
+        if fraction == 1:
+            return self.images[example, view]
+        row = self.problem.all_examples[[example]]
+        return self.problem.images(self._values_between(fraction), row)[0, view]
+
+    def _ball_between(self, fraction: float, example: int) -> Tensor:
+        """Render a white ball in the light of the values at a fraction of the way."""
+        row = self.problem.all_examples[[example]]
+        conditions = self.problem.conditions(self._values_between(fraction)[row], row)
+        basis = self.problem.scene.basis_under(conditions, 0)
+        return light_sphere(conditions.light[0], animation.SIDE, basis=basis)
 
     def _require_view(self, example: int, view: int) -> None:
         """Raise InputError if there is no such example or view."""
