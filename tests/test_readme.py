@@ -46,6 +46,7 @@ def test_every_block_of_python_is_run_here():
         "Attack a network",
         "Render",
         "Your own training loop",
+        "Your own cameras",
         "Many lights and views",
         "Load",
     }
@@ -63,6 +64,20 @@ def test_many_views_block_renders_each_view_and_light():
     assert names["own_images"].shape == (100, 3, 32, 32)
     assert names["lights"].grad.any()
     assert names["gradient"].any()
+
+
+def test_cameras_block_renders_and_builds_a_scene_of_the_camera_in_the_files(folder):
+    sphere = trimesh.creation.icosphere(2)
+    sphere.export(folder / "orange.ply")
+    (folder / "sparse").mkdir()
+    (folder / "sparse" / "cameras.txt").write_text("1 SIMPLE_PINHOLE 224 224 300 112 112\n")
+    # A camera without rotation looks along +z. The sphere is 4 units in front of it.
+    pose = "1 1 0 0 0 0 0 4 1 view.png\n\n"
+    (folder / "sparse" / "images.txt").write_text(pose)
+    names = run("Your own cameras")
+    assert names["images"].shape == (1, 3, 224, 224)
+    assert names["images"][0, :, 112, 112].min() > 0
+    assert len(names["scene"]) == 1
 
 
 def test_load_block_recognizes_an_orange(folder):

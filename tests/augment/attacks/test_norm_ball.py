@@ -186,7 +186,7 @@ def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
 
 
 def test_a_ball_without_a_radius_has_no_uniform_draw():
-    with pytest.raises(InputError, match="radius=None"):
+    with pytest.raises(InputError, match="radius is None"):
         sample(StepSettings(), torch.zeros(1, 2), torch.Generator())
 
 

@@ -463,17 +463,17 @@ def assert_rows_of_labels(folder: Path, scores: dict[str, float]) -> None:
     (_, scored, differences) = read_markdown(format_table([summarize(folder)])).values()
     *_, both, apple, pear = scored
     for row, name, part in [
-        (both, "random", ""),
-        (apple, "random, label=apple", "apple/"),
-        (pear, "random, label=pear", "pear/"),
+        (both, "after hardening", ""),
+        (apple, "after hardening, label=apple", "apple/"),
+        (pear, "after hardening, label=pear", "pear/"),
     ]:
         assert row[0] == name
         assert row[4].startswith(f"{scores[f'photographs/{part}auc']:.3f}")
     _, _, *labels = [row[0].rpartition(", ")[2] for row in differences]
     assert labels == ["label=apple", "label=pear"]
     page = write_report([folder], folder).read_text()
-    assert page.count("<td>random, label=pear</td>") == 1
-    assert "apple and pear, trained with renders" in page
+    assert page.count("<td>after hardening, label=pear</td>") == 1
+    assert "apple and pear" in page
 
 
 class TestARunFolder:

@@ -399,7 +399,7 @@ def format_overall(scores: Scores) -> str:
     """
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
-    title = f"{positives} images of {scores.label}, {negatives} of other things"
+    title = f"{positives} images of {scores.label}, {negatives} negatives"
     rows = []
     for table in (_counted_table(scores), _ranked_table(scores)):
         rows += list(zip(table.header[1:], table.rows[0][1:], strict=True))
