@@ -45,7 +45,7 @@ def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
 def require_same_camera(found: Camera, expected: Camera) -> None:
     """Require axes within 1°, and a size and a position within 1 % of the image."""
     cosines = (found.axes() * expected.axes()).sum(1)
-    assert min(cosines) > math.cos(math.radians(1.5))
+    assert min(cosines) > math.cos(math.radians(1))
     assert found.width == pytest.approx(expected.width, rel=0.01)
     tolerance = 0.01 * expected.width
     assert found.right == pytest.approx(expected.right, abs=tolerance)
@@ -83,8 +83,8 @@ def nearby_fit(brightness: float) -> NearbyFit:
     """Fit a mushroom under a light of some brightness, of which an image shows values up to 1."""
     mesh = renderer.normalize(renderer.solid("mushroom"))
     light = brightness * positive_light("eucalyptus")
-    [image] = renderer.render(mesh, FAR, light, 24, 0.0, samples=8)
-    mask = coverage_of(mesh, FAR, 24)
+    [image] = renderer.render(mesh, FAR, light, 32, 0.0, samples=8)
+    mask = coverage_of(mesh, FAR, 32)
     start = replace(FAR, polar=FAR.polar + 3, azimuth=FAR.azimuth - 3)
     found = fit_scene(image.clamp(0, 1), mask, mesh, start=start)
     return NearbyFit(found, irradiance_error(found, mesh, FAR, light))
@@ -96,9 +96,10 @@ def test_a_renders_camera_and_light_are_found_from_a_camera_nearby():
     assert fit.error < 0.05
 
 
-def test_light_is_found_from_an_image_with_overexposed_parts():
-    """A sixth of the values of the object are 1 and tell no more than that they are bright."""
-    assert nearby_fit(brightness=9.0).error < 0.055
+@pytest.mark.parametrize(("brightness", "bound"), [(9.0, 0.055), (13.0, 0.17)])
+def test_light_is_found_from_an_image_with_overexposed_parts(brightness, bound):
+    """A sixth and a third of the object's values are 1, and tell no more than that it is bright."""
+    assert nearby_fit(brightness).error < bound
 
 
 @pytest.mark.slow
