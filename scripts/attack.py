@@ -37,12 +37,12 @@ main = Command(
         "mesh.",
         examples=[
             "pnb-attack attack=lighting classifier=efficientnet_lite0 "
-            "scene.meshes=[orange.glb] label=orange",
+            "scene.meshes=[orange.glb]",
             "pnb-attack attack=lighting+geometry",
             "pnb-attack reload=runs/attacks/first/0_orange/example_000",
         ],
         common=[
-            *("classifier", "label", "target", "out", "attack.max_steps", "attack.margin"),
+            *("classifier", "label", "target", "out", "attack.max_steps", "attack.optimizer", "attack.margin"),
             *("scene.meshes", "scene.views", "scene.light", "scene.backgrounds"),
         ],
         groups=["attack"],

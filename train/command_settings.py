@@ -85,9 +85,10 @@ class AttackCommandSettings(AttackSettings):
         "The views share one lighting, shape or color, and their costs are summed.",
     )
     force: bool = setting(False, "Also attack images that are misclassified before the attack.")
-    checks: bool = setting(
-        True,
-        "Compare with a random search of as many passes, and with 3 and 10 times as many steps.",
+    checks: bool | None = setting(
+        None,
+        "Compare with random draws of as many passes, and with 3 and 10 times as many steps. "
+        "null: true, but false without gradients, because it takes 14 times as many queries.",
     )
     radius_scales: list[float] = setting(
         [],
@@ -159,8 +160,11 @@ class AttackExperimentSettings(ClassifierSettings):
     """
 
     classifier: str = setting("efficientnet_lite0", f"The attacked network: {CLASSIFIERS}.")
-    label: str = setting(
-        "orange", "Class of the meshes. A mapping {mesh, label} names its own class."
+    label: Any = setting(
+        None,
+        "Class of the meshes, by its name or index. null: the class that the name of each mesh's "
+        "file tells. A mapping {mesh, label} names its own class.",
+        is_text=True,
     )
     target: Any = setting(
         None,

@@ -16,7 +16,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attack_settings import NOISE_MARGIN, AttackSettings
+from augment.attack_settings import NOISE_MARGIN, RANDOM_SEARCH, AttackSettings
 from augment.attacks.attack import AttackResult, attack, fooled_in_views, logits_of, predictions
 from augment.attacks.checks import success_by_radius
 from augment.attacks.descent import Criterion
@@ -61,6 +61,8 @@ CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *CAMERA_ANGLES)
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
 # Steps of the attack at each radius, and random draws at each radius.
 STEPS = 10
+# Forward passes of each search without gradients, and random draws beside it.
+QUERIES = 100
 # Steps of an attack that continues after its success.
 ADDITIONAL_STEPS = 20
 # Steps of an attack that are as long together as the radius.
@@ -223,7 +225,8 @@ def adversaries(
     """Attack the lighting within the largest radius of its kind.
 
     A step changes each value by a quarter of the radius, in the direction of
-    the sign of the gradient.
+    the sign of the gradient. A classifier without gradients is attacked by
+    random search with QUERIES forward passes.
 
     Args:
         classifier: Attacked classifier.
@@ -244,6 +247,8 @@ def adversaries(
         limits |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
     else:
         limits |= {"max_steps": STEPS, "margin": 0.0, "noise_margin": NOISE_MARGIN}
+    if not classifier.has_gradients:
+        limits |= {"optimizer": RANDOM_SEARCH, "max_queries": QUERIES}
     return attack(
         classifier,
         views.scene(classifier.size, kind),

@@ -34,7 +34,7 @@ from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility.rasterizers import Rasterizer
-from train.class_names import class_name
+from train.class_names import class_name, class_of_meshes
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.report.attack_tables import (
@@ -185,7 +185,10 @@ def _write_attack(
     if mesh_attack.scene != settings.scene:
         changes = overrides(mesh_attack.scene, settings.scene)
         print(f"{name} is misclassified in the given scene, but not with {changes}")
-    checks = check(result) if settings.attack.checks else None
+    has_checks = settings.attack.checks
+    if has_checks is None:
+        has_checks = result.settings.uses_gradients
+    checks = check(result) if has_checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
     if is_verbose():
         print(format_attack(name, result, checks, lines))
@@ -242,9 +245,20 @@ def attacks(
         yield _attack_adversary(settings, classifier, device, adversary)
         return
     for index, item in enumerate(settings.scene.meshes):
-        mesh = read_object(item, settings.label, f"scene.meshes[{index}]")
+        key = f"scene.meshes[{index}]"
+        label = _class_of_items(settings, [item], key, classifier)
+        mesh = read_object(item, label, key)
         mesh.label = class_name(classifier, mesh.label, "label")
         yield _attack_mesh(settings, classifier, device, mesh)
+
+
+def _class_of_items(
+    settings: AttackExperimentSettings, items: Sequence[Any], key: str, classifier: Classifier
+) -> str:
+    """Return the class that `label` names or, without it, the class that the meshes tell."""
+    if settings.label is None:
+        return class_of_meshes(items, classifier, key)
+    return str(settings.label)
 
 
 def _attack_adversary(
@@ -359,9 +373,10 @@ def load_targets(
         InputError: If a classifier or a mesh cannot be loaded, or if a
             classifier lacks a class that it is asked for.
     """
-    label = settings.label
+    label = ""
     if settings.transfer.classifiers or settings.transfer.meshes:
         # Another classifier may have the class at another index.
+        label = _class_of_items(settings, settings.scene.meshes, "scene.meshes", attacked)
         label = class_name(attacked, label, "label")
     classifiers = []
     for item in settings.transfer.classifiers:

@@ -116,6 +116,14 @@ class TestAnAttack:
         assert summary["checks"]["cost_fell"] == 1
 
 
+def test_the_class_is_that_of_the_name_of_each_mesh(run, tmp_path):
+    meshes = "scene.meshes=['solid:apple:0','solid:orange:0']"
+    assert run("attack=pixels", meshes, "attack.force=true", *WITHOUT_CHECKS) == 0
+    for folder, label in (("0_solid_apple_0", "apple"), ("1_solid_orange_0", "orange")):
+        (line,) = read_lines(tmp_path / "out" / folder / "attack.jsonl")
+        assert line["label"] == [label]
+
+
 class TestFilesOfAnAttack:
     @pytest.fixture
     def example(self, run, tmp_path) -> Path:
@@ -130,7 +138,7 @@ class TestFilesOfAnAttack:
         assert len(load_mesh(shape).faces) > 0
         meshes = f"scene.meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
         shown = meshes, f"scene.light={light}"
-        assert run("attack=pixels", "out=again", *shown, *WITHOUT_CHECKS) == 0
+        assert run("attack=pixels", "out=again", "label=orange", *shown, *WITHOUT_CHECKS) == 0
         folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
         assert folders == {"0_mesh", "1_solid_orange_0"}
         (line,) = read_lines(tmp_path / "again" / "1_solid_orange_0" / "attack.jsonl")
