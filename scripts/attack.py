@@ -36,13 +36,20 @@ main = Command(
         about="Attack a classifier through the lighting, the shape, the colors or the pixels of a "
         "mesh.",
         examples=[
-            "pnb-attack attack=lighting classifier=efficientnet_lite0 "
-            "scene.meshes=[orange.glb]",
+            "pnb-attack attack=lighting classifier=efficientnet_lite0 scene.meshes=[orange.glb]",
             "pnb-attack attack=lighting+geometry",
             "pnb-attack reload=runs/attacks/first/0_orange/example_000",
         ],
         common=[
-            *("classifier", "label", "target", "out", "attack.max_steps", "attack.optimizer", "attack.margin"),
+            *(
+                "classifier",
+                "label",
+                "target",
+                "out",
+                "attack.max_steps",
+                "attack.optimizer",
+                "attack.margin",
+            ),
             *("scene.meshes", "scene.views", "scene.light", "scene.backgrounds"),
         ],
         groups=["attack"],

@@ -45,6 +45,7 @@ def test_every_block_of_python_is_run_here():
     assert BLOCKS.keys() == {
         "Attack a network",
         "Render",
+        "Networks without gradients",
         "Your own training loop",
         "Your own cameras",
         "Many lights and views",
@@ -100,6 +101,14 @@ def test_attack_block_fools_a_network_of_torchvision_in_three_views(folder):
     assert (folder / "attack.png").is_file()
     assert (folder / "adversaries" / "attack.jsonl").is_file()
     assert (folder / "adversaries" / "example_000" / "light.json").is_file()
+
+
+def test_block_without_gradients_finds_an_adversary_with_few_queries():
+    result = run("Networks without gradients")["result"]
+    assert result.success.all()
+    # Three more queries count the success with the noise of a sensor.
+    assert (result.queries <= 203).all()
+    assert not result.backward_passes.any()
 
 
 class Photographs(Dataset):

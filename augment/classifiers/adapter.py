@@ -10,6 +10,7 @@ import importlib
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -392,17 +393,36 @@ def unwrapped(network: Any) -> Any:
 
 
 class ArrayFunction(Wrapper):
-    """Network of tensors that calls a function of NumPy arrays. It has no gradients.
+    """A function that computes scores without torch, for tensors. It has no gradients.
+
+    If its first scores are probabilities, it returns the logarithms of all.
 
     Args:
-        function: Function from images (N, 3, H, W), float32 in [0, 1], to
-            scores (N, C).
+        function: Function from images (N, 3, H, W), in [0, 1], to scores
+            (N, C), an array of NumPy or lists of numbers.
+        takes_tensors: Whether the function takes tensors. Otherwise, it takes
+            arrays of float32.
+
+    Attributes:
+        has_probabilities: Whether the scores are probabilities. None before the
+            first call.
     """
+
+    def __init__(self, function: Callable[[Any], Any], takes_tensors: bool = False):
+        super().__init__(function)
+        self.takes_tensors = takes_tensors
+        self.has_probabilities: bool | None = None
 
     def forward(self, images: Tensor) -> Tensor:
         """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
-        scores = self.network(images.detach().cpu().float().numpy())
-        return as_scores(scores, images)
+        given = images.detach()
+        scores = self.network(given if self.takes_tensors else given.cpu().float().numpy())
+        scores = torch.as_tensor(np.asarray(scores)).to(images)
+        if self.has_probabilities is None and scores.ndim == 2:
+            self.has_probabilities = are_probabilities(scores)
+        if self.has_probabilities:
+            return scores.clamp(min=torch.finfo(scores.dtype).tiny).log()
+        return scores
 
 
 class AnyFunction(Wrapper):
@@ -412,55 +432,34 @@ class AnyFunction(Wrapper):
     array if the function then fails or returns no tensor.
 
     Attributes:
-        takes_arrays: Whether the function takes NumPy arrays. None before the
-            first call.
+        call: Function from tensors to scores. None before the first call.
     """
 
     def __init__(self, function: Callable[[Any], Any]):
         super().__init__(function)
-        self.takes_arrays: bool | None = None
+        self.call: Callable[[Tensor], Tensor] | None = None
 
     def forward(self, images: Tensor) -> Tensor:
-        """Compute the scores (N, C) of images (N, 3, H, W), in the images' dtype."""
-        if self.takes_arrays is None:
-            return self._call_first(images)
-        if self.takes_arrays:
-            return ArrayFunction(self.network)(images)
-        return as_scores(self.network(images), images)
-
-    def _call_first(self, images: Tensor) -> Tensor:
-        """Compute scores, and find out what the function takes."""
+        """Compute the scores (N, C) of images (N, 3, H, W)."""
+        if self.call is not None:
+            return self.call(images)
         failure = None
-        scores = None
         try:
             scores = self.network(images)
+            if isinstance(scores, Tensor):
+                self.call = self.network
+                return scores
         except Exception as error:  # Users' functions raise errors of many kinds.
             failure = error
-        if not isinstance(scores, Tensor):
-            try:
-                array_scores = ArrayFunction(self.network)(images)
-            except Exception:
-                # The first error tells of the function that takes tensors.
-                if failure is not None:
-                    raise failure from None
-            else:
-                self.takes_arrays = True
-                return array_scores
-        self.takes_arrays = False
-        return as_scores(scores, images)
-
-
-def as_scores(scores: Any, images: Tensor) -> Any:
-    """Convert scores of NumPy, or lists of numbers, to a tensor like the images.
-
-    A tensor is returned as it is, and so is what is no array of numbers.
-    """
-    if isinstance(scores, Tensor):
-        return scores
-    try:
-        return torch.as_tensor(np.asarray(scores)).to(images)
-    except (TypeError, ValueError):
-        return scores
+        for takes_tensors in (False, True):
+            converted = ArrayFunction(self.network, takes_tensors)
+            with suppress(Exception):
+                scores = converted(images)
+                self.call = converted
+                return scores
+        if failure is not None:
+            raise failure
+        return scores  # `NetworkCall` says what is wrong with it.
 
 
 class Normalized(Wrapper):

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import common, gpu, lights, renderer, scene, steps, training, whole_steps
+from benchmarks import (
+    common,
+    gpu,
+    gradient_free,
+    lights,
+    renderer,
+    scene,
+    steps,
+    training,
+    whole_steps,
+)
 from renderer.transport import precomputed
 from renderer.visibility.rasterizers import choose
 
@@ -173,3 +183,12 @@ def test_the_gpus_questions_are_refused_without_one(capsys):
     with pytest.raises(SystemExit, match="2"):
         gpu.main([])
     assert capsys.readouterr().err.count("error: torch finds no GPU here") == 1
+
+
+def test_optimizers_are_compared_at_equal_forward_passes(capsys):
+    pytest.importorskip("cma")
+    arguments = ["--network", "none", "--views", "1", "--seeds", "1", "--budgets", "2", "20"]
+    gradient_free.main(arguments)
+    header, _, *rows = capsys.readouterr().out.splitlines()
+    assert header == "|optimizer|2 passes|20 passes|"
+    assert [row.split("|")[1] for row in rows] == ["gradient", "random search", "CMA-ES"]

@@ -246,19 +246,12 @@ def attacks(
         return
     for index, item in enumerate(settings.scene.meshes):
         key = f"scene.meshes[{index}]"
-        label = _class_of_items(settings, [item], key, classifier)
+        label = "" if settings.label is None else str(settings.label)
         mesh = read_object(item, label, key)
+        if not mesh.label:
+            mesh.label = class_of_meshes([item], classifier, key)
         mesh.label = class_name(classifier, mesh.label, "label")
         yield _attack_mesh(settings, classifier, device, mesh)
-
-
-def _class_of_items(
-    settings: AttackExperimentSettings, items: Sequence[Any], key: str, classifier: Classifier
-) -> str:
-    """Return the class that `label` names or, without it, the class that the meshes tell."""
-    if settings.label is None:
-        return class_of_meshes(items, classifier, key)
-    return str(settings.label)
 
 
 def _attack_adversary(
@@ -376,8 +369,10 @@ def load_targets(
     label = ""
     if settings.transfer.classifiers or settings.transfer.meshes:
         # Another classifier may have the class at another index.
-        label = _class_of_items(settings, settings.scene.meshes, "scene.meshes", attacked)
-        label = class_name(attacked, label, "label")
+        if settings.label is None:
+            label = class_of_meshes(settings.scene.meshes, attacked, "scene.meshes")
+        else:
+            label = class_name(attacked, settings.label, "label")
     classifiers = []
     for item in settings.transfer.classifiers:
         classifier = _load_classifier(item).to(device)

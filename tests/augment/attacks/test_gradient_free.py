@@ -264,3 +264,10 @@ def test_a_function_may_take_and_return_tensors_or_arrays(function):
     images = random(2, 3, 4, 4, seed=0).sigmoid().float()
     for _ in range(2):
         torch.testing.assert_close(classifier(images), images.mean((2, 3)))
+
+
+def test_probabilities_of_a_function_without_gradients_become_their_logarithms():
+    probabilities = np.array([[0.7, 0.2, 0.1], [1.0, 0.0, 0.0]], dtype=np.float32)
+    classifier = augment.Classifier(lambda images: probabilities, 4, ["red", "green", "blue"])
+    logits = classifier(torch.full((2, 3, 4, 4), 0.5))
+    torch.testing.assert_close(logits.softmax(1), torch.from_numpy(probabilities))
