@@ -24,7 +24,14 @@ from renderer.light.presets import UNIFORM, load_light
 from renderer.mitsuba_scene import mitsuba
 from train import console
 from train.auditing import audit_page as page
-from train.auditing.lights import KINDS, Views, recognized, success_by_light, transfer_success
+from train.auditing.lights import (
+    KINDS,
+    QUERIES,
+    Views,
+    recognized,
+    success_by_light,
+    transfer_success,
+)
 from train.auditing.plain_light import PlainViews, find_plain_views
 from train.class_names import class_name, class_of_meshes, simplified, with_class_name
 from train.command import command_line
@@ -106,6 +113,7 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
                 plan.folders = {page.LABORATORY: renders} | plan.folders
         except InputError as error:
             caveats.append(f"The laboratory is left out, and hard_negatives with it ({error}).")
+    caveats += _missing_gradients(networks.values())
     for sentence in caveats:
         console.warning(sentence)
     with sole_writer("out", out):
@@ -270,6 +278,16 @@ def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
         return []
     listed = " and ".join(sizes)
     return [f"The networks take images of {listed} pixels, and differ by that, too."]
+
+
+def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
+    """Write a caveat for each network that has no gradients."""
+    return [
+        f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
+        "for each radius."
+        for network in networks
+        if not network.has_gradients
+    ]
 
 
 def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
