@@ -1,6 +1,7 @@
 """Classifiers from files that contain a whole network: TorchScript, `torch.export` and ONNX."""
 
 import importlib
+import io
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -124,7 +125,29 @@ def _read_torchscript(path: Path) -> Content:
         raise InputError(f"name={path} {advice}", "name")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns that torch.jit is deprecated.
-        return Content(torch.jit.load(path, map_location="cpu").eval())
+        return Content(Scripted(torch.jit.load(path, map_location="cpu").eval()))
+
+
+class Scripted(Wrapper):
+    """Network of TorchScript.
+
+    torch copies such a network with weights that are no leaves of autograd, so
+    that they could not be trained. This class saves and loads it instead.
+    """
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return a copy with weights of its own."""
+        content = io.BytesIO()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that torch.jit is deprecated
+            torch.jit.save(self.network, content)
+            content.seek(0)
+            copied = type(self)(torch.jit.load(content))
+        for weight, copied_weight in zip(self.parameters(), copied.parameters(), strict=True):
+            copied_weight.requires_grad_(weight.requires_grad)
+        for module, copied_module in zip(self.modules(), copied.modules(), strict=True):
+            copied_module.training = module.training
+        return copied
 
 
 def _read_exported(path: Path) -> Content:

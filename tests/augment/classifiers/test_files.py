@@ -1,5 +1,6 @@
 """Classifiers from files that contain a whole network."""
 
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,21 @@ def test_a_file_gives_the_logits_and_the_gradient_of_its_network(tmp_path, save)
     (gradient,) = torch.autograd.grad(found.sum(), images)
     (expected_gradient,) = torch.autograd.grad(expected.sum(), images)
     torch.testing.assert_close(gradient, expected_gradient, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_path):
+    path = save_torchscript(small_network(), tmp_path)
+    original = load_classifier(str(path), size=SIZE).function
+    copied = deepcopy(original)
+    images = torch.rand(2, 3, SIZE, SIZE)
+    before = original(images)
+    torch.testing.assert_close(copied(images), before)
+    copied.requires_grad_(True)
+    copied(images).sum().backward()
+    torch.optim.SGD(copied.parameters(), 0.1).step()
+    assert not torch.allclose(copied(images), before)
+    torch.testing.assert_close(original(images), before)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")

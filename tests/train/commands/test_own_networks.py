@@ -204,3 +204,60 @@ def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
     again = augment.load_classifier(f"torchvision:{NAME}", folder / "weights.pt", CLASSES, SIZE)
     torch.testing.assert_close(again(images), hardened, **ROUNDING)
     assert not torch.allclose(hardened, normalized_logits(trained_network(), images))
+
+
+def save_torchscript(network: nn.Module) -> str:
+    torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)).save("mine.ts")
+    return "mine.ts"
+
+
+def save_exported(network: nn.Module) -> str:
+    batch = {0: torch.export.Dim("N", min=1, max=512)}
+    images = torch.rand(2, 3, SIZE, SIZE)
+    torch.export.save(torch.export.export(network, (images,), dynamic_shapes=(batch,)), "mine.pt2")
+    return "mine.pt2"
+
+
+def load_original(name: str) -> nn.Module:
+    if name.endswith(".pt2"):
+        return torch.export.load(name).module()
+    return torch.jit.load(name)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.parametrize("save", [save_torchscript, save_exported])
+def test_a_network_in_a_file_is_attacked_audited_and_hardened(
+    call, harden, here, monkeypatch, save
+):
+    """The class is given by its index. The hardened weights load into the network of the file."""
+    monkeypatch.chdir(here)
+    name = save(nn.Sequential(Normalize(MEAN, STD), trained_network()).eval())
+    network = [f"classifier={name}", "classes=classes.txt", f"size={SIZE}", "device=cpu"]
+    label = f"label={CLASSES.index('Orange')}"
+    scene = ["scene.meshes=solid:orange:0", "renderer.shadows=false", "attack.max_steps=1"]
+    assert call("attack", *network, label, *scene, "attack.checks=false", "out=attack") == 0
+    meshes = ["meshes=solid:orange", "environments=[]", "budget=0.01", "laboratory=photos"]
+    assert call("audit", *network, label, *meshes, "out=audit") == 0
+    assert (here / "audit" / "report.html").is_file()
+
+    start = [f"train.init_from={name}", "classes=classes.txt", f"data.size={SIZE}"]
+    folder = harden(*start, label)
+    images = renders()[0][:4]
+    original = load_original(name)
+    before = original(images)
+    original.load_state_dict(torch.load(folder / "weights.pt"))
+    torch.testing.assert_close(load_run(folder)(images), original(images), **ROUNDING)
+    assert not torch.allclose(original(images), before)
+
+
+class Normalize(nn.Module):
+    """Normalization of images."""
+
+    def __init__(self, mean: torch.Tensor, std: torch.Tensor):
+        super().__init__()
+        self.register_buffer("mean", mean)
+        self.register_buffer("std", std)
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return (images - self.mean) / self.std
