@@ -144,7 +144,7 @@ class AttackSettings(ParameterSettings):
 
     @property
     def step_limit(self) -> int:
-        """The largest number of steps: `max_steps`, or without gradients one for each query."""
+        """The largest number of steps, which is `max_steps`, or without gradients one per query."""
         if self.uses_gradients:
             return self.max_steps
         return self.query_limit or 0

@@ -98,12 +98,12 @@ class Camera(ABC):
 
     @property
     def near(self) -> float:
-        """Depth of the near plane: the smallest visible depth in world units."""
+        """Depth of the near plane, the smallest visible depth, in world units."""
         return max(self.distance - self.clip_range, NEAREST * self.distance)
 
     @property
     def far(self) -> float:
-        """Depth of the far plane: the largest visible depth in world units."""
+        """Depth of the far plane, the largest visible depth, in world units."""
         return self.distance + self.clip_range
 
     def with_clip_range(self, radius: float) -> Self:
@@ -266,6 +266,7 @@ class Camera(ABC):
 
         Returns:
             A tuple of
+
             - (x w, y w, w) for the image position (x, y), shape (V, 3). The
               number w is 1 for an orthographic camera, and the depth over
               `distance` for a perspective camera;
@@ -378,7 +379,7 @@ class PerspectiveCamera(Camera):
 
     @property
     def angle(self) -> float:
-        """Field of view: the angle between opposite sides of the image in degrees."""
+        """Field of view, the angle between opposite sides of the image, in degrees."""
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:

@@ -122,9 +122,9 @@ def render(
             fit, a choice is unknown, or the albedo is not in [0, 1].
 
     Example:
-        >>> light = renderer.load_light("grace").requires_grad_()
-        >>> cameras = renderer.orbit_cameras(2, 2.2)
-        >>> image = renderer.render(renderer.solid("apple"), cameras, light, size=16)
+        >>> light = nb.load_light("grace").requires_grad_()
+        >>> cameras = nb.orbit_cameras(2, 2.2)
+        >>> image = nb.render(nb.solid("apple"), cameras, light, size=16)
         >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
         (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
@@ -241,9 +241,9 @@ def precompute_transfer(
         InputError: If an argument is out of range, or if there is no camera.
 
     Example:
-        >>> cameras = renderer.orbit_cameras(2, 2.2)
-        >>> operators = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
-        >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
+        >>> cameras = nb.orbit_cameras(2, 2.2)
+        >>> operators = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+        >>> lights = torch.stack([nb.load_light("grace"), nb.load_light("st_peters")])
         >>> operators[0].image(lights).shape, operators.image(lights).shape
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
@@ -282,7 +282,7 @@ def light_sphere(
         InputError: If the light has values that are not finite.
 
     Example:
-        >>> image = renderer.light_sphere(renderer.load_light("grace"), size=16)
+        >>> image = nb.light_sphere(nb.load_light("grace"), size=16)
         >>> image.shape
         torch.Size([3, 16, 16])
     """

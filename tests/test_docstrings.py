@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import augment
+import norm_balls
 import renderer
 
 PUBLIC = {}
@@ -46,6 +47,7 @@ def test_examples_run(module, result, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
     names = {
+        "nb": norm_balls,
         "augment": augment,
         "renderer": renderer,
         "torch": torch,

@@ -108,7 +108,8 @@ def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, st
             yield key, _format_line(f"{key}.", facts_of(kind, name).about)
             yield from _setting_lines(cast(DictConfig, child), f"{key}.")
         else:
-            yield key, _format_line(f"{key}={_format_value(values[name])}", _facts(kind, name))
+            shown = f"{key}={_format_value(values[name])}"
+            yield key, _format_line(shown, format_facts(kind, name))
 
 
 def _format_value(value: Any) -> str:
@@ -116,7 +117,7 @@ def _format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def _facts(kind: type, name: str) -> str:
+def format_facts(kind: type, name: str) -> str:
     """Format the explanation, the choices, the unit and the range of a field."""
     facts = facts_of(kind, name)
     limits = [f"{limit.sign} {limit.end:g}" for limit in facts.limits()]

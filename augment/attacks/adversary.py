@@ -284,8 +284,8 @@ def reload(folder: str | Path) -> Adversary:
         InputError: If a file is missing or damaged.
 
     Example:
-        >>> lines = augment.save(result, "adversaries")
-        >>> adversary = augment.reload("adversaries/example_000")
+        >>> lines = nb.save(result, "adversaries")
+        >>> adversary = nb.reload("adversaries/example_000")
         >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
         True
     """

@@ -354,11 +354,11 @@ def attack(
         >>> def logits(images):
         ...     mean = images.mean((1, 2, 3))
         ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
-        >>> classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
-        >>> scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
-        >>> light = augment.StepSettings(step_size=0.5)
-        >>> settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
-        >>> result = augment.attack(classifier, scene, settings=settings)
+        >>> classifier = nb.Classifier(logits, size=8, classes=["orange", "other"])
+        >>> scene = nb.build_scene([("solid:orange", "orange")], classifier.size)
+        >>> light = nb.StepSettings(step_size=0.5)
+        >>> settings = nb.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
+        >>> result = nb.attack(classifier, scene, settings=settings)
         >>> result.success, result.images.shape
         (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
     """

@@ -71,7 +71,7 @@ def save(
             or not installed.
 
     Example:
-        >>> [line] = augment.save(result, "adversaries")
+        >>> [line] = nb.save(result, "adversaries")
         >>> sorted(path.name for path in Path("adversaries").iterdir())
         ['attack.jsonl', 'example_000', 'example_000.png']
         >>> [*line["versions"]]

@@ -78,7 +78,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         InputError: If `result` is no result of an attack.
 
     Example:
-        >>> checks = augment.check(result)
+        >>> checks = nb.check(result)
         >>> checks["success"], checks["cost"] < checks["cost_before"]
         (1.0, True)
     """
@@ -161,7 +161,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
             positive numbers.
 
     Example:
-        >>> small, large = augment.success_by_radius(result, [0.001, 1])
+        >>> small, large = nb.success_by_radius(result, [0.001, 1])
         >>> small["radii"], small["adversarial"], large["adversarial"]
         ({'lighting': 0.001}, tensor([False]), tensor([True]))
     """
@@ -230,8 +230,8 @@ def transfer(
 
     Example:
         >>> function = result.classifier.function
-        >>> larger = augment.Classifier(function, size=12, classes=["orange", "other"])
-        >>> [network, turned] = augment.transfer(result, [larger], azimuths=[20.0])
+        >>> larger = nb.Classifier(function, size=12, classes=["orange", "other"])
+        >>> [network, turned] = nb.transfer(result, [larger], azimuths=[20.0])
         >>> network["predicted"], turned["azimuth"]
         ([['other']], '+20°')
     """

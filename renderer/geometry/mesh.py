@@ -402,7 +402,7 @@ def normalize(mesh: Mesh) -> Mesh:
         InputError: If the surface has no area. `load_mesh` ensures that it has.
 
     Example:
-        >>> bottle = normalize(renderer.solid("bottle"))
+        >>> bottle = normalize(nb.solid("bottle"))
         >>> float(np.abs(bottle.vertices).max())
         1.0
     """
@@ -479,7 +479,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
         InputError: If the number is not whole or out of range.
 
     Example:
-        >>> table = renderer.solid("table")
+        >>> table = nb.solid("table")
         >>> finer = subdivide(table, vertices=1000)
         >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
         (True, 0)

@@ -62,8 +62,8 @@ def export_mesh(
     Raises:
         InputError: If an argument is invalid, or if the file cannot be written.
 
-    >>> apple = renderer.normalize(renderer.solid("apple"))
-    >>> cameras = renderer.orbit_cameras(views=3, width=2.2)
+    >>> apple = nb.normalize(nb.solid("apple"))
+    >>> cameras = nb.orbit_cameras(views=3, width=2.2)
     >>> export_mesh(apple, "apple.glb", cameras=cameras)
     """
     require_mesh("mesh", mesh)

@@ -87,8 +87,8 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
             weights that do not sum to one, or missing joints.
 
     Example:
-        >>> cup = renderer.solid("cup")
-        >>> renderer.export_mesh(cup, "cup.glb")
+        >>> cup = nb.solid("cup")
+        >>> nb.export_mesh(cup, "cup.glb")
         >>> load_mesh("cup.glb").faces.shape == cup.faces.shape
         True
     """

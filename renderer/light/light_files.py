@@ -51,9 +51,9 @@ def save_light(
             file cannot be written.
 
     Example:
-        >>> light = renderer.load_light("grace")
+        >>> light = nb.load_light("grace")
         >>> save_light("light.json", light)
-        >>> torch.equal(renderer.load_light("light.json"), light)
+        >>> torch.equal(nb.load_light("light.json"), light)
         True
     """
     path = as_path("path", path)

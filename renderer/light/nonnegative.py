@@ -130,7 +130,7 @@ def project_nonnegative(lights: Tensor) -> Tensor:
         non-negative everywhere keeps its bits.
 
     Example:
-        >>> physical = project_nonnegative(renderer.load_light("grace"))
+        >>> physical = project_nonnegative(nb.load_light("grace"))
         >>> physical.shape
         torch.Size([49, 3])
     """

@@ -81,7 +81,7 @@ class Gloss:
             Otherwise the textures are ignored.
 
     Example:
-        >>> varnished = Gloss(roughness=0.3).on(renderer.solid("orange"))
+        >>> varnished = Gloss(roughness=0.3).on(nb.solid("orange"))
         >>> varnished.gloss.shape == varnished.faces.shape
         True
     """

@@ -37,9 +37,9 @@ class TransferOperators(Sequence[TransferOperator]):
     which take about as much memory again.
 
     Example:
-        >>> cameras = renderer.orbit_cameras(5, 2.2)
-        >>> operators = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
-        >>> probes = [renderer.load_light("grace"), renderer.load_light("st_peters")]
+        >>> cameras = nb.orbit_cameras(5, 2.2)
+        >>> operators = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+        >>> probes = [nb.load_light("grace"), nb.load_light("st_peters")]
         >>> lights = torch.stack(probes).requires_grad_()
         >>> images = operators.image(lights, background=0.2)
         >>> [gradient] = torch.autograd.grad(images.mean(), lights)
@@ -109,15 +109,15 @@ class TransferOperators(Sequence[TransferOperator]):
         The images equal those of the single operators up to rounding.
 
         Args:
-            lights: Coefficients, shape (*B, coefficients, 3). Every view is
+            lights: Coefficients, shape (..., coefficients, 3). Every view is
                 rendered under every light.
             background: Gray value, color, or images in [0, 1] that broadcast to
-                (V, *B, 3, size, size).
+                (V, ..., 3, size, size).
             light_per_view: Whether each view has its own lights. Their shape is
-                then (V, *B, coefficients, 3).
+                then (V, ..., coefficients, 3).
 
         Returns:
-            Images in [0, 1], shape (V, *B, 3, size, size).
+            Images in [0, 1], shape (V, ..., 3, size, size).
 
         Raises:
             InputError: If the lights hold NaN, have another basis or are not one
@@ -154,7 +154,7 @@ class TransferOperators(Sequence[TransferOperator]):
 
         Args:
             lights: Coefficients, as for `image`.
-            loss_gradient: Function of the images, shape (V, *B, 3, size, size).
+            loss_gradient: Function of the images, shape (V, ..., 3, size, size).
                 It returns the gradient of the loss by the images, of the same
                 shape. `torch.func.grad(loss)` makes such a function from a loss.
             background: Background, as for `image`.
@@ -195,7 +195,7 @@ class TransferOperators(Sequence[TransferOperator]):
         return stacks
 
     def _image_by_image(self, lights: Tensor, background: Tensor) -> Tensor:
-        """Render lights (V, *B, coefficients, 3), one operator after the other.
+        """Render lights (V, ..., coefficients, 3), one operator after the other.
 
         The background has the shape (3, size, size) or that of the images.
         """
@@ -208,7 +208,7 @@ class TransferOperators(Sequence[TransferOperator]):
     def _stacked_images(
         self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]
     ) -> Tensor:
-        """Render lights (V, *B, coefficients, 3), one stack of operators after the other.
+        """Render lights (V, ..., coefficients, 3), one stack of operators after the other.
 
         The background has the shape (3, size, size) or that of the images.
         """
@@ -239,7 +239,7 @@ class TransferOperators(Sequence[TransferOperator]):
 
 
 def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
-    """Broadcast background images to (V, *B, 3, size, size), or raise `InputError`."""
+    """Broadcast background images to (V, ..., 3, size, size), or raise `InputError`."""
     try:
         return images.expand(shape)
     except RuntimeError as error:

@@ -8,7 +8,7 @@ gloss (`renderer.shading.gloss`), and shadows and bounces (the package
 `renderer.transport`).
 
 Shapes use these letters: an operator has P covered pixels and K coefficients
-that reach a pixel, and *B are any dimensions of a batch of lights.
+that reach a pixel, and ... are any dimensions of a batch of lights.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ class TransferOperator:
             without such entries.
 
     Example:
-        >>> cameras = renderer.orbit_cameras(1, 2.2)
-        >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
-        >>> light = renderer.load_light("grace")
+        >>> cameras = nb.orbit_cameras(1, 2.2)
+        >>> [operator] = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+        >>> light = nb.load_light("grace")
         >>> twice = operator.radiance(2 * light)  # Before clamping, this is linear.
         >>> torch.allclose(twice, 2 * operator.radiance(light))
         True
@@ -109,12 +109,12 @@ class TransferOperator:
 
         Args:
             lights: Coefficients of the operator's basis, shape
-                (*B, coefficients, 3).
+                (..., coefficients, 3).
             background: Gray value, color or images in [0, 1]. See
                 `renderer.image.as_background`.
 
         Returns:
-            Images in [0, 1], shape (*B, 3, size, size), in the dtype of the
+            Images in [0, 1], shape (..., 3, size, size), in the dtype of the
             lights.
 
         Raises:
@@ -143,15 +143,15 @@ class TransferOperator:
 
         Args:
             lights: Coefficients of the operator's basis, shape
-                (*B, coefficients, 3).
-            loss_gradient: Function of the images, shape (*B, 3, size, size). It
+                (..., coefficients, 3).
+            loss_gradient: Function of the images, shape (..., 3, size, size). It
                 returns the gradient of the loss by the images, of the same
                 shape. `torch.func.grad(loss)` makes such a function from a loss.
             background: Gray value, color or images in [0, 1]. See
                 `renderer.image.as_background`.
 
         Returns:
-            The images in [0, 1], shape (*B, 3, size, size), and the gradient of
+            The images in [0, 1], shape (..., 3, size, size), and the gradient of
             the loss by the lights, with the shape of the lights.
 
         Raises:
@@ -159,9 +159,9 @@ class TransferOperator:
                 hold NaN or have another shape.
 
         Example:
-            >>> cameras = renderer.orbit_cameras(1, 2.2)
-            >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), cameras, size=16)
-            >>> light = renderer.load_light("grace")
+            >>> cameras = nb.orbit_cameras(1, 2.2)
+            >>> [operator] = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+            >>> light = nb.load_light("grace")
             >>> target = torch.zeros(3, 16, 16)
             >>> image, gradient = operator.image_and_gradient(light, lambda x: 2 * (x - target))
             >>> image.shape, gradient.shape
@@ -188,10 +188,10 @@ class TransferOperator:
 
         Args:
             lights: Coefficients of the operator's basis, shape
-                (*B, coefficients, 3).
+                (..., coefficients, 3).
 
         Returns:
-            Radiance, weighted with coverage, shape (*B, 3, P), in the dtype of
+            Radiance, weighted with coverage, shape (..., 3, P), in the dtype of
             the lights.
 
         Raises:
@@ -211,10 +211,10 @@ class TransferOperator:
         ∂loss/∂U = T ∂loss/∂radiance.
 
         Args:
-            radiance_gradient: Gradient by the radiance, shape (*B, 3, P).
+            radiance_gradient: Gradient by the radiance, shape (..., 3, P).
 
         Returns:
-            Gradient by the lights, shape (*B, coefficients, 3). It is exactly
+            Gradient by the lights, shape (..., coefficients, 3). It is exactly
             zero for coefficients that reach no pixel.
 
         Raises:
@@ -236,9 +236,9 @@ class TransferOperator:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Render without a graph.
 
-        Returns the images (*B, 3, size, size), ones and zeros where the clamp
-        lets the gradient pass or not (*B, 3, P), and the clamped linear values
-        (*B, 3, P).
+        Returns the images (..., 3, size, size), ones and zeros where the clamp
+        lets the gradient pass or not (..., 3, P), and the clamped linear values
+        (..., 3, P).
         """
         unclamped = self._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
@@ -263,7 +263,7 @@ class TransferOperator:
     ) -> Tensor:
         """Compute the gradient by the lights from that by the images of `_images`.
 
-        The gradient by the images has the shape (*B, 3, size, size).
+        The gradient by the images has the shape (..., 3, size, size).
         """
         # torch selects ten times as fast from two axes as from three.
         by_channel = image_gradient.reshape(-1, self._image_shape[1] * self._image_shape[2])
@@ -282,7 +282,7 @@ class TransferOperator:
         """Check that lights have the operator's basis and hold no NaN.
 
         Args:
-            lights: Coefficients, shape (*B, coefficients, 3).
+            lights: Coefficients, shape (..., coefficients, 3).
 
         Raises:
             InputError: If the lights hold NaN or have another shape.
@@ -361,8 +361,8 @@ class TransferOperator:
     def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
         """Flatten background images, and compute what they add to the covered pixels.
 
-        The images have the shape (*B, 3, size, size), and the lights
-        (*B, coefficients, 3).
+        The images have the shape (..., 3, size, size), and the lights
+        (..., coefficients, 3).
         """
         flat = images.flatten(-2)
         at_pixels = flat.index_select(-1, self.pixels)
@@ -449,9 +449,9 @@ class _PreparedBackground(NamedTuple):
     """A background of an operator.
 
     Attributes:
-        images: Background images, shape (*B, 3, size²).
+        images: Background images, shape (..., 3, size²).
         term: Linear values that are added to the radiance of the covered pixels,
-            shape (*B, 3, P).
+            shape (..., 3, P).
     """
 
     images: Tensor

@@ -1,0 +1,138 @@
+"""Settings of the documentation site: `sphinx-build -W --keep-going -b html docs build/site`."""
+
+import dataclasses
+import os
+import re
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+from docutils.nodes import Element
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.ext.autodoc import Options
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+import norm_balls as nb  # noqa: E402 (The path is set above.)
+from renderer.settings import Settings  # noqa: E402
+from train.help import format_facts  # noqa: E402
+
+project = "Parametric norm-balls"
+author = "Parametric norm-balls maintainers"
+project_copyright = author
+version = installed_version("parametric-norm-balls")
+release = version
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+]
+exclude_patterns = ["gallery"]
+templates_path = ["_templates"]
+# A name in single backticks links to its page, if it is public.
+default_role = "py:obj"
+
+html_theme = "furo"
+html_title = f"{project} {version}"
+html_show_sourcelink = False
+html_copy_source = False
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+nb_execution_mode = "off"
+
+autosummary_imported_members = True
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+# Pages of the site that hold a file outside docs/.
+PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "pretrained/README.md": "networks.md",
+}
+
+
+def link_to_pages(folder: Path, text: str) -> str:
+    """Let the links of a Markdown file lead to the pages of the site.
+
+    Args:
+        folder: Folder of the file. Its links are relative to it.
+        text: Content of the file.
+
+    Returns:
+        The content with links that are relative to docs/. Links to folders become text, because
+        a folder has no page.
+    """
+
+    def replace_target(match: re.Match[str]) -> str:
+        text, target, anchor = match.groups()
+        path = (folder / target).resolve()
+        if path.is_dir():
+            return text
+        if not path.is_file():
+            return match.group()
+        name = path.relative_to(ROOT).as_posix()
+        page = PAGES.get(name) or os.path.relpath(path, ROOT / "docs")
+        return f"[{text}]({page}{anchor or ''})"
+
+    return re.sub(r"\[([^]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)", replace_target, text)
+
+
+def link_in_source(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Rewrite the links of a page of docs/."""
+    source[0] = link_to_pages(ROOT / "docs", source[0])
+
+
+def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -> None:
+    """Rewrite the links of a file that a page includes."""
+    # The README is split into two pages, and its anchors are on the first of them.
+    text = re.sub(r"\]\(#", "](README.md#", source[0]) if path.name == "README.md" else source[0]
+    source[0] = link_to_pages((ROOT / "docs" / path).parent, text)
+
+
+def list_fields(
+    app: Sphinx, what: str, name: str, value: object, options: Options, lines: list[str]
+) -> None:
+    """Add the explanation of each field to the docstring of a settings class."""
+    if not (isinstance(value, type) and issubclass(value, Settings)):
+        return
+    lines += ["", "Args:"]
+    for item in dataclasses.fields(value):
+        lines.append(f"    {item.name}: {format_facts(value, item.name)}")
+
+
+def resolve_public_name(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Element
+) -> Element | None:
+    """Let `renderer.render` in a docstring lead to the page of `norm_balls.render`."""
+    package, _, name = node["reftarget"].rpartition(".")
+    if node["refdomain"] != "py" or name not in nb.__all__:
+        return None
+    if package.partition(".")[0] not in {"renderer", "augment", "train"}:
+        return None
+    target = f"norm_balls.{name}"
+    domain = env.domains["py"]
+    return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the functions of this file to the events of Sphinx."""
+    app.connect("source-read", link_in_source)
+    app.connect("include-read", link_in_included)
+    app.connect("missing-reference", resolve_public_name)
+    # Before napoleon, which converts the lines.
+    app.connect("autodoc-process-docstring", list_fields, priority=400)
