@@ -19,12 +19,14 @@ NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
 MAX_JOINT_ANGLE = 180.0  # degrees
 
-# Names of the parts of a pose, without the joints, in the order of their values.
-# The fields of `PoseSettings` with these names are their units.
+# Parts of a pose without the joints, in the order in which an attack on the pose
+# stores them. `PoseSettings` has a field of the same name for each part: the unit
+# in which the attack measures this part.
 POSE_PARTS = ("rotation", "shift", "scale", "view", "distance")
 
-# Names of the four values of an attack on the material, in their order. The
-# fields of `MaterialSettings` with these names are their units.
+# The four values of an attack on the material, in the order in which the attack
+# stores them. `MaterialSettings` has a field of the same name for each value: the
+# unit in which the attack measures this value.
 MATERIAL_PARTS = ("roughness", "metallic", "specular_factor", "hue")
 
 

@@ -362,7 +362,11 @@ class SpecularLayerSettings(Settings):
 
 @dataclass
 class CameraEffectSettings(Settings):
-    """Effects of a camera on each render. Each is uniform from 0 to its value."""
+    """Random effects of a camera on each render.
+
+    For `white_balance`, `blur` and `noise`, the setting is an upper limit. The
+    strength of each render is drawn uniformly between 0 and this limit.
+    """
 
     pattern_fraction: float = setting(
         0.0, "Fraction of renders under a projected pattern.", minimum=0, maximum=1

@@ -394,7 +394,7 @@ def class_texts(classes: Any) -> Any:
 
 @dataclass
 class ExperimentSettings(NetworkSettings):
-    """Settings of pnb-train: one run."""
+    """Settings of one training run, which the command `pnb-train` reads from Hydra."""
 
     run: str = setting(f"runs/{TIME_FOLDER}", "Folder of the run.")
     sweep: str = setting(
@@ -487,11 +487,12 @@ def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, Object
 
     Args:
         items: Files, solids or mappings.
-        label: Class of objects that name none.
-        key: Key of the list.
+        label: Class of the objects that have no label of their own.
+        key: Key of the list in the settings, such as "scene.meshes".
 
     Returns:
-        The objects by the key of each, such as "scene.meshes[0]".
+        The settings of each object. Its key is the key of the list with the
+        position of the object, such as "scene.meshes[0]".
     """
     objects = {}
     for index, item in enumerate(items):
@@ -505,7 +506,7 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
     Args:
         item: A file, a solid, or a mapping with fields of `ObjectSettings`.
-        label: Class of an object that names none.
+        label: Class of an object that has no label of its own.
         key: Key of the object, for errors.
 
     Returns:

@@ -145,7 +145,7 @@ class Adversary:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1], shape (V, 3, size, size).
+            Images in [0, 1] of the V cameras, shape (V, 3, size, size).
         """
         if not isinstance(rasterizer, Rasterizer):
             rasterizer = choose(rasterizer or "auto")

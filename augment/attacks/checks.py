@@ -40,7 +40,7 @@ from augment.scene.objects import SceneObject
 from renderer.errors import MAX_MAGNITUDE, MAX_SCALE, InputError, require_range
 from renderer.validation import as_list, require_number
 
-# `check` also takes so many times as many steps as the attack.
+# `check` repeats the attack with these multiples of its number of steps.
 GROWTH = (3, 10)
 
 # Results of `check` that `warnings` reads.
@@ -325,7 +325,7 @@ class Successes:
 
     @staticmethod
     def before(result: AttackResult) -> Successes:
-        """Return the successes before any step, with which nothing goes on.
+        """Return the examples that the classifier misclassifies before any step of an attack.
 
         Args:
             result: The result of an attack.
@@ -338,7 +338,7 @@ class Successes:
 
     @property
     def left(self) -> Tensor:
-        """Return the indices of the examples that are not counted, shape (A,)."""
+        """Return the indices of the A examples without a counted success, shape (A,)."""
         return torch.nonzero(~self.counted).squeeze(1)
 
     def add(
@@ -417,30 +417,44 @@ def _count_draws(result: AttackResult) -> int:
 
 
 def _success_by_steps(result: AttackResult) -> dict[int, Successes]:
-    """Return the successes of the attack and of longer ones from its start, by their budget.
+    """Repeat an attack with 3 and 10 times its budget, and count the successes.
 
-    The budget is a number of steps or, without gradients, of queries. Examples
-    that a shorter search counts already are not attacked again.
+    The budget is a number of steps or, without gradients, a number of queries.
+    Only the examples without a success so far are attacked again, each from its
+    start.
+
+    Args:
+        result: Result of the attack with its own budget.
+
+    Returns:
+        Successes by budget: those of the attack, and those of each repetition.
+        The successes of a smaller budget count for a larger budget, too.
     """
     settings = result.settings
-    found = Successes(result.success, result.success_without_noise)
-    by_steps = {settings.step_limit: found}
+    successes = Successes(result.success, result.success_without_noise)
+    successes_by_budget = {settings.step_limit: successes}
     for factor in GROWTH:
-        longer = settings.with_budget(factor)
-        found = found.clone()
-        left = found.left
-        if len(left):
-            end = descend(
+        longer_settings = settings.with_budget(factor)
+        successes = successes.clone()
+        unsuccessful = successes.left
+        if len(unsuccessful):
+            descent = descend(
                 result.preprocessed_model,
                 result.problem,
-                result.criterion.select(left),
-                longer,
-                examples=left,
+                result.criterion.select(unsuccessful),
+                longer_settings,
+                examples=unsuccessful,
                 seed=result.seed,
             )
-            found.add(result, result.problem, end.values, left, end.images)
-        by_steps[longer.step_limit] = found
-    return by_steps
+            successes.add(
+                result,
+                result.problem,
+                values=descent.values,
+                examples=unsuccessful,
+                images=descent.images,
+            )
+        successes_by_budget[longer_settings.step_limit] = successes
+    return successes_by_budget
 
 
 def _fraction(values: Tensor) -> float:

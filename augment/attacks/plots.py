@@ -11,7 +11,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Classes whose probabilities are shown.
+# Number of classes whose probabilities are drawn, the most probable ones.
 SHOWN_CLASSES = 5
 BEFORE_COLOR = "#4c78a8"
 AFTER_COLOR = "#e45756"

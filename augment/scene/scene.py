@@ -346,10 +346,13 @@ class Scene:
         return indices.to(self.lights.device)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """Render the covered pixels of all images, by the method that the conditions allow.
+        """Render the covered pixels of all images, by the fastest method that is exact.
 
-        Changed surfaces are rendered directly, changed positions of lamps are
-        added image by image, and changed light alone uses transfer operators.
+        - If the shape, the albedo or the gloss changed, or if each operator would
+          be used for one light only, images are rendered without operators.
+        - If lamps moved, transfer operators render all other light, and the light
+          of the lamps is computed for each image.
+        - If only the light changed, transfer operators render it.
         """
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]

@@ -290,9 +290,11 @@ def _directions(degree: int) -> tuple[Tensor, Tensor, Tensor]:
     radius = squared.sqrt()
     x = radius * angle.cos()
     y = radius * angle.sin()
-    table = torch.stack([x, y, (1 - squared).sqrt()], dim=1)
-    # The cyclic permutation (x, y, z) to (z, x, y) turns the table's normal into the wall's.
-    directions = torch.stack([table, table.roll(1, 1)])
+    above_table = torch.stack([x, y, (1 - squared).sqrt()], dim=1)
+    # The normal of the table is +z, the normal of the wall +x. The permutation of
+    # (x, y, z) to (z, x, y) turns +z into +x.
+    before_wall = above_table.roll(1, 1)
+    directions = torch.stack([above_table, before_wall])
     harmonics = Harmonics(degree)
     normals = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     irradiance = torch.zeros(2, harmonics.size, dtype=torch.float64)

@@ -116,13 +116,22 @@ def read_audit(label: str, names: Mapping[str, str], page: Path) -> AuditReport:
 
 
 def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
-    """Read the numbers of one network."""
+    """Read what the audit measured of one network.
+
+    Args:
+        label: Class whose objects were tested.
+        name: Name of the network.
+        folder: Folder of the measurements of this network.
+    """
     summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
-    hits = read_json(folder / RECOGNIZED)
+    recognized_views = read_json(folder / RECOGNIZED)
+    recognized_fraction = {}
+    for light, is_recognized in recognized_views.items():
+        recognized_fraction[light] = sum(is_recognized) / len(is_recognized)
     return NetworkReport(
         name=name,
         answer=write_answer(label, name, folder, sorted(summaries)),
-        recognized={light: sum(found) / len(found) for light, found in hits.items()},
+        recognized=recognized_fraction,
         attacks={kind: _read_attack(kind, folder / f"{kind}.json") for kind in KINDS},
         scores={part: _read_scores(summary) for part, summary in summaries.items()},
         transfers=read_json(folder / TRANSFER) if (folder / TRANSFER).exists() else {},

@@ -472,6 +472,15 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
 
 
 def _is_scored_on(group: Scored, photographs: str) -> bool:
-    """Return whether a group has the scores of a sub-folder, or of a network that is no run."""
+    """Return whether a group of scored networks belongs to photographs of a given name.
+
+    Networks that are not runs, such as files of weights, have no seed. They
+    belong to photographs of every name.
+
+    Args:
+        group: Scored networks by method.
+        photographs: Name of the photographs: the sub-folder with the scores in
+            the folder of each run.
+    """
     members = [scored for scored_runs in group.values() for scored in scored_runs]
     return any(scored.name == photographs or scored.run.seed is None for scored in members)

@@ -202,18 +202,19 @@ def _sha256(script: str) -> str:
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
-    """Write the page of finished runs, and return the last lines that their command prints.
+    """Write the page of finished runs, and describe it for the console.
 
-    An error must not make a command fail whose runs are finished and saved. It
-    is therefore part of the lines.
+    If the page cannot be written, the text says why. No error is raised, since
+    the runs are finished and saved, and their command must not fail.
 
     Args:
         folders: Folders of the runs.
         out: Folder that report.html is written to.
 
     Returns:
-        What hardening changed, if that was measured, and the path of the page,
-        or why there is no page.
+        Text for the console: the path of the page, below one paragraph that
+        says what hardening changed. The paragraph is absent if the runs have no
+        scores before and after hardening.
     """
     try:
         lines = [f"report: {write_report(folders, out)}"]

@@ -61,7 +61,9 @@ def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
         metrics: The metrics of the epoch, by the names of `epoch_metrics`.
 
     Returns:
-        The line.
+        The line. If the renders were attacked, it has the fraction of
+        successes among the clean-correct renders, which are the renders that
+        the network classifies correctly before the attack.
     """
     total = sum(metrics[f"seconds/{name}"] for name in PHASES)
     parts = [
@@ -71,6 +73,7 @@ def format_epoch(epoch: int, epochs: int, metrics: Mapping[str, float]) -> str:
     ]
     success = attack_success(metrics, "augment/")
     if success is not None:
+        # "attack_success_before" is the fraction that is misclassified before the attack.
         correct = 1 - metrics["augment/attack_success_before"]
         parts.append(f"attack success {success:.2f} of the {correct:.0%} clean-correct")
     duration = f"{total:.0f} s (renders {metrics['seconds/attack']:.1f} s)"

@@ -330,7 +330,13 @@ class Run:
         return agreement
 
     def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
-        """Score a model on the photographs with a name, and write the scores below a folder."""
+        """Score a model on one of the folders of photographs of this run.
+
+        Args:
+            model: The model.
+            name: Key of the photographs in `scored_folders`.
+            folder: Folder of the run. The scores are written to its sub-folder `name`.
+        """
         asked = self.settings.evaluate
         return evaluate_photographs(
             Predictor(model, self.data.classes, self.data.size, self.trainer.device),

@@ -109,6 +109,7 @@ class Material(Parameter):
             with respect to the values.
         """
         if self.used_mask is not None:
+            # Values that are not attacked keep their start.
             values = torch.where(self.used_mask[examples], values, self.start[examples])
         material = values * self._unit
         objects = self._object_of[examples]

@@ -408,10 +408,10 @@ class Pooled:
         pools = {}
         for mesh, group in groups.items():
             mesh_pool = pool(group, self.thresholds)
-            # If there are several labels, the images of a mesh with one label
-            # also have predictions about the other labels, which are negative.
-            # They would be the only negatives of this mesh, so the negatives of
-            # all meshes replace them.
+            # Example with the labels orange and lemon: an image of an orange is a
+            # positive for the label orange and a negative for the label lemon.
+            # Such negatives are left out here, because all negatives of this
+            # mesh would be images of the mesh itself.
             negatives = []
             for prediction in mesh_pool.negatives:
                 if prediction.photograph.label not in labels:
