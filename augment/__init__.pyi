@@ -1,5 +1,6 @@
 from augment.attack_settings import AttackSettings as AttackSettings
 from augment.attack_settings import EOTSettings as EOTSettings
+from augment.attack_settings import RelightingSettings as RelightingSettings
 from augment.attacks.adversary import Adversary as Adversary
 from augment.attacks.adversary import reload as reload
 from augment.attacks.attack import AttackResult as AttackResult
@@ -15,6 +16,9 @@ from augment.parameter_settings import ParameterSettings as ParameterSettings
 from augment.parameter_settings import PoseSettings as PoseSettings
 from augment.parameter_settings import SkylightSettings as SkylightSettings
 from augment.parameter_settings import StepSettings as StepSettings
+from augment.photographs.photograph_attack import PhotographAttackResult as PhotographAttackResult
+from augment.photographs.photograph_attack import attack_photographs as attack_photographs
+from augment.photographs.projected_light import relight_photographs as relight_photographs
 from augment.scene.build import build_scene as build_scene
 from augment.scene.conditions import Conditions as Conditions
 from augment.scene.conditions import Example as Example

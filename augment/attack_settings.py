@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -43,6 +44,50 @@ class EOTSettings(Settings):
     exposure: float = setting(0.2, "Largest change of the exposure.", "stops", minimum=0, maximum=5)
     noise: float = setting(0.02, "Standard deviation of the pixel noise.", minimum=0, maximum=1)
     jpeg: int = setting(75, "Lowest JPEG quality.", minimum=1, maximum=100)
+
+
+@dataclass
+class RelightingSettings(Settings):
+    """Attack on photographs in the light of a projector; see `augment.photographs`.
+
+    The projector shows a random slide. The attack multiplies each channel of the slide by a smooth
+    factor, which is at most `gain` and at least 1 / gain.
+    """
+
+    gain: float = setting(
+        3.0,
+        "Largest factor of a channel of the slide. Its inverse is the smallest.",
+        minimum=1,
+        maximum=100,
+    )
+    cells: int = setting(
+        6,
+        "Number of cells per side with a factor of their own. Between their centers, the "
+        "logarithm of the factor is interpolated linearly.",
+        minimum=1,
+        maximum=64,
+    )
+    passes: int = setting(
+        21,
+        "Passes through the classifier of each search: forward ones, and those backward for the "
+        "gradient. Random search draws as many factors. The gradient attack takes half as many "
+        "steps.",
+        minimum=1,
+        maximum=10**6,
+    )
+    slides: int = setting(
+        1, "Number of random slides for each photograph.", minimum=1, maximum=10**4
+    )
+
+    @property
+    def radius(self) -> float:
+        """Radius of the L∞ ball of the logarithm of the factors."""
+        return math.log(self.gain)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps along the gradient. The last image needs a forward pass of its own."""
+        return (self.passes - 1) // 2
 
 
 @dataclass

@@ -13,10 +13,12 @@ from augment import MaterialSettings as MaterialSettings
 from augment import MeshSettings as MeshSettings
 from augment import ObjectSettings as ObjectSettings
 from augment import ParameterSettings as ParameterSettings
+from augment import PhotographAttackResult as PhotographAttackResult
 from augment import PoseSettings as PoseSettings
 from augment import ProjectorSettings as ProjectorSettings
 from augment import PropSettings as PropSettings
 from augment import RandomLightSettings as RandomLightSettings
+from augment import RelightingSettings as RelightingSettings
 from augment import RendererSettings as RendererSettings
 from augment import Scene as Scene
 from augment import SceneObject as SceneObject
@@ -27,9 +29,11 @@ from augment import StepSettings as StepSettings
 from augment import TrainingAttackSettings as TrainingAttackSettings
 from augment import VariationSettings as VariationSettings
 from augment import attack as attack
+from augment import attack_photographs as attack_photographs
 from augment import build_scene as build_scene
 from augment import check as check
 from augment import load_classifier as load_classifier
+from augment import relight_photographs as relight_photographs
 from augment import reload as reload
 from augment import save as save
 from augment import success_by_radius as success_by_radius

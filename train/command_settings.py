@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from augment.attack_settings import AttackSettings
+from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, RendererSettings, SceneSettings
 from renderer.errors import MAX_SCALE, InputError, require_choice
 from renderer.settings import (
@@ -80,6 +80,9 @@ class ClassifierSettings(Settings):
 class AttackCommandSettings(AttackSettings):
     """Settings of the attack of pnb-attack."""
 
+    relighting: RelightingSettings | None = setting(
+        None, "Attack on the light of a projector on `photographs`, without a mesh."
+    )
     shared: bool = setting(
         False,
         "The views share one lighting, shape or color, and their costs are summed.",
@@ -174,6 +177,9 @@ class AttackExperimentSettings(ClassifierSettings):
     )
     seed: int = setting(0, "Seed of all random draws.", minimum=0, maximum=MAX_SEED)
     out: str = setting(f"runs/attacks/{TIME_FOLDER}", "Folder of the adversaries.")
+    photographs: str | None = setting(
+        None, "Folder of any photographs, which attack=relighting attacks instead of meshes."
+    )
     reload: str | None = setting(
         None,
         "Folder of an adversary. Its predictions are printed or, with attack=..., it is attacked "
@@ -203,6 +209,12 @@ class AttackExperimentSettings(ClassifierSettings):
         if isinstance(self.target, int | float):  # a class whose name is a number
             self.target = str(self.target)
         attacked = self.attack.parameters
+        if (self.attack.relighting is None) != (self.photographs is None):
+            advice = "set both, or neither"
+            raise InputError(f"attack=relighting and photographs belong together: {advice}")
+        if self.photographs is not None and (attacked or self.reload):
+            remedy = "attack meshes in a command of their own"
+            raise InputError(f"attack=relighting attacks photographs alone: {remedy}", "attack")
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if name in attacked and getattr(self.scene, name) is None:
                 setattr(self.scene, name, kind())

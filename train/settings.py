@@ -77,6 +77,7 @@ INPUTS = (
     ),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
     *("classifier", "hardened", "meshes", "hard_negatives", "environments", "photos", "laboratory"),
+    "photographs",
 )
 
 

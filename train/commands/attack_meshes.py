@@ -37,6 +37,7 @@ from renderer.visibility.rasterizers import Rasterizer
 from train.class_names import class_name, class_of_meshes
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
+from train.commands import attack_photographs
 from train.report.attack_tables import (
     FIGURE,
     TABLE,
@@ -115,6 +116,9 @@ def run(settings: AttackExperimentSettings) -> None:
         InputError: If a setting or an input file is wrong, or if a classifier
             misclassifies a mesh before the attack.
     """
+    if settings.attack.relighting is not None:
+        attack_photographs.run(settings)
+        return
     _require_attack_settings(settings)
     adversary = reload(settings.reload) if settings.reload else None
     if adversary is None:

@@ -8,6 +8,7 @@ from augment.attacks import adversary
 from augment.attacks.attack_files import LINES
 from renderer.errors import InputError
 from train.data import photographs
+from train.evaluation.relit import RELIT
 from train.evaluation.scores.predictions import PREDICTIONS
 from train.evaluation.scores.scoring import CONTACT_SHEET, SUMMARY
 from train.evaluation.scores.sheet import ROC_FIGURE, ROC_TABLE
@@ -22,7 +23,7 @@ from train.runs.saved_networks import PUBLISHED, WEIGHTS
 # message names the first file that is found.
 OF_AUDIT = ("*/recognized.json",)
 OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
-OF_ATTACK = (f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
+OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)
 OF_LABORATORY = (photographs.DESCRIPTION, photographs.TABLE)
 OF_FIT = ("light.json", "background.png", "comparison.png")

@@ -1,0 +1,148 @@
+"""The attack on photographs through the light of a projector."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from augment.attack_settings import RelightingSettings
+from augment.photographs.gain import descend_gain
+from augment.photographs.photograph_attack import ADVERSARIAL, LIGHTS, RANDOM, attack_photographs
+from augment.photographs.projected_light import draw_projected_light
+from augment.random_streams import generator
+from renderer.errors import InputError
+from renderer.image import to_unit
+
+SIZE = 16
+SETTINGS = RelightingSettings(gain=2.0, cells=3, passes=9, slides=2)
+
+
+class HueNetwork(nn.Module):
+    """Network with a class for each channel, which is the brightest part of the upper half."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(20.0))
+
+    def forward(self, images):
+        return self.scale * images[:, :, : SIZE // 2].mean((2, 3))
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    draws = torch.Generator().manual_seed(0)
+    coarse = torch.rand(12, 3, 4, 4, generator=draws)
+    return (255 * nn.functional.interpolate(coarse, SIZE)).to(torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def result(photographs):
+    return attack_photographs(HueNetwork().eval(), photographs, SETTINGS, seed=1)
+
+
+def test_the_class_to_keep_is_that_of_the_unchanged_photograph(result, photographs):
+    means = to_unit(photographs)[:, :, : SIZE // 2].mean((2, 3))
+    assert torch.equal(result.source, means.argmax(1))
+
+
+def test_factors_stay_in_the_norm_ball(result):
+    for log_gain in result.log_gain.values():
+        assert log_gain.abs().max() <= math.log(2) + 1e-6
+
+
+def test_images_of_a_result_have_its_predictions(result):
+    network = HueNetwork()
+    for light in LIGHTS:
+        for index in range(len(result.photographs)):
+            image = to_unit(result.image(index, light, slide=1))
+            assert network(image[None]).argmax() == result.predicted[light][index, 1]
+
+
+def test_a_change_counts_only_if_the_prediction_changes(result):
+    for light in LIGHTS:
+        is_other = result.predicted[light] != result.source[:, None]
+        assert (is_other | ~result.changed[light]).all()
+
+
+def test_searches_change_what_the_slide_changes_and_the_gradient_changes_most(result):
+    counts = [int(result.changed[light].sum()) for light in LIGHTS]
+    for light in (RANDOM, ADVERSARIAL):
+        assert (result.changed[light] | ~result.changed["slide"]).all()
+    assert counts[0] <= counts[1] < counts[2]
+
+
+def test_a_gain_of_one_changes_nothing_more_than_the_slide(photographs):
+    settings = RelightingSettings(gain=1.0, passes=5)
+    result = attack_photographs(HueNetwork().eval(), photographs, settings)
+    assert torch.equal(result.changed[RANDOM], result.changed["slide"])
+    assert torch.equal(result.changed[ADVERSARIAL], result.changed["slide"])
+
+
+def test_photographs_are_attacked_alike_in_any_batch(result, photographs):
+    again = attack_photographs(HueNetwork().eval(), photographs, SETTINGS, batch_size=5, seed=1)
+    for light in LIGHTS:
+        assert torch.equal(again.changed[light], result.changed[light])
+        torch.testing.assert_close(again.log_gain[light], result.log_gain[light])
+
+
+def test_noise_makes_changes_no_more_frequent(photographs):
+    settings = RelightingSettings(gain=1.1, passes=9)
+    network = HueNetwork().eval()
+    without = attack_photographs(network, photographs, settings, sensor_noise=0.0)
+    noisy = attack_photographs(network, photographs, settings, sensor_noise=20.0)
+    assert (without.changed["slide"] | ~noisy.changed["slide"]).all()
+
+
+def test_steps_lower_the_confidence_in_the_source(photographs):
+    network = HueNetwork().eval().requires_grad_(False)
+    images = to_unit(photographs)
+    light = draw_projected_light(len(images), SIZE, generator(0))
+    source = network(images).argmax(1)
+    start = torch.zeros(len(images), 3, 3, 3)
+    log_gain = descend_gain(network, images, light, source, start, math.log(2), steps=4)
+    before = network(light.apply(images)).log_softmax(1)
+    after = network(light.apply(images, log_gain)).log_softmax(1)
+    change = (after - before).gather(1, source[:, None])
+    assert (change < 0).float().mean() > 0.9
+
+
+def test_the_random_search_and_the_gradient_have_as_many_passes(photographs):
+    calls = {"forward": 0, "backward": 0}
+
+    class Counted(HueNetwork):
+        def forward(self, images):
+            calls["forward"] += 1
+            if images.requires_grad:
+                images.register_hook(lambda _: calls.update(backward=calls["backward"] + 1))
+            return super().forward(images)
+
+    def count(passes):
+        calls.update(forward=0, backward=0)
+        settings = RelightingSettings(gain=1.0 + 1e-6, passes=passes)
+        attack_photographs(Counted().eval(), photographs, settings, sensor_noise=0.0)
+        return calls["forward"], calls["backward"]
+
+    few = count(5)
+    many = count(9)
+    # Four more draws, and two more steps with a forward and a backward pass each.
+    assert many[0] - few[0] == 4 + 2
+    assert many[1] - few[1] == 2
+
+
+def test_a_function_without_gradients_is_attacked_by_random_search(photographs):
+    def brightest(images):
+        return np.asarray(images.detach())[:, :, : SIZE // 2].mean((2, 3))
+
+    result = attack_photographs(brightest, photographs[:2], SETTINGS)
+    assert RANDOM in result.changed
+    assert ADVERSARIAL not in result.changed
+
+
+def test_photographs_of_another_size_are_an_error(photographs):
+    from augment.classifiers.plain_networks import as_classifier
+
+    classifier = as_classifier(HueNetwork().eval(), SIZE, None)
+    with pytest.raises(InputError, match="8 pixels"):
+        attack_photographs(classifier, photographs[:, :, :8, :8])

@@ -1,0 +1,98 @@
+"""pnb-attack attack=relighting on a folder of photographs, without a mesh."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from renderer.errors import InputError
+from scripts.attack import list_parameters, main
+from tests.helpers import bright_or_dark
+from train.commands.attack_meshes import run
+from train.evaluation.relit import PICTURED, RELIT, read_relit
+
+
+def load_bright_or_dark():
+    """Return a network of two classes that takes images of 16 pixels."""
+    return bright_or_dark, 16, ["bright", "dark"]
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Save twelve photographs near the limit of the two classes, in two sub-folders."""
+    folder = tmp_path_factory.mktemp("photographs")
+    rng = np.random.default_rng(0)
+    for index in range(12):
+        path = folder / f"part_{index % 2}" / f"{index}.png"
+        path.parent.mkdir(exist_ok=True)
+        pixels = rng.integers(0, 2 * (20 + 2 * index), (20, 24, 3))
+        Image.fromarray(pixels.astype(np.uint8)).save(path)
+    return folder
+
+
+def settings_of(*words):
+    name = "classifier=python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
+    return main.read(list_parameters([name, *words]))
+
+
+@pytest.fixture(scope="module")
+def out(photographs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("attack") / "out"
+    size = ["attack.relighting.passes=5", "attack.relighting.slides=2"]
+    run(settings_of("attack=relighting", f"photographs={photographs}", f"out={folder}", *size))
+    return folder
+
+
+def test_every_photograph_has_predictions_and_counts(out, photographs):
+    scores = read_relit(out)
+    paths = {path.relative_to(photographs).as_posix() for path in photographs.rglob("*.png")}
+    assert {item.path for item in scores.photographs} == paths
+    for item in scores.photographs:
+        for light in scores.lights:
+            is_kept = sum(name == item.predicted for name in item.becomes[light])
+            assert is_kept <= item.kept[light] <= scores.slides
+        assert item.kept["adversarial"] <= item.kept["slide"]
+
+
+def test_the_tables_count_the_photographs_that_keep_their_class_under_all_slides(out):
+    scores = read_relit(out)
+    content = json.loads((out / RELIT).read_text())
+    rows = {row[0]: row for row in scores.class_table().rows}
+    for place, light in enumerate(scores.lights):
+        kept = [item for item in content["photographs"] if item["kept"][light] == 2]
+        assert scores.kept(light).hits == len(kept)
+        for name in ("bright", "dark"):
+            expected = sum(item["predicted"] == name for item in kept)
+            assert name not in rows or rows[name][2 + place] == expected
+    assert sum(row[1] for row in rows.values()) == 12
+
+
+def test_pictures_show_the_photograph_and_its_lights(out, photographs):
+    scores = read_relit(out)
+    assert 0 < len(scores.pictures) <= PICTURED
+    for index, name in scores.pictures.items():
+        with Image.open(out / name) as strip:
+            pixels = torch.from_numpy(np.array(strip)).permute(2, 0, 1)
+        assert pixels.shape == (3, 16, 16 * (1 + len(scores.lights)))
+        predicted = bright_or_dark(pixels[None, :, :, :16] / 255).argmax()
+        assert scores.photographs[index].predicted == ["bright", "dark"][predicted]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["attack=relighting"],
+        ["photographs=folder"],
+        ["attack=relighting+lighting", "photographs=folder"],
+    ],
+)
+def test_relighting_needs_photographs_alone(words):
+    with pytest.raises(InputError, match="relighting"):
+        settings_of(*words)
+
+
+def test_earlier_results_are_not_replaced(out, photographs):
+    with pytest.raises(InputError, match="overwrite"):
+        run(settings_of("attack=relighting", f"photographs={photographs}", f"out={out}"))

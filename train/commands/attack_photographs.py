@@ -1,0 +1,52 @@
+"""The attack command for photographs: attack the light of a projector on each photograph."""
+
+from pathlib import Path
+
+from renderer.errors import InputError
+from train.command import command_line
+from train.command_settings import AttackExperimentSettings
+from train.evaluation.relit import MODELED, RELIT, attack_folder
+from train.report.results import require_replaceable
+from train.runs.run_config import write_config
+from train.runs.run_lock import sole_writer
+from train.runs.saved_networks import load_chosen
+from train.settings import published
+from train.system.device import choose_device
+from train.system.user_errors import keyed, writable_folder
+
+
+def run(settings: AttackExperimentSettings) -> None:
+    """Attack a network through the light on photographs, write the results, and print them.
+
+    Args:
+        settings: Settings of pnb-attack, with `attack.relighting` and
+            `photographs`.
+
+    Raises:
+        InputError: If the folder or the network cannot be read.
+    """
+    relighting = settings.attack.relighting
+    if relighting is None or settings.photographs is None:
+        raise InputError("attack=relighting and photographs=FOLDER need each other: set both")
+    device = choose_device(settings.device)
+    with keyed(name="classifier"):
+        classifier = load_chosen(settings).to(device)
+    out = writable_folder(settings.out, "out")
+    require_replaceable(out, "out", settings.overwrite)
+    with sole_writer("out", out):
+        with keyed("photographs"):
+            scores = attack_folder(
+                classifier,
+                published(Path(settings.photographs)),
+                relighting,
+                out,
+                sensor_noise=settings.attack.sensor_noise,
+                batch_size=settings.attack.batch_size,
+                seed=settings.seed,
+            )
+        write_config(out, settings, command=command_line("attack"))
+    print(f"{scores.summary_table()}\n")
+    print(f"{MODELED}\n")
+    for path in scores.unreadable:
+        print(f"warning: {path} cannot be read")
+    print(f"predictions and pictures: {out / RELIT}")
