@@ -29,6 +29,7 @@ from augment.settings import AugmentationSettings as AugmentationSettings
 from augment.settings import CameraEffectSettings as CameraEffectSettings
 from augment.settings import LampsSettings as LampsSettings
 from augment.settings import MeshSettings as MeshSettings
+from augment.settings import NormalizedLightSettings as NormalizedLightSettings
 from augment.settings import ObjectSettings as ObjectSettings
 from augment.settings import ProjectorSettings as ProjectorSettings
 from augment.settings import PropSettings as PropSettings

@@ -650,3 +650,62 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
         )
         raise InputError(f"examples={examples} is not {product}: {remedy}", "examples")
     return derived
+
+
+@dataclass
+class NormalizedLightSettings(Settings):
+    """How the light of each image is normalized before a classifier sees it."""
+
+    percentile: float = setting(
+        98.0,
+        "Percentile of all pixels and channels that the exposure maps to `level`.",
+        above=0,
+        maximum=100,
+    )
+    level: float = setting(
+        0.8,
+        "Linear value of this percentile after the exposure.",
+        above=0,
+        maximum=1,
+    )
+    white_balance: float = setting(
+        0.5,
+        "Degree of the white balance. 0: none. 1: all channels have the same mean (gray world).",
+        minimum=0,
+        maximum=1,
+    )
+    gamma: float = setting(
+        1.0,
+        "Exponent of the encoded image. 1: sRGB. Less than 1 brightens the image.",
+        minimum=0.1,
+        maximum=10,
+    )
+
+
+# Values of `normalize_light`.
+NormalizeLight = bool | Mapping[str, Any] | NormalizedLightSettings | None
+
+
+def read_normalized_light(value: NormalizeLight) -> NormalizedLightSettings | None:
+    """Read a value of `normalize_light`.
+
+    Args:
+        value: True for the defaults, a mapping with fields of `NormalizedLightSettings`, or
+            settings. False or None for none.
+
+    Returns:
+        The settings. None if the light is not normalized.
+
+    Raises:
+        InputError: If the value is something else.
+    """
+    if value is None or value is False:
+        return None
+    if value is True:
+        return NormalizedLightSettings()
+    if isinstance(value, NormalizedLightSettings):
+        return value
+    if isinstance(value, Mapping):
+        return settings_from(NormalizedLightSettings, value, "normalize_light")
+    expected = "true, false, or a mapping such as {white_balance: 0.5}"
+    raise InputError(f"normalize_light is {describe(value)}: give {expected}", "normalize_light")

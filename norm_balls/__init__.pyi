@@ -11,6 +11,7 @@ from augment import Example as Example
 from augment import LampsSettings as LampsSettings
 from augment import MaterialSettings as MaterialSettings
 from augment import MeshSettings as MeshSettings
+from augment import NormalizedLightSettings as NormalizedLightSettings
 from augment import ObjectSettings as ObjectSettings
 from augment import ParameterSettings as ParameterSettings
 from augment import PhotographAttackResult as PhotographAttackResult

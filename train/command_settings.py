@@ -30,6 +30,7 @@ from train.settings import (
     NetworkSettings,
     class_texts,
     label_names,
+    normalized_light_values,
 )
 
 # Default environment maps of an audit.
@@ -63,6 +64,12 @@ class ClassifierSettings(Settings):
     weights: str | None = setting_like(NetworkSettings, "weights", None)
     classes: Any = setting_like(NetworkSettings, "classes", None)
     normalization: Any = setting_like(NetworkSettings, "normalization", None)
+    normalize_light: Any = setting(
+        None,
+        "Normalize the light of each image before the network sees it: true, or "
+        "{white_balance, percentile, level, gamma}. null: as the network does. This is not "
+        "`normalization`.",
+    )
     size: int | None = setting(
         None,
         "Pixels per side of the classifier's images. null: that of its source, and 224 if a file "
@@ -74,6 +81,7 @@ class ClassifierSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.classes = class_texts(self.classes)
+        self.normalize_light = normalized_light_values(self.normalize_light)
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from augment.settings import (
     RendererSettings,
     SceneSettings,
     count_views,
+    read_normalized_light,
 )
 from renderer.errors import MAX_SCALE, InputError, describe, is_whole, require_range
 from renderer.settings import (
@@ -380,10 +381,23 @@ class NetworkSettings(Settings):
         "before a file's network.",
         is_text=True,
     )
+    normalize_light: Any = setting(
+        None,
+        "Normalize the light of each image before the network sees it: true, or "
+        "{white_balance, percentile, level, gamma}. A training sees such images, too, and its "
+        "network remembers it. null: as the network does. This is not `normalization`.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.classes = class_texts(self.classes)
+        self.normalize_light = normalized_light_values(self.normalize_light)
+
+
+def normalized_light_values(value: Any) -> dict[str, float] | None:
+    """Return all fields of a value of `normalize_light` by name, as files record them."""
+    light = read_normalized_light(value)
+    return None if light is None else asdict(light)
 
 
 def class_texts(classes: Any) -> Any:

@@ -38,6 +38,7 @@ from augment.random_streams import generator
 from augment.scene.conditions import Conditions
 from augment.scene.degree import NOTICED, with_needed_degree
 from augment.scene.scene import Scene
+from augment.settings import NormalizeLight
 from renderer.errors import InputError, is_whole, require_choice, require_range
 from renderer.io.images import write_image
 from renderer.light.harmonics import irradiance_error
@@ -308,6 +309,7 @@ def attack(
     classes: Sequence[str] | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
     seed: int = 0,
     force: bool = False,
 ) -> AttackResult:
@@ -335,6 +337,9 @@ def attack(
             normalizes them itself.
         value_range: Values of black and white that a plain network takes before
             normalization.
+        normalize_light: Whether the light of each image is normalized before
+            the classifier sees it, as `load_classifier` takes it. The attack
+            knows it.
         seed: Seed of the restarts and of the noise.
         force: Whether examples that are misclassified before the attack are
             accepted, and attacked too.
@@ -370,7 +375,14 @@ def attack(
     device = scene.lights.device
     with gradient_flags_kept(classifier):
         adapted = as_classifier(
-            classifier, size, classes, normalization, value_range, device, "classifier"
+            classifier,
+            size,
+            classes,
+            normalization,
+            value_range,
+            device,
+            "classifier",
+            normalize_light=normalize_light,
         )
         return _attack(adapted, scene, target, settings, seed, force)
 

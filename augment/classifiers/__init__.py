@@ -11,7 +11,12 @@ from typing import Any, NamedTuple
 
 from augment.classifiers.adapter import Classifier, OperatingPoint, load_python
 from augment.classifiers.files import SUFFIXES, build_file, load_file
-from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
+from augment.classifiers.plain_networks import (
+    NetworkFacts,
+    Normalization,
+    as_facts,
+    require_no_facts,
+)
 from augment.classifiers.sources import (
     SQUEEZENET_CAFFE,
     build_efficientnet_lite,
@@ -24,6 +29,7 @@ from augment.classifiers.sources import (
     load_torchvision,
 )
 from augment.progress import progress_message
+from augment.settings import NormalizeLight
 from renderer.errors import InputError
 from renderer.validation import as_path, require_kind
 
@@ -95,6 +101,7 @@ def load_classifier(
     classes: Sequence[str] | str | Path | None = None,
     size: int | None = None,
     normalization: Normalization = None,
+    normalize_light: NormalizeLight = None,
 ) -> Classifier:
     """Load a classifier by name, on the CPU.
 
@@ -113,6 +120,9 @@ def load_classifier(
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1]. None for the
             normalization of the source.
+        normalize_light: Whether the light of each image is normalized first:
+            True, or a mapping with fields of `NormalizedLightSettings`. This
+            has nothing to do with `normalization`.
 
     Returns:
         The classifier.
@@ -130,6 +140,12 @@ def load_classifier(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
     facts = as_facts(classes, size, normalization)
+    classifier = _load(name, path, facts)
+    return classifier.normalizing_light(normalize_light)
+
+
+def _load(name: str, path: Path | None, facts: NetworkFacts) -> Classifier:
+    """Load a classifier without normalized light."""
     source, colon, model = name.partition(":")
     if source + colon in SOURCES:
         arguments: list[Any] = [model, path] if colon else [path]

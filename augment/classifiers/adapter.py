@@ -20,7 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from augment.classifiers.normalized_light import normalize_light
 from augment.losses import log_odds
+from augment.settings import NormalizedLightSettings, NormalizeLight, read_normalized_light
 from renderer.errors import InputError, describe, is_out_of_memory, require_range, single_line
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, as_tensor, require_kind, require_whole
@@ -166,6 +168,9 @@ class Classifier(nn.Module):
         classes: Names of the C classes in the order of the logits. Each name
             occurs once, because labels are found by name.
         name: Name of the classifier in messages.
+        normalize_light: Whether the light of each image is normalized before
+            the network sees it: True, or a mapping with fields of
+            `NormalizedLightSettings`.
 
     Attributes:
         operating_points: Thresholds for `detect`, at most one for each class.
@@ -184,6 +189,7 @@ class Classifier(nn.Module):
         size: int,
         classes: Sequence[str],
         name: str = "callable",
+        normalize_light: NormalizeLight = None,
     ):
         super().__init__()
         require_kind("name", name, str, "a string for messages")
@@ -192,9 +198,8 @@ class Classifier(nn.Module):
         )
         require_whole(f"classifier {name}: size", size)
         require_range(f"classifier {name}: size", size, 1, MAX_SIZE)
-        self.function: Callable[[Tensor], Tensor] = (
-            function if isinstance(function, nn.Module) else AnyFunction(function)
-        )
+        module = function if isinstance(function, nn.Module) else AnyFunction(function)
+        self.function: Callable[[Tensor], Tensor] = with_normalized_light(module, normalize_light)
         self.size = size
         self.classes = as_class_names(f"classifier {name}: classes", classes)
         self.name = name
@@ -239,6 +244,39 @@ class Classifier(nn.Module):
                 "or choose optimizer='random_search'"
             )
         return logits
+
+    @property
+    def normalized_light(self) -> NormalizedLightSettings | None:
+        """How the light of images is normalized first. None if it is not."""
+        return light_settings(self.function)
+
+    def normalizing_light(self, normalize_light: NormalizeLight = True) -> Classifier:
+        """Return a classifier of the same network that normalizes the light of images first.
+
+        It has no operating points, because its log-odds differ.
+
+        Args:
+            normalize_light: True, or a mapping with fields of
+                `NormalizedLightSettings`. None or False returns the classifier
+                as it is.
+
+        Returns:
+            The classifier. It shares the network.
+
+        Raises:
+            InputError: If the light is normalized already.
+
+        Example:
+            >>> def logits(images):
+            ...     return images.mean((2, 3))
+            >>> classifier = Classifier(logits, size=8, classes=["red", "green", "blue"])
+            >>> dark = torch.full((1, 3, 8, 8), 0.1)
+            >>> classifier.normalizing_light({"level": 1.0})(dark).round(decimals=3)
+            tensor([[1., 1., 1.]])
+        """
+        if read_normalized_light(normalize_light) is None:
+            return self
+        return Classifier(self.function, self.size, self.classes, self.name, normalize_light)
 
     @cached_property
     def has_gradients(self) -> bool:
@@ -492,6 +530,64 @@ class Normalized(Wrapper):
         ordered = images.flip(1) if self.bgr else images
         normalized = (ordered - self.mean) / self.std
         return self.network(normalized.contiguous(memory_format=torch.channels_last))
+
+
+class NormalizedLight(Wrapper):
+    """Network that takes RGB images in [0, 1] and first normalizes their light.
+
+    Args:
+        network: Network that takes RGB images (N, 3, H, W) in [0, 1].
+        settings: How the light is normalized.
+    """
+
+    def __init__(self, network: nn.Module, settings: NormalizedLightSettings):
+        super().__init__(network)
+        self.settings = settings
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Compute the logits (N, C) of RGB images (N, 3, H, W) in [0, 1]."""
+        return self.network(normalize_light(images, self.settings))
+
+    def extra_repr(self) -> str:
+        """Return the settings, by which stored logits of networks are told apart."""
+        return str(self.settings)
+
+
+def with_normalized_light(network: nn.Module, value: NormalizeLight) -> nn.Module:
+    """Put the normalization of light in front of a network.
+
+    Args:
+        network: Network that takes RGB images in [0, 1].
+        value: Value of `normalize_light`, see `read_normalized_light`.
+
+    Returns:
+        The network itself if `value` is None or False.
+
+    Raises:
+        InputError: If the light is normalized already, or if the value is wrong.
+    """
+    settings = read_normalized_light(value)
+    if settings is None:
+        return network
+    if light_settings(network) is not None:
+        raise InputError(
+            "normalize_light is given, and the network normalizes light already: leave it out",
+            "normalize_light",
+        )
+    normalized = NormalizedLight(network, settings)
+    # Networks of torch.export refuse a change of the mode.
+    normalized.training = network.training
+    return normalized
+
+
+def light_settings(network: object) -> NormalizedLightSettings | None:
+    """Return how a network normalizes light. None if it does not."""
+    return network.settings if isinstance(network, NormalizedLight) else None
+
+
+def without_normalized_light(network: Any) -> Any:
+    """Return the network behind the normalization of light, or the network itself."""
+    return network.network if isinstance(network, NormalizedLight) else network
 
 
 def class_index(classes: Sequence[str], name: str | int, subject: str) -> int:

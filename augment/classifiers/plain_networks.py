@@ -21,6 +21,7 @@ from augment.classifiers.adapter import (
     Normalized,
     as_class_names,
 )
+from augment.settings import NormalizeLight
 from renderer.errors import InputError, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, require_kind, require_whole
@@ -126,11 +127,12 @@ def as_classifier(
     device: torch.device | str | None = None,
     argument: str = "network",
     name: str | None = None,
+    normalize_light: NormalizeLight = None,
 ) -> Classifier:
     """Make a classifier of a plain network, and check it on gray images.
 
     Args:
-        network: A classifier, which is returned as it is, or a network from
+        network: A classifier, of which only the light is normalized, or a network from
             images to logits: a `torch.nn.Module` in evaluation mode, or a
             function of tensors or of NumPy arrays.
         size: Pixels per side of the images. None for 224.
@@ -144,6 +146,8 @@ def as_classifier(
         device: Device of the images. None for that of the network.
         argument: Name of the argument `network` of the caller, for errors.
         name: Name for messages. None for the name of the network's class.
+        normalize_light: Whether the light of each image is normalized first:
+            True, or a mapping with fields of `NormalizedLightSettings`.
 
     Returns:
         The classifier. It contains the network itself.
@@ -165,7 +169,7 @@ def as_classifier(
                 "classes, normalization and value_range are for a plain network: "
                 "leave them out, because a Classifier has its own"
             )
-        return network
+        return network.normalizing_light(normalize_light)
     require_kind(
         argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
     )
@@ -183,7 +187,7 @@ def as_classifier(
         fault = f"classes has {len(names)} names, but the network returns {count} outputs"
         raise InputError(f"{fault}: give one name per output")
     name = name or type(network).__name__
-    return Classifier(function, size, names or index_names(count), name)
+    return Classifier(function, size, names or index_names(count), name, normalize_light)
 
 
 def device_of(network: object) -> torch.device:

@@ -49,4 +49,5 @@ def _load_network(settings: EvaluateSettings) -> Classifier:
             return load_chosen(settings)
     facts = as_facts(settings.classes, settings.size, settings.normalization)
     require_no_facts(f"run={settings.run}", facts)
-    return load_run(settings.run, settings.weights, settings.model)
+    classifier = load_run(settings.run, settings.weights, settings.model)
+    return classifier.normalizing_light(settings.normalize_light)

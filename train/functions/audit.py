@@ -14,6 +14,7 @@ from augment.classifiers.plain_networks import (
     device_of,
     gradient_flags_kept,
 )
+from augment.settings import NormalizeLight
 from renderer.errors import InputError
 from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
@@ -34,6 +35,7 @@ def audit(
     size: int | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
     photographs: str | Path | None = None,
     laboratory: str | Path | None = None,
     environments: Sequence[str] = ENVIRONMENTS,
@@ -64,6 +66,9 @@ def audit(
             takes it.
         value_range: Values of black and white that plain networks take before
             normalization.
+        normalize_light: Whether the light of each image is normalized before
+            `network`, and before `hardened` if it is a plain network, as
+            `load_classifier` takes it. The attacks know it.
         photographs: Folder of photographs, as `evaluate` takes it.
         laboratory: Such a folder of renders, as "pretrained/laboratory". None
             if it is made of the meshes, for which Mitsuba is needed.
@@ -90,9 +95,17 @@ def audit(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with gradient_flags_kept(network), gradient_flags_kept(hardened):
-        networks = {page.CLASSIFIER: as_classifier(network, *options)}
+        networks = {
+            page.CLASSIFIER: as_classifier(network, *options, normalize_light=normalize_light)
+        }
         if hardened is not None:
-            networks[page.HARDENED] = as_classifier(hardened, *options, argument="hardened")
+            is_classifier = isinstance(hardened, Classifier)
+            networks[page.HARDENED] = as_classifier(
+                hardened,
+                *options,
+                argument="hardened",
+                normalize_light=None if is_classifier else normalize_light,
+            )
         classifier = networks[page.CLASSIFIER]
         items = as_mappings("meshes", meshes, classifier)
         positive_classes = studied_classes(label, items, classifier)

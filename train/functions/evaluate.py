@@ -16,6 +16,7 @@ from augment.classifiers.plain_networks import (
     device_of,
     gradient_flags_kept,
 )
+from augment.settings import NormalizeLight
 from renderer.errors import InputError
 from renderer.validation import as_folder
 from train.command_settings import require_calibration
@@ -39,6 +40,7 @@ def evaluate(
     size: int | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
     by: str = "source",
     calibrate: str | Path | None = None,
     false_positive_rate: float | None = None,
@@ -67,6 +69,8 @@ def evaluate(
             takes it.
         value_range: Values of black and white that a plain network takes before
             normalization.
+        normalize_light: Whether the light of each photograph is normalized
+            first, as `load_classifier` takes it.
         by: "mesh" to score each object of photos.csv, too. Otherwise "source".
         calibrate: Folder like `folder`, on which a threshold on the log-odds of
             each label is chosen for `false_positive_rate`. None for the
@@ -100,7 +104,15 @@ def evaluate(
     folder = published(as_folder("folder", folder))
     device = device_of(network) if device is None else torch.device(device)
     with gradient_flags_kept(network):
-        classifier = as_classifier(network, size, classes, normalization, value_range, device)
+        classifier = as_classifier(
+            network,
+            size,
+            classes,
+            normalization,
+            value_range,
+            device,
+            normalize_light=normalize_light,
+        )
         labels = _choose_labels(classifier, folder, label)
         model = MixedPrecision(classifier.to(device), choose_precision(precision, device))
         predictor = Predictor(model, classifier.classes, classifier.size, device)

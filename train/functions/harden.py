@@ -12,14 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from augment.classifiers import Classifier
-from augment.classifiers.adapter import Normalized, unwrapped
+from augment.classifiers.adapter import unwrapped
 from augment.classifiers.plain_networks import (
     UNIT_RANGE,
     Normalization,
     as_classifier,
     device_of,
 )
-from augment.settings import AugmentationSettings, RendererSettings
+from augment.settings import AugmentationSettings, NormalizeLight, RendererSettings
 from renderer.errors import InputError, describe
 from renderer.settings import Settings
 from renderer.validation import as_path, require_kind
@@ -59,6 +59,7 @@ def harden(
     size: int | None = None,
     normalization: Normalization = None,
     value_range: tuple[float, float] = UNIT_RANGE,
+    normalize_light: NormalizeLight = None,
     train: TrainSettings | Section = None,
     augment: AugmentationSettings | Section = None,
     scene: TrainingSceneSettings | Section = None,
@@ -92,6 +93,10 @@ def harden(
             takes it.
         value_range: Values of black and white that a plain network takes before
             normalization.
+        normalize_light: Whether the light of each image is normalized first, as
+            `load_classifier` takes it, in training and afterwards. A copy of a
+            plain network does not do this itself: give it to the other
+            functions, too.
         train: Fields of `TrainSettings` that differ from the experiment, such
             as {"epochs": 5, "learning_rate": 0.01}, or all of them.
         augment: The same of `AugmentationSettings`.
@@ -121,7 +126,7 @@ def harden(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
-        classifier = as_classifier(deepcopy(network), *options)
+        classifier = as_classifier(deepcopy(network), *options, normalize_light=normalize_light)
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give one whose weights can be trained")
         items = as_mappings("meshes", meshes, classifier)
@@ -213,11 +218,11 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
 
 def _copy_with(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
     """Return a copy of a network with the weights that its classifier has learned."""
-    copy = deepcopy(network)
-    if isinstance(copy, Classifier):
-        cast(nn.Module, copy.function).load_state_dict(trained.state_dict())
-        return copy
-    is_wrapped = type(classifier.function) is Normalized and type(network) is not Normalized
-    learned = unwrapped(trained) if is_wrapped else trained
-    copy.load_state_dict(learned.state_dict())
+    if isinstance(network, Classifier):
+        copy: nn.Module = deepcopy(classifier)
+        target = cast(Classifier, copy).function
+    else:
+        copy = deepcopy(network)
+        target = copy
+    unwrapped(target).load_state_dict(unwrapped(trained).state_dict())
     return copy

@@ -14,9 +14,10 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from augment.classifiers import SOURCES, Classifier, OperatingPoint, load_classifier
-from augment.classifiers.adapter import unwrapped
+from augment.classifiers.adapter import unwrapped, with_normalized_light
 from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import Normalization, as_facts, require_no_facts
+from augment.settings import NormalizeLight
 from renderer.errors import InputError, single_line
 from renderer.io.files import atomic_write
 from renderer.validation import as_path, require_kind
@@ -35,6 +36,10 @@ WEIGHTS = "weights.pt"
 PUBLISHED_FACTS = ("architecture", "settings", "scores", "versions", "operating_point")
 # Entries of the description of a network that are not needed to build it.
 FACTS = ("version", "encoding", "validation")
+# Entry of the description of a network that normalizes the light of images, with the settings.
+NORMALIZE_LIGHT = "normalize_light"
+# Prefix of the names of the weights of such a network.
+LIGHT_PREFIX = "network."
 # Characters of a reason in an error, at most.
 LONGEST_REASON = 300
 
@@ -45,6 +50,7 @@ def load_network(
     classes: Sequence[str] | str | None = None,
     size: int | None = None,
     normalization: Normalization = None,
+    normalize_light: NormalizeLight = None,
 ) -> Classifier:
     """Load a classifier by its name: a trained network, or one that was trained elsewhere.
 
@@ -55,6 +61,7 @@ def load_network(
         classes: Names of the classes, or a file of them, as for `augment.load_classifier`.
         size: Pixels per side of the images, as there.
         normalization: Normalization of the images, as there.
+        normalize_light: Whether the light of each image is normalized first, as there.
 
     Returns:
         The classifier.
@@ -65,8 +72,9 @@ def load_network(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
-        return load_run(name.removeprefix(RUN), weights)
-    return load_classifier(name, weights, classes, size, normalization)
+        classifier = load_run(name.removeprefix(RUN), weights)
+        return classifier.normalizing_light(normalize_light)
+    return load_classifier(name, weights, classes, size, normalization, normalize_light)
 
 
 def load_chosen(settings: ClassifierSettings) -> Classifier:
@@ -77,6 +85,7 @@ def load_chosen(settings: ClassifierSettings) -> Classifier:
         settings.classes,
         settings.size,
         settings.normalization,
+        settings.normalize_light,
     )
 
 
@@ -117,7 +126,8 @@ def load_run(
     with of_one_architecture(path):
         size = int(shape.pop("size"))
         classes = tuple(map(str, shape.pop("classes")))
-        network = build_network(classes, size, **shape)
+        light = shape.pop(NORMALIZE_LIGHT, None)
+        network = with_normalized_light(build_network(classes, size, **shape), light)
         network.load_state_dict(state["model"])
         classifier = Classifier(network, size, classes, f"{RUN}{run}")
         classifier.operating_points = _operating_points(state)
@@ -197,6 +207,21 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     if path.suffix == ".safetensors":
         return path, _load_published(path)
     return path, load(path)
+
+
+def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the weights of a network by their names without normalized light.
+
+    Args:
+        state: Content of a file, as `load_selected` returns it.
+
+    Returns:
+        State dict of the network behind the normalization of light.
+    """
+    weights: dict[str, Tensor] = state["model"]
+    if NORMALIZE_LIGHT not in state["architecture"]:
+        return weights
+    return {name.removeprefix(LIGHT_PREFIX): value for name, value in weights.items()}
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:

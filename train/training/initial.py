@@ -1,7 +1,7 @@
 """The network that a run begins with, and the images that neither it nor the run learns from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.classifiers import Classifier, load_classifier
+from augment.classifiers.adapter import without_normalized_light
 from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
@@ -16,7 +17,13 @@ from train import console
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, describe
-from train.runs.saved_networks import is_classifier, load_selected, of_one_architecture
+from train.runs.saved_networks import (
+    NORMALIZE_LIGHT,
+    is_classifier,
+    load_selected,
+    of_one_architecture,
+    plain_weights,
+)
 from train.settings import WIDERESNET, ExperimentSettings
 from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
@@ -37,9 +44,9 @@ class Initial:
         source: File of the network of another run, or name of a classifier.
         architecture: Arguments that build the network (see
             `train.networks.describe`).
-        weights: State dict of the network.
-        network: The network itself. The run trains a copy. None if the name in the
-            architecture builds it.
+        weights: State dict of the network, without normalized light.
+        network: The network itself, without normalized light. The run trains a
+            copy. None if the name in the architecture builds it.
     """
 
     source: Path
@@ -66,6 +73,11 @@ class Initial:
     def name(self) -> str:
         """Return the name of the architecture."""
         return self.architecture["name"]
+
+    @property
+    def normalize_light(self) -> dict[str, float] | None:
+        """Return how the network normalizes the light of images. None if it does not."""
+        return self.architecture.get(NORMALIZE_LIGHT)
 
     @property
     def validation(self) -> dict[str, Any] | None:
@@ -123,7 +135,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     )
     with keyed(run="train.init_from"):
         path, state = load_selected(Path(name))
-    return Initial(path, state["architecture"], state["model"])
+    return Initial(path, state["architecture"], plain_weights(state))
 
 
 def _classifier(settings: ExperimentSettings, name: str) -> Initial:
@@ -158,8 +170,10 @@ def initial_of(classifier: Classifier, size: int | None) -> Initial:
     Returns:
         The network.
     """
-    network = cast(nn.Module, classifier.function)
-    shape = {"name": classifier.name, CLASSIFIER: True}
+    network = without_normalized_light(classifier.function)
+    shape: dict[str, Any] = {"name": classifier.name, CLASSIFIER: True}
+    if classifier.normalized_light is not None:
+        shape[NORMALIZE_LIGHT] = asdict(classifier.normalized_light)
     architecture = describe(network, classifier.classes, size or classifier.size, "srgb", **shape)
     return Initial(Path(classifier.name), architecture, network.state_dict(), network)
 

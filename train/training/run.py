@@ -4,9 +4,10 @@
 this order.
 """
 
+import json
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,12 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from augment import distributed
-from augment.classifiers.adapter import unwrapped
+from augment.classifiers.adapter import (
+    light_settings,
+    unwrapped,
+    with_normalized_light,
+    without_normalized_light,
+)
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
@@ -32,7 +38,7 @@ from train.networks import CLASSIFIER, PYTHON, build_network, describe
 from train.runs import checkpoint
 from train.runs.run_config import require_same_run, write_config
 from train.runs.run_log import BEFORE, RunLog, remove_run
-from train.runs.saved_networks import WEIGHTS, export
+from train.runs.saved_networks import NORMALIZE_LIGHT, WEIGHTS, export
 from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
 from train.system.device import (
     MixedPrecision,
@@ -179,6 +185,10 @@ class Run:
             path = self.folder / WEIGHTS
             export(path, self.trainer.selected.network)
             console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
+            light = light_settings(self.trainer.selected.network)
+            if light is not None:
+                given = json.dumps(asdict(light))
+                console.info("it needs normalized light before it: normalize_light=%s", given)
 
     def _require_folder(self) -> DictConfig | None:
         """Return the settings of the run that is resumed in the folder. None for a new run."""
@@ -435,6 +445,10 @@ def build_trainer(
     }
     if initial:
         initial.copy_to(network, facts)
+    light = settings.normalize_light or (initial.normalize_light if initial else None)
+    if light is not None:
+        facts[NORMALIZE_LIGHT] = light
+        network = with_normalized_light(network, light)
     if settings.train.freeze:
         with keyed(stage="train.freeze"):
             freeze(unwrapped(network), settings.train.freeze)
@@ -445,7 +459,7 @@ def build_trainer(
     recipe = settings.train
     if recipe.eval_mode is None:
         recipe = replace(recipe, eval_mode=bool(initial and initial.is_classifier))
-    description = describe(network, **facts, validation=validation.record)
+    description = describe(without_normalized_light(network), **facts, validation=validation.record)
     service = build_service(settings, data, device)
     with keyed(**keys):
         return Trainer(recipe, model, description, service, folder, data.labeled)

@@ -133,6 +133,16 @@ def test_a_classifier_is_hardened_as_its_network_is(network, photographs):
     assert torch.equal(hardened.function[4].weight, expected[4].weight)
 
 
+def test_a_copy_trained_in_normalized_light_has_the_weights_without_it(network, photographs):
+    plain = harden(network, photographs, normalize_light=True)
+    classifier = nb.Classifier(deepcopy(network), SIZE, CLASSES, normalize_light=True)
+    hardened = harden(classifier, photographs, classes=None, size=None)
+    assert type(plain) is type(network)
+    assert hardened.normalized_light == nb.NormalizedLightSettings()
+    assert torch.equal(hardened.function.network[4].weight, plain[4].weight)
+    assert not torch.equal(plain[4].weight, harden(network, photographs)[4].weight)
+
+
 def test_a_field_that_does_not_exist_is_refused(network, photographs):
     with pytest.raises(nb.InputError, match=r"train\.epoch"):
         harden(network, photographs, train={"epoch": 1})

@@ -12,11 +12,13 @@ from torch import Tensor, nn
 from torchvision.models import get_model
 
 from augment.classifiers import load_classifier
+from augment.classifiers.normalized_light import normalize_light
+from augment.settings import NormalizedLightSettings
 from renderer.errors import InputError
 from tests.runs import completed_run
 from train.__main__ import main as train_command
 from train.runs.run_log import read_metrics
-from train.runs.saved_networks import load_run
+from train.runs.saved_networks import load_network, load_run
 from train.training.data import load_data
 
 NAME = "shufflenet_v2_x0_5"
@@ -120,6 +122,47 @@ def test_the_result_loads_where_the_original_did_and_in_every_command(tuned, wei
     init_from = [f"train.init_from={folder}", "weights=null"]
     continued, _ = tuned("unlabelled", *init_from, ALMOST_FIXED)
     torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
+
+
+class TestNormalizedLight:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def trained(cls, tuned) -> Path:
+        """Train with images in normalized light, without changing the weights noticeably."""
+        folder, _ = tuned("unlabelled", ALMOST_FIXED, "normalize_light={white_balance: 1.0}")
+        return folder
+
+    @pytest.fixture
+    def expected(self, weights) -> Tensor:
+        """Return the logits of the original network for normalized images."""
+        light = NormalizedLightSettings(white_balance=1.0)
+        images = normalize_light(self.images(), light)
+        return normalized_logits(load_torchvision(weights), images)
+
+    @staticmethod
+    def images() -> Tensor:
+        return torch.rand(4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+
+    def test_is_remembered_by_the_network(self, trained, expected):
+        network = load_run(trained)
+        assert network.normalized_light == NormalizedLightSettings(white_balance=1.0)
+        torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
+
+    def test_is_not_in_the_file_of_weights(self, trained, weights):
+        state = load_torchvision(trained / "weights.pt").state_dict()
+        assert state.keys() == load_torchvision(weights).state_dict().keys()
+
+    def test_is_remembered_by_the_network_of_the_next_run(self, tuned, trained, expected):
+        continued, _ = tuned(
+            "unlabelled", f"train.init_from={trained}", "weights=null", ALMOST_FIXED
+        )
+        images = self.images()
+        torch.testing.assert_close(load_run(continued)(images), expected, rtol=1e-4, atol=1e-4)
+
+    def test_is_put_before_a_network_that_was_trained_without(self, tuned, weights, expected):
+        plain, _ = tuned("unlabelled", ALMOST_FIXED)
+        network = load_network(f"run:{plain}", normalize_light={"white_balance": 1.0})
+        torch.testing.assert_close(network(self.images()), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_a_network_that_hardly_moves_keeps_its_predictions_at_no_loss(almost_fixed):

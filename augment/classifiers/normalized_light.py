@@ -1,0 +1,82 @@
+"""Normalizes the light of images: white balance, exposure and encoding."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from augment.settings import NormalizedLightSettings
+from renderer.image import clamp, decode, encode
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+# Encoded values are linear below this one, and are not raised to a power. It is the smallest
+# value of 8 bits above black.
+DARKEST_ENCODED = 1 / 255
+# The same value in linear light. A mean or a percentile below it counts as this value, so that
+# black images stay black.
+DARKEST = DARKEST_ENCODED / 12.92
+
+
+def normalize_light(
+    images: Float[Tensor, "N 3 H W"], settings: NormalizedLightSettings
+) -> Float[Tensor, "N 3 H W"]:
+    """Normalize color and brightness of the light of each image.
+
+    The steps are computed in linear light, and each image is treated alone:
+
+    1. White balance: each channel is multiplied by (m / m_c)^`white_balance`. Here, m_c is the
+       mean of the channel, and m is the mean of all channels.
+    2. Exposure: the image is multiplied by a factor that maps the given percentile of all pixels
+       and channels to `level`. Values above 1 are clipped.
+    3. Encoding: the sRGB curve, and then the exponent `gamma`.
+
+    The result is differentiable almost everywhere.
+
+    Args:
+        images: RGB images in [0, 1], sRGB-encoded, shape (N, 3, H, W).
+        settings: Settings of the three steps.
+
+    Returns:
+        RGB images in [0, 1], same shape. Black images stay black.
+
+    Example:
+        >>> import torch
+        >>> dark = torch.full((1, 3, 8, 8), 0.2)
+        >>> normalize_light(dark, NormalizedLightSettings(level=1.0)).unique()
+        tensor([1.])
+    """
+    linear = decode(clamp(images), "srgb")
+    balanced = linear * _balance(linear, settings.white_balance)
+    exposed = clamp(balanced * _exposure(balanced, settings))
+    encoded = encode(exposed, "srgb")
+    return _apply_gamma(encoded, settings.gamma)
+
+
+def _balance(linear: Tensor, degree: float) -> Tensor:
+    """Compute the factor of each channel of each image, shape (N, 3, 1, 1)."""
+    channel_means = linear.mean((2, 3), keepdim=True)
+    mean = channel_means.mean(1, keepdim=True)
+    ratio = mean.clamp(min=DARKEST) / channel_means.clamp(min=DARKEST)
+    return ratio**degree
+
+
+def _exposure(linear: Tensor, settings: NormalizedLightSettings) -> Tensor:
+    """Compute the factor of each image, shape (N, 1, 1, 1)."""
+    values = linear.flatten(1)
+    rank = math.ceil(settings.percentile / 100 * values.shape[1])
+    bright = values.kthvalue(rank, dim=1).values
+    factors = settings.level / bright.clamp(min=DARKEST)
+    return factors.view(-1, 1, 1, 1)
+
+
+def _apply_gamma(encoded: Tensor, gamma: float) -> Tensor:
+    """Raise encoded values to a power. Below DARKEST_ENCODED, the curve is a line through 0."""
+    if gamma == 1:
+        return encoded
+    # The derivative of the power is infinite at 0 if gamma is less than 1.
+    factor = encoded.clamp(min=DARKEST_ENCODED) ** (gamma - 1)
+    return encoded * factor

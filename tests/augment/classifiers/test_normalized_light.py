@@ -1,0 +1,159 @@
+"""Normalized light: closed forms, gradients by finite differences, and images without light."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from augment.classifiers.adapter import Classifier, NormalizedLight
+from augment.classifiers.normalized_light import normalize_light
+from augment.classifiers.plain_networks import as_classifier
+from augment.settings import NormalizedLightSettings
+from renderer import InputError
+
+SIZE = 12
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values by IEC 61966-2-1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def linear_of(encoded: np.ndarray) -> np.ndarray:
+    """Decode sRGB values by IEC 61966-2-1."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.fixture
+def radiance() -> np.ndarray:
+    """Return linear values of four color images in [0, 0.3]."""
+    return np.random.default_rng(0).uniform(0, 0.3, (4, 3, SIZE, SIZE))
+
+
+def normalized(linear: np.ndarray, **settings) -> np.ndarray:
+    """Normalize linear images, and return linear images."""
+    images = torch.from_numpy(srgb(linear))
+    result = normalize_light(images, NormalizedLightSettings(**settings))
+    return linear_of(result.numpy())
+
+
+@pytest.mark.parametrize("exposure", [0.05, 0.5, 3.0])
+def test_images_at_any_exposure_become_the_same_image(radiance, exposure):
+    expected = normalized(radiance)
+    np.testing.assert_allclose(normalized(exposure * radiance), expected, rtol=1e-9)
+
+
+def test_the_percentile_gets_the_level(radiance):
+    result = normalized(radiance, percentile=90, level=0.4)
+    bright = np.quantile(result.reshape(4, -1), 0.9, axis=1, method="inverted_cdf")
+    np.testing.assert_allclose(bright, 0.4, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("degree", "left"), [(0.0, 1.0), (0.5, 0.5), (1.0, 0.0)])
+def test_a_cast_on_gray_keeps_a_part_of_its_logarithm(degree, left):
+    gray = np.random.default_rng(1).uniform(0.05, 0.2, (1, 1, SIZE, SIZE))
+    cast = np.array([1.5, 1.0, 0.4])
+    result = normalized(gray * cast[:, None, None], white_balance=degree, level=0.5, percentile=100)
+    means = result.mean((0, 2, 3))
+    expected = left * np.log(cast / cast[1])
+    np.testing.assert_allclose(np.log(means / means[1]), expected, atol=1e-9)
+
+
+def test_an_image_in_normalized_light_stays_as_it_is(radiance):
+    once = normalized(radiance, white_balance=1.0, level=0.5, percentile=100)
+    twice = normalized(once, white_balance=1.0, level=0.5, percentile=100)
+    np.testing.assert_allclose(twice, once, rtol=1e-9)
+
+
+def test_gamma_is_the_exponent_of_the_encoded_image(radiance):
+    plain = srgb(normalized(radiance))
+    powered = srgb(normalized(radiance, gamma=0.7))
+    is_bright = plain > 0.01
+    np.testing.assert_allclose(powered[is_bright], plain[is_bright] ** 0.7, rtol=1e-9)
+
+
+def test_each_image_is_normalized_alone(radiance):
+    together = normalized(radiance)
+    for index, image in enumerate(radiance):
+        np.testing.assert_array_equal(normalized(image[None])[0], together[index])
+
+
+@pytest.mark.parametrize("gamma", [0.6, 1.0, 1.8])
+def test_the_gradient_is_that_of_finite_differences(gamma):
+    generator = torch.Generator().manual_seed(2)
+    images = 0.1 + 0.8 * torch.rand(2, 3, 4, 4, generator=generator, dtype=torch.float64)
+    settings = NormalizedLightSettings(gamma=gamma, percentile=90)
+    weights = torch.randn(2, 3, 4, 4, generator=generator, dtype=torch.float64)
+
+    def weighted(values: Tensor) -> Tensor:
+        return (weights * normalize_light(values, settings)).sum()
+
+    assert torch.autograd.gradcheck(weighted, images.requires_grad_(), eps=1e-7, atol=1e-4)
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1.0])
+@pytest.mark.parametrize(
+    "image",
+    [
+        torch.zeros(3, SIZE, SIZE),
+        torch.ones(3, SIZE, SIZE),
+        torch.full((3, SIZE, SIZE), 0.3),
+        torch.eye(3)[0].view(3, 1, 1).expand(3, SIZE, SIZE),
+        torch.full((3, SIZE, SIZE), 1e-6),
+    ],
+    ids=["black", "white", "constant", "red", "almost black"],
+)
+def test_images_without_contrast_are_finite_with_finite_gradients(image, gamma):
+    images = image[None].clone().requires_grad_()
+    result = normalize_light(images, NormalizedLightSettings(gamma=gamma))
+    result.sum().backward()
+    assert result.min() >= 0 and result.max() <= 1
+    assert images.grad.isfinite().all()
+    assert (result == 0).all() == (image == 0).all()
+
+
+class Spy(nn.Module):
+    """Network whose logits are the means of the channels."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.mean((2, 3))
+
+
+def test_a_classifier_sees_normalized_images(radiance):
+    images = torch.from_numpy(srgb(radiance))
+    settings = NormalizedLightSettings(white_balance=0.25)
+    expected = normalize_light(images, settings).mean((2, 3))
+    classes = ["red", "green", "blue"]
+    for classifier in (
+        Classifier(Spy(), SIZE, classes, normalize_light={"white_balance": 0.25}),
+        Classifier(Spy(), SIZE, classes).normalizing_light(settings),
+        as_classifier(Spy().eval(), SIZE, classes, normalize_light={"white_balance": 0.25}),
+    ):
+        torch.testing.assert_close(classifier(images), expected)
+        assert classifier.normalized_light == settings
+
+
+def test_light_is_normalized_before_the_mean_is_subtracted(radiance):
+    images = torch.from_numpy(srgb(radiance)).float()
+    mean, std = (0.4, 0.5, 0.6), (0.1, 0.2, 0.3)
+    classifier = as_classifier(Spy().eval(), SIZE, normalization=(mean, std), normalize_light=True)
+    light = normalize_light(images, NormalizedLightSettings())
+    expected = (light.mean((2, 3)) - torch.tensor(mean)) / torch.tensor(std)
+    torch.testing.assert_close(classifier(images), expected)
+
+
+def test_light_is_not_normalized_twice():
+    classifier = Classifier(Spy(), SIZE, ["red", "green", "blue"], normalize_light=True)
+    with pytest.raises(InputError, match="normalize_light"):
+        classifier.normalizing_light()
+
+
+@pytest.mark.parametrize("value", ["yes", {"exposure": 2}, {"white_balance": 2.0}, 1.5])
+def test_other_values_are_refused(value):
+    with pytest.raises(InputError, match="normalize_light"):
+        Classifier(Spy(), SIZE, ["red", "green", "blue"], normalize_light=value)
+
+
+def test_networks_with_other_settings_are_told_apart():
+    networks = [NormalizedLight(Spy(), NormalizedLightSettings(level=x)) for x in (0.5, 0.6)]
+    assert str(networks[0]) != str(networks[1])
