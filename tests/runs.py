@@ -5,12 +5,13 @@ from pathlib import Path
 from train.data.sets import DataSet
 from train.settings import ExperimentSettings
 from train.training.data import load_data
-from train.training.initial import load_initial
+from train.training.initial import load_initial, with_label
 from train.training.run import Run
 
 
 def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None = None) -> Run:
     """Make a run and load it. Without data, it loads those of the settings."""
+    settings = with_label(settings)
     initial = load_initial(settings)
     if data is None:
         data = load_data(settings, initial)

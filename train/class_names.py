@@ -1,73 +1,119 @@
 """Classes as users name them: by name, by index, or by the name of a mesh."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from augment.classifiers import Classifier
-from augment.classifiers.adapter import nearest
+from augment.classifiers.adapter import class_index, nearest
 from renderer.errors import InputError
 from train.data.photographs import OTHER_PREFIX
-from train.settings import OTHER, solid_name
-from train.system.user_errors import keyed
+from train.settings import OTHER, ExperimentSettings, simplified, solid_name
 
 
-def class_name(classifier: Classifier, label: str | int, key: str) -> str:
-    """Return the name of a class of a classifier.
+def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
+    """Return the name of a class.
 
     Args:
-        classifier: The classifier.
+        classes: Names of all classes of a network.
         label: Name of the class, or its index.
         key: Setting that names the class, for the error.
+
+    Returns:
+        Name of the class.
 
     Raises:
         InputError: If there is no such class.
     """
-    with keyed(key):
-        return classifier.classes[classifier.label(label)]
+    return classes[class_index(classes, label, key)]
 
 
-def with_class_name(item: Any, classifier: Classifier, key: str) -> Any:
+def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     """Return a mesh of the settings with its class by name.
 
-    A class of no classifier, such as "other" or "other_lemon", stays.
+    A class of no network, such as "other" or "other_lemon", stays.
 
     Args:
         item: File, solid or mapping with the fields of `ObjectSettings`.
-        classifier: Classifier that has the class.
+        classes: Names of all classes of a network.
         key: Setting that lists the mesh, for the error.
 
+    Returns:
+        The mesh.
+
     Raises:
-        InputError: If the classifier lacks the class of the mesh.
+        InputError: If the network lacks the class of the mesh.
     """
     label = item.get("label") if isinstance(item, dict) else None
     if label is None or label == "" or label == OTHER or str(label).startswith(OTHER_PREFIX):
         return item
-    return {**item, "label": class_name(classifier, label, f"{key}.label")}
+    return {**item, "label": class_name(classes, label, f"{key}.label")}
 
 
-def simplified(name: str) -> str:
-    """Return a name in lower case, in which "_" and "-" are spaces."""
-    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
-
-
-def class_of_name(name: str, classifier: Classifier) -> str | None:
+def class_of_name(name: str, classes: Sequence[str]) -> str | None:
     """Return the class whose name differs only in case, "_", "-" and spaces. None if not unique."""
-    same = [known for known in classifier.classes if simplified(known) == simplified(name)]
+    same = [known for known in classes if simplified(known) == simplified(name)]
     if name in same:
         return name
     return same[0] if len(same) == 1 else None
 
 
-def class_of_meshes(items: Sequence[Any], classifier: Classifier, key: str) -> str:
-    """Find the class that the names of meshes tell.
+def name_of_mesh(mesh: str) -> str:
+    """Return the name of a solid, or that of a file without its ending.
+
+    Args:
+        mesh: File, or solid:NAME with or without a seed.
+
+    Returns:
+        The name.
+
+    >>> name_of_mesh("meshes/banana.glb")
+    'banana'
+    """
+    return solid_name(mesh) or Path(mesh).stem
+
+
+def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> list[str]:
+    """Find the class of each mesh by its label or, without a label, by its name.
 
     The name of a file without its suffix, or the name of a solid, must be the
     name of a class. Case, "_", "-" and spaces make no difference.
 
     Args:
         items: Files, solids or mappings with the fields of `ObjectSettings`.
-        classifier: Classifier that has the classes.
+        classes: Names of all classes of a network.
+        key: Setting that lists the meshes, for the error.
+
+    Returns:
+        Name of the class of each mesh.
+
+    Raises:
+        InputError: If the network lacks the class of a mesh, or if a mesh tells
+            no class.
+    """
+    found = []
+    for index, item in enumerate(items):
+        values = item if isinstance(item, dict) else {"mesh": item}
+        if values.get("label") not in (None, ""):
+            found.append(class_name(classes, values["label"], f"{key}[{index}].label"))
+            continue
+        mesh = str(values.get("mesh"))
+        name = class_of_name(name_of_mesh(mesh), classes)
+        if name is None:
+            choices = nearest(name_of_mesh(mesh), classes)
+            fault = f"label is not set, and {mesh} is not named like a class of the network"
+            remedy = f"give label=CLASS or {{mesh: {mesh}, label: CLASS}}, such as {choices}"
+            raise InputError(f"{fault}: {remedy}", "label")
+        found.append(name)
+    return found
+
+
+def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:
+    """Find the only class of meshes, see `classes_of_meshes`.
+
+    Args:
+        items: Files, solids or mappings with the fields of `ObjectSettings`.
+        classes: Names of all classes of a network.
         key: Setting that lists the meshes, for the error.
 
     Returns:
@@ -76,21 +122,42 @@ def class_of_meshes(items: Sequence[Any], classifier: Classifier, key: str) -> s
     Raises:
         InputError: If the meshes tell no class, or several.
     """
-    found = []
-    for item in items:
-        values = item if isinstance(item, dict) else {"mesh": item}
-        if values.get("label"):
-            found.append(class_name(classifier, values["label"], f"{key}.label"))
-            continue
-        mesh = str(values.get("mesh"))
-        stem = solid_name(mesh) or Path(mesh).stem
-        name = class_of_name(stem, classifier)
-        if name is None:
-            choices = nearest(stem, classifier.classes)
-            fault = f"label is not set, and {mesh} is not named like a class of {classifier.name}"
-            raise InputError(f"{fault}: set label=CLASS, such as {choices}", "label")
-        found.append(name)
+    found = classes_of_meshes(items, classes, key)
     if len(set(found)) != 1:
         fault = f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}"
         raise InputError(f"{fault}: give the meshes of one class, or label=CLASS", "label")
     return found[0]
+
+
+def with_classes_of_meshes(
+    settings: ExperimentSettings, classes: Sequence[str]
+) -> ExperimentSettings:
+    """Return settings whose label is the classes of their meshes.
+
+    Args:
+        settings: Settings of a run. Their label is None.
+        classes: Names of all classes of the network.
+
+    Returns:
+        Settings in which each mesh names its class. Each class is once in the
+        label, in the order of the meshes.
+
+    Raises:
+        InputError: See `classes_of_meshes`.
+    """
+    items = settings.scene.meshes
+    names = classes_of_meshes(items, classes, "scene.meshes")
+    meshes = []
+    for item, name in zip(items, names, strict=True):
+        values = item if isinstance(item, dict) else {"mesh": item}
+        meshes.append({**values, "label": name})
+    negatives = [
+        with_class_name(item, classes, "scene.hard_negatives")
+        for item in settings.scene.hard_negatives
+    ]
+    labels = list(dict.fromkeys(names))
+    return replace(
+        settings,
+        label=labels[0] if len(labels) == 1 else labels,
+        scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
+    )

@@ -421,7 +421,7 @@ class ExperimentSettings(NetworkSettings):
     label: Any = setting(  # str | list[str], for which OmegaConf has no type
         "orange",
         "Positive class: the class of the meshes, whose recall and false positives are measured. "
-        "Or several: [orange, apple].",
+        "Or several: [orange, apple]. null: the classes that scene.meshes name.",
         is_text=True,
     )
     compare: list[str] = setting(
@@ -449,7 +449,9 @@ class ExperimentSettings(NetworkSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        label_names(self.label)
+        if self.label is None:  # The objects are known when the meshes have named their classes.
+            return
+        self._remove_generated_positives()
         if self.augment.renders and self.augment.mode != "folder":
             if "pose" in self.augment.attack.parameters and not self.renderer.silhouettes:
                 remedy = "an attack on the pose needs renderer.silhouettes=true"
@@ -458,6 +460,15 @@ class ExperimentSettings(NetworkSettings):
             self.augment.examples = self.views * self.scene.objects * backgrounds
             product = "meshes × views × backgrounds"
             require_range(product, self.augment.examples, 1, MAX_EXAMPLES)
+
+    def _remove_generated_positives(self) -> None:
+        """Remove the hard negatives that are solids of a positive class and name no class."""
+        names = {simplified(name) for name in label_names(self.label)}
+        self.scene.hard_negatives = [
+            item
+            for item in self.scene.hard_negatives
+            if not (isinstance(item, str) and simplified(solid_name(item)) in names)
+        ]
 
     @property
     def views(self) -> int:
@@ -541,6 +552,21 @@ def solid_name(mesh: str) -> str:
     """Return the NAME of solid:NAME or solid:NAME:SEED, and "" for a file."""
     kind, name, *_ = [*mesh.split(":"), ""]
     return name if kind == "solid" else ""
+
+
+def simplified(name: str) -> str:
+    """Return a name in lower case, in which "_" and "-" are spaces.
+
+    Args:
+        name: Name of a class, a solid or a file.
+
+    Returns:
+        Name for comparisons.
+
+    >>> simplified("Sweet_pepper")
+    'sweet pepper'
+    """
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
 def label_names(label: str | int | Sequence[str | int]) -> list[str]:

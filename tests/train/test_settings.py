@@ -7,6 +7,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
+from augment.settings import AugmentationSettings
 from renderer.errors import InputError
 from scripts.attack import main as attack_command
 from scripts.evaluate import main as evaluate_command
@@ -14,7 +15,7 @@ from tests.runs import loaded_run
 from train.__main__ import main as train_command
 from train.command import Command, as_override, quoted
 from train.data.batches import rounds_of_epoch
-from train.settings import OTHER
+from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "run=here"]
 EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper"]
@@ -45,6 +46,14 @@ def test_a_classifier_of_another_library_needs_no_class_but_the_label():
     settings = train_command.read(["experiment=classifier", "label=mug", *files])
     assert {item.label for item in settings.objects.values()} == {"mug", OTHER}
     assert settings.data.name == "unlabelled"
+
+
+def test_a_solid_of_the_label_is_no_hard_negative_unless_it_is_of_another_class():
+    negatives = ["solid:lemon", "solid:sweet_pepper", {"mesh": "solid:lemon", "label": "lime"}]
+    scene = TrainingSceneSettings(hard_negatives=negatives, views=1)
+    augment = AugmentationSettings(examples=None)
+    settings = ExperimentSettings(label=["lemon", "Sweet pepper"], scene=scene, augment=augment)
+    assert settings.scene.hard_negatives == negatives[2:]
 
 
 def test_the_demonstration_has_one_epoch_of_three_rounds():
@@ -125,7 +134,7 @@ def test_a_wrong_setting_is_one_sentence_that_starts_with_its_key(overrides, sta
     assert "\n" not in sentence
 
 
-@pytest.mark.parametrize("path", ["solid:orange", "/a folder/örange.glb", "'a, b'"])
+@pytest.mark.parametrize("path", ["solid:lemon", "/a folder/örange.glb", "'a, b'"])
 def test_a_single_value_for_a_list_is_a_list_of_one(path):
     meshes = train_command.read([f"scene.hard_negatives={path}"]).scene.hard_negatives
     assert [str(mesh) for mesh in meshes] == [path.strip("'")]

@@ -33,7 +33,7 @@ from train.auditing.lights import (
     transfer_success,
 )
 from train.auditing.plain_light import PlainViews, find_plain_views
-from train.class_names import class_name, class_of_meshes, simplified, with_class_name
+from train.class_names import class_name, class_of_meshes, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import OTHER_PREFIX, find_photographs
@@ -44,7 +44,7 @@ from train.report.results import RESULTS, require_replaceable
 from train.runs.run_config import CONFIG, read_config, read_json, require_same, write_config
 from train.runs.run_lock import sole_writer
 from train.runs.saved_networks import load_chosen, load_network
-from train.settings import published, read_objects, solid_name
+from train.settings import published, read_objects, simplified, solid_name
 from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
 
@@ -221,17 +221,18 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
             the names of the meshes tell the class.
     """
     if settings.label is None:
-        label = class_of_meshes(settings.meshes, classifier, "meshes")
+        label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
     else:
-        label = class_name(classifier, settings.label, "label")
+        label = class_name(classifier.classes, settings.label, "label")
     negatives = [
-        with_class_name(item, classifier, "hard_negatives") for item in settings.hard_negatives
+        with_class_name(item, classifier.classes, "hard_negatives")
+        for item in settings.hard_negatives
     ]
     if not (negatives or settings.laboratory):
         negatives = [
             solid for solid in HARD_NEGATIVES if simplified(solid_name(solid)) != simplified(label)
         ]
-    meshes = [with_class_name(item, classifier, "meshes") for item in settings.meshes]
+    meshes = [with_class_name(item, classifier.classes, "meshes") for item in settings.meshes]
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 

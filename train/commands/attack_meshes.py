@@ -253,8 +253,8 @@ def attacks(
         label = "" if settings.label is None else str(settings.label)
         mesh = read_object(item, label, key)
         if not mesh.label:
-            mesh.label = class_of_meshes([item], classifier, key)
-        mesh.label = class_name(classifier, mesh.label, "label")
+            mesh.label = class_of_meshes([item], classifier.classes, key)
+        mesh.label = class_name(classifier.classes, mesh.label, "label")
         yield _attack_mesh(settings, classifier, device, mesh)
 
 
@@ -374,9 +374,9 @@ def load_targets(
     if settings.transfer.classifiers or settings.transfer.meshes:
         # Another classifier may have the class at another index.
         if settings.label is None:
-            label = class_of_meshes(settings.scene.meshes, attacked, "scene.meshes")
+            label = class_of_meshes(settings.scene.meshes, attacked.classes, "scene.meshes")
         else:
-            label = class_name(attacked, settings.label, "label")
+            label = class_name(attacked.classes, settings.label, "label")
     classifiers = []
     for item in settings.transfer.classifiers:
         classifier = _load_classifier(item).to(device)

@@ -26,6 +26,7 @@ from train.settings import ExperimentSettings
 from train.system.processes import Interrupted, broadcast, process_group
 from train.system.user_errors import keyed, writable_folder
 from train.system.verbosity import is_verbose
+from train.training.initial import with_label
 from train.training.run import load_runs
 
 # Folders of conf/ from which an override can choose a file.
@@ -71,7 +72,7 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
     # continues with the settings that it began with.
     if config.train.resume and not any(map(_is_choice, overrides)):
         config, command = resumed(config, overrides)
-    settings = read_settings(ExperimentSettings, config)
+    settings = with_label(read_settings(ExperimentSettings, config))
     methods = _list_methods(settings, folder)
     for path, method_settings in methods.items():
         if settings.train.resume and (path / CONFIG).is_file():

@@ -25,6 +25,7 @@ from renderer.settings import Settings
 from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
+from train.class_names import with_classes_of_meshes
 from train.command import read_settings
 from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
 from train.report.report_page import report_of
@@ -35,8 +36,6 @@ from train.settings import (
     ExperimentSettings,
     TrainingSceneSettings,
     TrainSettings,
-    label_names,
-    solid_name,
 )
 from train.system.folders import folder_or_temporary
 from train.system.user_errors import keyed
@@ -135,7 +134,7 @@ def harden(
             "run": str(folder.absolute()),
             "seed": seed,
             "overwrite": overwrite,
-            "label": labels[0] if len(labels) == 1 else labels,
+            "label": None if label is None else labels[0],
             "data": {"name": "unlabelled", "path": str(as_path("photographs", photographs))},
             "scene": {"meshes": items},
             "train": {"init_from": classifier.name, "device": str(device)},
@@ -154,6 +153,8 @@ def harden(
             "data": data,
         }
         settings = _read_settings(changes, sections)
+        if settings.label is None:
+            settings = with_classes_of_meshes(settings, classifier.classes)
         require_new_run(folder, "out", overwrite, resume=False)
         with sole_writer("out", folder), _state_of_torch_kept():
             trained = _train(settings, classifier, has_report=out is not None)
@@ -171,10 +172,6 @@ def _read_settings(
     settings.evaluate.laboratory_setups = 0
     given = {name: _as_mapping(name, section) for name, section in sections.items()}
     merged = OmegaConf.merge(settings, changes, given)
-    if "hard_negatives" not in changes["scene"]:
-        labels = label_names(changes["label"])
-        negatives = [item for item in merged.scene.hard_negatives if solid_name(item) not in labels]
-        merged.scene.hard_negatives = negatives
     return read_settings(ExperimentSettings, cast(DictConfig, merged))
 
 

@@ -9,8 +9,7 @@ from augment.classifiers import Classifier
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
 from renderer.validation import as_list
-from train.class_names import class_of_name
-from train.settings import solid_name
+from train.class_names import classes_of_meshes, name_of_mesh
 
 # A mesh as an argument: a file or solid:NAME, a pair of these and a class, or
 # settings.
@@ -74,7 +73,7 @@ def studied_classes(
     """
     if label is not None:
         return [classifier.classes[classifier.label(label)]]
-    return list(dict.fromkeys(_class_of(mesh, classifier) for mesh in meshes))
+    return list(dict.fromkeys(classes_of_meshes(meshes, classifier.classes, "meshes")))
 
 
 def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
@@ -88,7 +87,7 @@ def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[st
         InputError: If one is of such a class, by its label or by its name.
     """
     for index, item in enumerate(hard_negatives):
-        name = item.get("label") or _name_of(item)
+        name = item.get("label") or name_of_mesh(item["mesh"])
         # If there are several positive classes, an object of one class is a hard negative for
         # the others.
         is_studied = name in labels and (len(labels) == 1 or not item.get("label"))
@@ -97,21 +96,3 @@ def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[st
                 f"hard_negatives[{index}] is {item['mesh']}, of the positive class {name}: "
                 "move it to meshes, or remove it"
             )
-
-
-def _name_of(mesh: dict[str, Any]) -> str:
-    """Return the name of a solid, or that of a file without its ending."""
-    return solid_name(mesh["mesh"]) or Path(mesh["mesh"]).stem
-
-
-def _class_of(mesh: dict[str, Any], classifier: Classifier) -> str:
-    """Return the label of a mesh or, without a label, the class that its file is named after."""
-    if mesh.get("label"):
-        return str(mesh["label"])
-    name = class_of_name(_name_of(mesh), classifier)
-    if name is None:
-        raise InputError(
-            f"label is not given, and {mesh['mesh']} is not named by a class of the network: "
-            "give label, or pairs of a mesh and its class"
-        )
-    return name

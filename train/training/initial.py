@@ -14,6 +14,7 @@ from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
 from train import console
+from train.class_names import with_classes_of_meshes
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, describe
@@ -136,6 +137,29 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     with keyed(run="train.init_from"):
         path, state = load_selected(Path(name))
     return Initial(path, state["architecture"], plain_weights(state))
+
+
+def with_label(settings: ExperimentSettings) -> ExperimentSettings:
+    """Return settings with a label. Without one, it is the classes of the meshes.
+
+    Args:
+        settings: Settings of a run.
+
+    Returns:
+        The same settings if they have a label. Otherwise the meshes name their
+        classes, too.
+
+    Raises:
+        InputError: If there is no initial network, whose classes are needed, or
+            if it lacks the class of a mesh.
+    """
+    if settings.label is not None:
+        return settings
+    initial = load_initial(settings)
+    if initial is None:
+        problem = "label is not set, and there is no train.init_from whose classes are known"
+        raise InputError(f"{problem}: set label=CLASS", "label")
+    return with_classes_of_meshes(settings, initial.classes)
 
 
 def _classifier(settings: ExperimentSettings, name: str) -> Initial:

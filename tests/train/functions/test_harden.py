@@ -1,11 +1,13 @@
 """A copy of any network is hardened in one call, as pnb-train does it."""
 
+from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from torch import nn
 
@@ -59,11 +61,13 @@ def photographs(tmp_path) -> Path:
     return folder
 
 
-def harden(network: nn.Module, photographs: Path, **options) -> nn.Module:
+def harden(
+    network: nn.Module, photographs: Path, meshes: Sequence[object] = ("solid:orange:0",), **options
+) -> nn.Module:
     options = (
         {"classes": CLASSES, "size": SIZE, "hard_negatives": ["solid:lemon"]} | SHORT | options
     )
-    return nb.harden(network, ["solid:orange:0"], photographs, **options)
+    return nb.harden(network, meshes, photographs, **options)
 
 
 def test_the_result_loads_where_the_network_was_loaded(network, photographs):
@@ -122,6 +126,22 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     assert all(value.equal(expected[name]) for name, value in hardened.state_dict().items())
     written = torch.load(tmp_path / "hardened" / "weights.pt")
     assert all(value.equal(expected[name]) for name, value in written.items())
+
+
+def test_each_mesh_trains_the_class_that_it_or_its_file_names(network, photographs, tmp_path):
+    file = tmp_path / "PEAR.ply"
+    trimesh.creation.box().export(file)
+    meshes = ["solid:orange:0", file]
+    options = {"hard_negatives": ["solid:fruit"], "train": SHORT["train"] | {"epochs": 3}}
+    hardened = harden(network, photographs, meshes=meshes, **options)
+    named = harden(
+        network, photographs, meshes=[("solid:orange:0", 1), (str(file), "pear")], **options
+    )
+    swapped = harden(
+        network, photographs, meshes=[("solid:orange:0", "pear"), (str(file), 1)], **options
+    )
+    assert torch.equal(hardened[4].weight, named[4].weight)
+    assert not torch.equal(hardened[4].weight, swapped[4].weight)
 
 
 def test_a_classifier_is_hardened_as_its_network_is(network, photographs):

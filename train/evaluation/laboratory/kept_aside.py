@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
-from train.class_names import simplified
 from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photographs import OTHER_PREFIX
-from train.settings import ExperimentSettings, label_names
+from train.settings import ExperimentSettings, label_names, simplified
 
 # Seeds of the first instance. Training draws its seeds from far larger numbers,
 # or names lower ones.

@@ -12,7 +12,8 @@ from train.settings import ExperimentSettings
 def settings() -> ExperimentSettings:
     """Read the settings of the hardening of a classifier by an orange and other fruit."""
     words = ("experiment=classifier", "train.init_from=pretrained/none", "data.path=photos")
-    return train_command.read([*words, "scene.meshes=[solid:orange:0,solid:orange]"])
+    meshes = "scene.meshes=[solid:orange:0,solid:orange]"
+    return train_command.read([*words, "label=orange", meshes])
 
 
 def test_no_instance_and_no_pattern_is_one_of_training(settings, tmp_path):

@@ -1,0 +1,62 @@
+"""The classes of a run are those that its meshes name."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from renderer.errors import InputError
+from train import class_names
+from train.__main__ import main as train_command
+from train.settings import ExperimentSettings
+
+CLASSES = ["banana", "coffee mug", "lemon", "orange"]
+
+
+def settings(meshes: list, hard_negatives: list | None = None) -> ExperimentSettings:
+    overrides = ["experiment=classifier", "train.init_from=a", "data.path=b", "run=c"]
+    composed = train_command.read(overrides)
+    scene = replace(composed.scene, meshes=meshes, hard_negatives=hard_negatives or [])
+    return replace(composed, scene=scene)
+
+
+def test_label_lists_the_classes_of_labels_files_and_solids_once():
+    meshes = [
+        {"mesh": "scan.glb", "label": "banana", "albedo_scale": 2.0},
+        "objects/Coffee_Mug.glb",
+        {"mesh": "other_scan.glb", "label": 0},
+        "solid:lemon:3",
+    ]
+    named = class_names.with_classes_of_meshes(settings(meshes), CLASSES)
+    assert named.label == ["banana", "coffee mug", "lemon"]
+    labels = [item.label for item in named.objects.values()]
+    assert labels == ["banana", "coffee mug", "banana", "lemon"]
+    assert named.scene.meshes[0]["albedo_scale"] == 2.0
+
+
+def test_label_of_one_class_is_its_name():
+    named = class_names.with_classes_of_meshes(settings(["orange.glb", "solid:orange"]), CLASSES)
+    assert named.label == "orange"
+
+
+def test_generated_hard_negatives_of_these_classes_are_left_out():
+    negatives = ["solid:fruit", "solid:lemon", {"mesh": "solid:orange", "label": 3}]
+    named = class_names.with_classes_of_meshes(settings(["lemon.glb"], negatives), CLASSES)
+    assert named.scene.hard_negatives == [
+        "solid:fruit",
+        {"mesh": "solid:orange", "label": "orange"},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        ("bananas.glb", "label is not set, and bananas.glb is not named like a class"),
+        ("bananas.glb", "such as banana"),
+        ({"mesh": "a.glb", "label": 4}, "scene.meshes[0].label: the label 4 is not a class"),
+        ({"mesh": "a.glb", "label": "mug"}, "scene.meshes[0].label: 'mug' is not a class"),
+    ],
+)
+def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        class_names.with_classes_of_meshes(settings([mesh]), CLASSES)
