@@ -1,11 +1,11 @@
-"""Progress bars and messages for long work, and timers for its phases."""
+"""Progress bars for long work, and timers for its phases."""
 
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from threading import Event, Thread
+from threading import Timer
 from typing import TypeVar
 
 import torch
@@ -14,7 +14,6 @@ from tqdm import tqdm
 from augment.distributed import rank
 
 PATIENCE = 2.0  # Seconds before the first sign of progress.
-LONGEST_WAIT = 30.0  # Seconds between two lines of progress.
 Item = TypeVar("Item")
 
 
@@ -24,13 +23,12 @@ def progress(
     total: int | None = None,
     done: int = 0,
 ) -> Iterator[Item]:
-    """Yield items, and show on the standard error stream how many of them are done.
+    """Yield items, and show a bar on a terminal that says how many of them are done.
 
-    Progress is shown after `PATIENCE` seconds, even if no item is done by then.
-    A terminal shows a bar. Other streams get a line with the number of items and
-    the remaining time. The line is repeated after intervals that double up to
-    `LONGEST_WAIT` seconds. If there are several processes, only the first one
-    shows progress.
+    The bar stands on the standard error stream. It appears after `PATIENCE`
+    seconds, even if no item is done by then, and is removed at the end. Nothing
+    is written if the stream is a file or a pipe. If there are several processes,
+    only the first one shows the bar.
 
     Args:
         items: The items.
@@ -41,67 +39,36 @@ def progress(
     Yields:
         Each item.
     """
-    is_terminal = sys.stderr.isatty()
-    is_first = rank() == 0
+    is_shown = sys.stderr.isatty() and rank() == 0
     bar = tqdm(
         items,
         description,
         total,
         leave=False,
         delay=PATIENCE,
-        disable=not (is_terminal and is_first),
+        disable=not is_shown,
         initial=done,
     )
-    counted = _Progress(description, bar, done, is_terminal)
-    if is_first:
-        Thread(target=counted.show, daemon=True).start()
+    # tqdm alone shows a bar only after the first item.
+    timer = Timer(PATIENCE, _show, [bar])
+    timer.daemon = True
+    if is_shown:
+        timer.start()
     try:
-        for item in bar:
-            yield item
-            counted.done += 1
+        yield from bar
     finally:
-        counted.ended.set()
+        timer.cancel()
 
 
-class _Progress:
-    """Shows progress from a thread of its own, also before the first item is done."""
-
-    def __init__(self, description: str, bar: "tqdm[Item]", done: int, is_terminal: bool):
-        self.done = done
-        self.ended = Event()
-        self._description = description
-        self._bar = bar
-        self._done_before = done
-        self._is_terminal = is_terminal
-        self._start = time.perf_counter()
-
-    def show(self) -> None:
-        """Show a bar or lines until the items end."""
-        wait = PATIENCE
-        while not self.ended.wait(wait):
-            if self._is_terminal:
-                # The bar updates itself after its first appearance.
-                self._bar.delay = 0
-                self._bar.refresh()
-                return
-            print(f"{self._description}{self._count()} ...", file=sys.stderr, flush=True)
-            wait = min(2 * wait, LONGEST_WAIT)
-
-    def _count(self) -> str:
-        """Return how many items are done, and how much time is left, as far as is known."""
-        total = self._bar.total
-        done = self.done
-        count = f": {done} of {total}" if done and total else ""
-        if total and done > self._done_before:
-            seconds_per_item = (time.perf_counter() - self._start) / (done - self._done_before)
-            seconds_left = seconds_per_item * (total - done)
-            count += f", {tqdm.format_interval(seconds_left)} left at this rate"
-        return count
+def _show(bar: "tqdm[Item]") -> None:
+    """Show a bar before its first item is done. It updates itself afterwards."""
+    bar.delay = 0
+    bar.refresh()
 
 
 @contextmanager
 def progress_message(description: str) -> Iterator[None]:
-    """Show `progress` of a `with` block.
+    """Show the bar of `progress` during a `with` block.
 
     Args:
         description: What the block does, such as "loading the network".

@@ -1,4 +1,4 @@
-"""pnb-compare: print Markdown tables of finished runs, side by side."""
+"""pnb-compare: print Markdown tables of finished runs."""
 
 from train.command import Command
 from train.command_settings import CompareSettings
@@ -9,7 +9,7 @@ main = Command(
     settings=CompareSettings,
     body="train.commands.compare:print_comparison",
     help=HelpText(
-        about="Print Markdown tables of finished runs, side by side.",
+        about="Print a Markdown table of finished runs. With -v, print all tables.",
         examples=[
             "pnb-compare 'runs=[runs/a,runs/b]'",
         ],

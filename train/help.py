@@ -20,6 +20,7 @@ CONF = Path(conf.__path__[0])
 KEY_WIDTH = 44
 # Number of characters of an explanation in a line.
 TEXT_WIDTH = 80
+VERBOSE_HELP = "Print details. Without it, a command prints its result in at most 15 lines."
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class HelpText:
             sections.append("\n".join(["Changed most often:", *common]))
         if self.groups:
             sections.append("\n".join(["Choices:", *_choice_lines(self.groups)]))
+        sections.append("\n".join(["Options:", _format_line("-v, --verbose", VERBOSE_HELP)]))
         sections.append("\n".join(["Settings:", *lines.values()]))
         return "\n\n".join(sections)
 

@@ -77,7 +77,10 @@ NO_HARD_NEGATIVES = (
 ADDED = ("hardened", "photos")
 
 
-def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None = None) -> Path:
+def run_audit(
+    settings: AuditSettings,
+    networks: Mapping[str, Classifier] | None = None,
+) -> page.Audited:
     """Measure the parts that are missing in the folder `settings.out`, and write the report.
 
     Args:
@@ -86,7 +89,7 @@ def run_audit(settings: AuditSettings, networks: Mapping[str, Classifier] | None
             load those that the settings name.
 
     Returns:
-        Path of the report.
+        The report.
 
     Raises:
         InputError: If an input cannot be read, if a network lacks a class, or

@@ -59,13 +59,29 @@ PASS_THRESHOLD = 0.9
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
 
 
+class Audited(NamedTuple):
+    """The report of an audit.
+
+    Attributes:
+        path: Path of report.html.
+        screen: First screen of the report.
+        label: Class whose objects were tested.
+        names: Names of the networks by the folders of their parts.
+    """
+
+    path: Path
+    screen: FirstScreen
+    label: str
+    names: Mapping[str, str]
+
+
 def write_audit_page(
     label: str,
     names: Mapping[str, str],
     folders: Mapping[str, Path],
     out: Path,
     caveats: Sequence[str],
-) -> Path:
+) -> Audited:
     """Write report.html from the parts of an audit.
 
     Args:
@@ -76,7 +92,7 @@ def write_audit_page(
         caveats: Sentences at the beginning of the report.
 
     Returns:
-        Path of the report.
+        The report.
     """
     paths = {name: out / key for key, name in names.items()}
     scored = {
@@ -92,7 +108,8 @@ def write_audit_page(
     transfers = {}
     if len(paths) > 1:
         transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
-    return write_page(
+    screen = _first_screen(label, paths, folders, counts, plain)
+    path = write_page(
         out,
         "audit.html.jinja",
         title=f"Audit: {label} under unusual lighting",
@@ -112,11 +129,12 @@ def write_audit_page(
         photographs=_score_sections(paths),
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
-        screen=_first_screen(label, paths, folders, counts, plain),
+        screen=screen,
         caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
         agreement=_agreement(scored),
         config=read_config(out / CONFIG),
     )
+    return Audited(path, screen, label, names)
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:

@@ -7,7 +7,14 @@ from typing import Any
 
 from renderer.io.files import atomic_write
 from renderer.validation import as_path
-from train.auditing.audit_page import CLASSIFIER, HARDENED, RECOGNIZED, TRANSFER, write_answer
+from train.auditing.audit_page import (
+    CLASSIFIER,
+    HARDENED,
+    RECOGNIZED,
+    TRANSFER,
+    Audited,
+    write_answer,
+)
 from train.auditing.lights import KINDS
 from train.evaluation.scores.metrics import METRICS, read_metric
 from train.evaluation.scores.scoring import SUMMARY
@@ -99,19 +106,21 @@ class AuditReport:
         return "\n".join(network.answer for network in networks)
 
 
-def read_audit(label: str, names: Mapping[str, str], page: Path) -> AuditReport:
+def read_audit(audited: Audited) -> AuditReport:
     """Read the numbers of an audit from its folder.
 
     Args:
-        label: Class whose objects were tested.
-        names: Names of the networks by the folders of their parts.
-        page: The page in the folder of the audit.
+        audited: The page in the folder of the audit, and what it shows.
 
     Returns:
         The report.
     """
-    networks = {key: _read_network(label, name, page.parent / key) for key, name in names.items()}
-    text = page.read_text(encoding="utf-8")
+    folder = audited.path.parent
+    label = audited.label
+    networks = {}
+    for key, name in audited.names.items():
+        networks[key] = _read_network(label, name, folder / key)
+    text = audited.path.read_text(encoding="utf-8")
     return AuditReport(label, networks[CLASSIFIER], networks.get(HARDENED), text)
 
 

@@ -38,6 +38,7 @@ from train.class_names import class_name, class_of_meshes
 from train.command import command_line
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.commands import attack_photographs
+from train.evaluation.tables import Table
 from train.report.attack_tables import (
     FIGURE,
     TABLE,
@@ -55,7 +56,7 @@ from train.runs.saved_networks import load_chosen, load_network
 from train.settings import read_object, read_objects
 from train.system.device import choose_device, choose_rasterizer
 from train.system.user_errors import keyed, keys_of, writable_folder
-from train.system.verbosity import is_verbose
+from train.system.verbosity import is_verbose, shortened
 
 # Settings that `find_scene` may change, in the order in which they are printed.
 SEARCHED_SETTINGS = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
@@ -73,6 +74,28 @@ class MeshAttack(NamedTuple):
     name: str
     scene: AttackSceneSettings
     result: AttackResult
+
+
+@dataclass
+class Outcome:
+    """What is printed about the attack on one mesh.
+
+    Attributes:
+        name: Name of the mesh.
+        heading: Sentence with the success.
+        details: Lines of further results.
+        success_count: Number of examples with a success, of those that were
+            correct before.
+        correct_count: Number of examples that were correct before.
+        example_count: Number of all examples.
+    """
+
+    name: str
+    heading: str
+    details: list[str]
+    success_count: int
+    correct_count: int
+    example_count: int
 
 
 @dataclass(frozen=True)
@@ -129,7 +152,8 @@ def run(settings: AttackExperimentSettings) -> None:
         classifier = load_chosen(settings).to(device)
     if adversary is not None:
         images = adversary.render(_start_rasterizer(settings)).to(device)
-        print(format_reloaded(adversary, images, classifier, settings.attack, settings.seed))
+        views = format_reloaded(adversary, images, classifier, settings.attack, settings.seed)
+        print("\n".join(shortened(views)))
         if not settings.attack.parameters:
             return
     targets = load_targets(settings, classifier, device)
@@ -138,20 +162,27 @@ def run(settings: AttackExperimentSettings) -> None:
     with sole_writer("out", out):
         _remove_adversaries(out)
         sweeps: dict[str, Sweep] = {}
+        outcomes = []
         mesh_attacks = attacks(settings, classifier, device, adversary)
         for index, mesh_attack in enumerate(mesh_attacks):
             # Windows allows no colon in the name of a folder.
             stem = Path(mesh_attack.name.replace(":", "_")).stem
             folder = out / f"{index}_{stem}"
-            _write_attack(mesh_attack, folder, settings, targets)
+            outcome = _write_attack(mesh_attack, folder, settings, targets)
             if settings.attack.radius_scales:
                 sweep = success_by_radius(mesh_attack.result, settings.attack.radius_scales)
                 sweeps[folder.name] = sweep
-                print(f"{format_sweep(sweep)}\n")
+                outcome.details += format_sweep(sweep).splitlines()
+            outcomes.append(outcome)
+            if is_verbose():
+                print("\n".join([outcome.heading, *outcome.details, ""]))
+        if not is_verbose():
+            print("\n".join(shortened(format_outcomes(outcomes))))
         if sweeps:
             norms = {name: steps.norm for name, steps in settings.attack.parameters.items()}
             write_sweeps(sweeps, norms, out)
-            print(f"success against radius: {out / TABLE} and {out / FIGURE}")
+            if is_verbose():
+                print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         write_config(out, settings, command=command_line("attack"))
     print(f"images, adversaries and numbers: {out}")
 
@@ -179,31 +210,69 @@ def _write_attack(
     folder: Path,
     settings: AttackExperimentSettings,
     targets: TransferTargets,
-) -> None:
-    """Check the attack on one mesh, write its files into a folder, and print its summary.
+) -> Outcome:
+    """Check the attack on one mesh, write its files into a folder, and return its outcome.
 
-    With --verbose, print what the checks found, too.
+    With --verbose, the details have what the checks found, too.
     """
     name = mesh_attack.name
     result = mesh_attack.result
+    clean = result.clean_correct
+    details = []
     if mesh_attack.scene != settings.scene:
         changes = overrides(mesh_attack.scene, settings.scene)
-        print(f"{name} is misclassified in the given scene, but not with {changes}")
+        details.append(f"{name} is misclassified in the given scene, but not with {changes}")
     has_checks = settings.attack.checks
     if has_checks is None:
         has_checks = result.settings.uses_gradients
     checks = check(result) if has_checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
     if is_verbose():
-        print(format_attack(name, result, checks, lines))
-        print(f"images, adversaries and numbers: {folder}\n")
+        heading, *found = format_attack(name, result, checks, lines)
+        details += [*found, f"images, adversaries and numbers: {folder}"]
     else:
-        print(format_attack(name, result, None))
-        for warning in warnings(checks) if checks else ():
-            print(f"warning: {warning}")
+        (heading,) = format_attack(name, result, None)
+        doubts = warnings(checks) if checks else []
+        details += [f"warning about {name}: {doubt}" for doubt in doubts]
     if targets:
         table = write_transfers(targets.transfer(result), folder / TRANSFERS)
-        print(f"{table}\n")
+        details += table.splitlines()
+    return Outcome(
+        name,
+        heading,
+        details,
+        success_count=int(result.success[clean].sum()),
+        correct_count=int(clean.sum()),
+        example_count=len(clean),
+    )
+
+
+def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
+    """Write the outcomes of several meshes.
+
+    Args:
+        outcomes: Outcome for each mesh.
+
+    Returns:
+        Lines. One mesh has its sentence. Several meshes have their number of
+        successes and a table with a row for each. The details follow.
+    """
+    (first, *others) = outcomes
+    lines = [first.heading]
+    if others:
+        successes = sum(outcome.success_count for outcome in outcomes)
+        correct = sum(outcome.correct_count for outcome in outcomes)
+        counted = f"{successes} of {correct} examples that were correct before"
+        lines = [f"{len(outcomes)} meshes: success on {counted}"]
+        header = ["mesh", "examples", "correct before", "success"]
+        rows = [
+            [item.name, item.example_count, item.correct_count, item.success_count]
+            for item in outcomes
+        ]
+        lines += str(Table("", header, rows)).splitlines()
+    for outcome in outcomes:
+        lines += outcome.details
+    return lines
 
 
 def _remove_adversaries(out: Path) -> None:
@@ -427,7 +496,7 @@ def format_reloaded(
     classifier: Classifier,
     settings: AttackSettings,
     seed: int,
-) -> str:
+) -> list[str]:
     """Say how a classifier predicts the images of a reloaded adversary.
 
     Args:
@@ -473,4 +542,4 @@ def format_reloaded(
         difference = 255 * float(differences[view])
         line += f"; values differ from the saved image's by {difference:.3g}/255 at most"
         lines.append(line)
-    return "\n".join(lines)
+    return lines

@@ -5,5 +5,7 @@ from train.command_settings import AuditSettings
 
 
 def audit(settings: AuditSettings) -> None:
-    """Run the audit of pnb-audit, and print the path of its report."""
-    print(f"report: {run_audit(settings)}")
+    """Run the audit of pnb-audit, and print its answer, its numbers and the path of its report."""
+    audited = run_audit(settings)
+    print(audited.screen)
+    print(f"report: {audited.path}")

@@ -3,12 +3,13 @@
 from pathlib import Path
 
 from train.command_settings import CompareSettings
-from train.report.comparison import format_comparison
+from train.report.comparison import format_comparison, format_short_comparison
 from train.report.summary import summarize
+from train.system.verbosity import is_verbose, shortened
 
 
 def print_comparison(settings: CompareSettings) -> None:
-    """Print Markdown tables that compare finished runs.
+    """Print a Markdown table that compares finished runs. With --verbose, print all tables.
 
     Args:
         settings: Settings of pnb-compare.
@@ -17,4 +18,10 @@ def print_comparison(settings: CompareSettings) -> None:
         InputError: If a folder holds no finished run.
     """
     runs = [summarize(Path(run)) for run in settings.runs]
-    print(format_comparison(runs, settings.exclude, settings.photographs, settings.by))
+    options = (settings.exclude, settings.photographs, settings.by)
+    if is_verbose():
+        print(format_comparison(runs, *options))
+        return
+    table = format_short_comparison(runs, *options)
+    print("\n".join(shortened(table.splitlines())))
+    print(f"-v shows intervals, settings, differences and scores by {settings.by}")

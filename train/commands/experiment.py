@@ -154,7 +154,7 @@ class _Terminal(_QuietHandler, logging.StreamHandler):
 
 
 @contextmanager
-def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
+def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterator[None]:
     """Log to a file, and what is no detail also to the console, until the block ends.
 
     With --verbose, the console shows details, too.
@@ -162,6 +162,7 @@ def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
     Args:
         path: The file. If its folder does not exist, it is made.
         prefix: Text before each line on the console.
+        level: Lowest level of the lines on the console, without --verbose.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = _LogFile(path, encoding="utf-8", errors="backslashreplace")
@@ -171,16 +172,16 @@ def logged_to(path: Path, prefix: str = "") -> Iterator[None]:
     # Matplotlib reports that it builds its font cache.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     root = logging.getLogger()
-    level = root.level
+    level_before = root.level
     root.setLevel(logging.INFO)
     console.setLevel(logging.DEBUG)
-    terminal.setLevel(logging.DEBUG if is_verbose() else logging.INFO)
+    terminal.setLevel(logging.DEBUG if is_verbose() else level)
     for handler in (terminal, file):
         root.addHandler(handler)
     try:
         yield
     finally:
-        root.setLevel(level)
+        root.setLevel(level_before)
         console.setLevel(logging.NOTSET)
         for handler in (terminal, file):
             root.removeHandler(handler)

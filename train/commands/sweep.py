@@ -5,6 +5,7 @@ repeated. Hydra's launchers start the runs, in this process or in others. The
 results are read from the folders.
 """
 
+import logging
 import shutil
 import sys
 import traceback
@@ -22,7 +23,7 @@ from renderer.io.files import atomic_write
 from train import console
 from train.command import compose, quoted, read_settings
 from train.commands.experiment import LOG, logged_to
-from train.report.comparison import format_table
+from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import PAGE, report_of
 from train.report.results import require_new_run, require_replaceable
 from train.report.summary import is_finished, summarize
@@ -32,7 +33,12 @@ from train.runs.run_lock import FAILURE, locked, state
 from train.runs.run_names import run_name
 from train.settings import ExperimentSettings
 from train.system.user_errors import user_message, writable_folder
+from train.system.verbosity import is_verbose, shortened
 from train.training.run import load_runs
+
+# Lines of the table and of the list of unfinished runs without --verbose.
+MAX_TABLE_LINES = 10
+MAX_UNFINISHED = 3
 
 
 def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
@@ -117,13 +123,19 @@ def run_in_sweep(config: DictConfig) -> None:
     folder = Path(config.run)
     with locked(folder) as has_lock:
         if not has_lock:
-            print(f"in training elsewhere: {folder}", flush=True)
+            _print_detail(f"in training elsewhere: {folder}")
         elif is_finished(folder):
-            print(f"finished before: {folder}", flush=True)
+            _print_detail(f"finished before: {folder}")
         else:
             (folder / FAILURE).unlink(missing_ok=True)
-            print(f"training: {folder}", flush=True)
+            _print_detail(f"training: {folder}")
             _run_and_record_failure(config, folder)
+
+
+def _print_detail(line: str) -> None:
+    """Print a line about one run of a sweep if details are printed."""
+    if is_verbose():
+        print(line, flush=True)
 
 
 def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
@@ -132,7 +144,7 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
     # The runs of joblib's launcher print at the same time.
     shares_console = "n_jobs" in job.launcher
     prefix = f"#{job.job.num} " if shares_console else ""
-    with logged_to(folder / LOG, prefix):
+    with logged_to(folder / LOG, prefix, level=logging.CRITICAL):
         try:
             _run(config, folder, list(job.overrides.task))
         except Exception as error:
@@ -174,14 +186,20 @@ def format_sweep(folders: Sequence[Path]) -> str:
 
     Returns:
         The number of finished runs, their table with means over several seeds,
-        and the state of the other runs.
+        and the state of the other runs. Without --verbose, the table and the
+        list are short.
     """
     finished = [folder for folder in folders if is_finished(folder)]
-    parts = [f"{len(finished)} of {len(folders)} runs are finished"]
-    if finished:
-        parts.append(format_table([summarize(folder) for folder in finished]))
+    lines = [f"{len(finished)} of {len(folders)} runs are finished", ""]
     unfinished = [folder for folder in folders if folder not in finished]
+    if finished:
+        runs = [summarize(folder) for folder in finished]
+        table = format_table(runs) if is_verbose() else format_short_comparison(runs)
+        # Only a few rows fit beside a list of unfinished runs.
+        limit = MAX_TABLE_LINES - MAX_UNFINISHED if unfinished else MAX_TABLE_LINES
+        lines += shortened(table.splitlines(), limit)
     if unfinished:
-        parts += [f"{folder}: {state(folder)}" for folder in unfinished]
-        parts.append("to go on, give the same command again")
-    return "\n" + "\n\n".join(parts)
+        states = [f"{folder}: {state(folder)}" for folder in unfinished]
+        lines += shortened(states, MAX_UNFINISHED)
+        lines.append("to go on, give the same command again")
+    return "\n".join(lines)

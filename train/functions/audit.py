@@ -130,6 +130,4 @@ def audit(
                 out=str(folder),
                 overwrite=overwrite,
             )
-            report = run_audit(settings, networks)
-            names = {key: item.name for key, item in networks.items()}
-            return read_audit(positive_classes[0], names, report)
+            return read_audit(run_audit(settings, networks))

@@ -41,7 +41,7 @@ def format_attack(
     result: AttackResult,
     checks: Mapping[str, Any] | None,
     lines: Sequence[Mapping[str, Any]] = (),
-) -> str:
+) -> list[str]:
     """Write what came of the attack on one mesh.
 
     Args:
@@ -51,7 +51,7 @@ def format_attack(
         lines: Lines of attack.jsonl, as `augment.save` returns them.
 
     Returns:
-        Lines without a newline at the end.
+        Lines. The first one says how often the attack succeeds.
     """
     has_noise = bool(result.settings.sensor_noise)
     text = [_heading(name, result)]
@@ -61,7 +61,7 @@ def format_attack(
     if adversaries:
         for version in adversaries[0]["versions"]:
             text.append(_version_line(version, adversaries, has_noise))
-    return "\n".join(text)
+    return text
 
 
 def _heading(name: str, result: AttackResult) -> str:

@@ -30,6 +30,7 @@ from train.report.summary import (
     INITIAL,
     RunSummary,
     Scored,
+    ScoredRun,
     group_by_images,
     group_by_method,
     label_title,
@@ -41,6 +42,8 @@ from train.settings import PHOTOGRAPHS
 
 # Titles of the columns of metrics.
 TITLES = [metric_title(name) for name in METRICS]
+# Metrics of the table that is printed without --verbose.
+SHORT_METRICS = ("recall", "false_positive_rate", "auc")
 
 
 @dataclass(frozen=True)
@@ -448,7 +451,7 @@ def format_comparison(
     methods = group_by_method(runs)
     groups = group_by_images(methods)
     tables = run_tables(methods, groups)
-    overall = f"all but {', '.join(exclude)}" if exclude else "all"
+    overall = _title_of_all(exclude)
     group = _find_group(list(groups.values()), photographs)
     if group is not None:
         evaluations = read_evaluations(group, exclude, by)
@@ -456,6 +459,84 @@ def format_comparison(
         tables += difference_tables(evaluations, overall, by)
     tables.append(seconds_table(methods))
     return _format_tables(tables)
+
+
+def format_short_comparison(
+    runs: Sequence[RunSummary],
+    exclude: Sequence[str] = (),
+    photographs: str = PHOTOGRAPHS,
+    by: str = "source",
+) -> str:
+    """Compare runs in one table, which pnb-compare prints without --verbose.
+
+    Args:
+        runs: Finished runs and scored networks.
+        exclude: See `format_comparison`.
+        photographs: See `format_comparison`. If no run has a sub-folder of the
+            usual name, the first scored photographs of the runs are compared.
+        by: "source" for the metrics on all images, or "mesh" for the metrics of
+            each mesh.
+
+    Returns:
+        Markdown table. If `by` is "source", it has a row for each method, with
+        means over its runs. The gain in AUC over the first network has a 95%
+        interval.
+
+    Raises:
+        InputError: See `format_comparison`.
+    """
+    methods = group_by_method(runs)
+    groups = group_by_images(methods)
+    group = _find_group(list(groups.values()), photographs)
+    if group is None and groups:
+        group = next(iter(groups.values()))
+    evaluations = read_evaluations(group, exclude, by) if group else {}
+    if by != "source" and evaluations:
+        return str(group_table(evaluations, _title_of_all(exclude), by).known)
+    titles = [title for title, members in groups.items() if members is group]
+    rows = []
+    for method, members in methods.items():
+        scored = group.get(method, ()) if group else ()
+        found = evaluations.get(method)
+        if found is None and not exclude:
+            metrics = [_mean_score(scored, name) for name in SHORT_METRICS]
+        else:
+            metrics = [mean_metric(found or (), ALL, name) for name in SHORT_METRICS]
+        accuracies = [run.accuracy for run in members if run.accuracy is not None]
+        accuracy = Estimate(fmean(accuracies)) if accuracies else None
+        values = [_format_value(metric) for metric in (accuracy, *metrics)]
+        rows.append([method, len(members), *values, _format_gain(evaluations, method)])
+    header = ["network", "runs", "test accuracy", *map(metric_title, SHORT_METRICS)]
+    return str(Table("".join(titles), [*header, "gain in AUC [95%]"], rows).known)
+
+
+def _title_of_all(exclude: Sequence[str]) -> str:
+    """Name the images of all sources that are not excluded."""
+    return f"all but {', '.join(exclude)}" if exclude else "all"
+
+
+def _mean_score(scored: Sequence[ScoredRun], name: str) -> Estimate | None:
+    """Average a metric over runs, of which only scores are known."""
+    values = []
+    for item in scored:
+        metric = item.scores.metrics[name]
+        if metric is not None and metric.value is not None:
+            values.append(metric.value)
+    return Estimate(fmean(values)) if values else None
+
+
+def _format_value(metric: Estimate | None) -> str:
+    """Write a metric without its interval."""
+    return format_interval(None if metric is None else Estimate(metric.value))
+
+
+def _format_gain(methods: Evaluations, method: str) -> str:
+    """Write the difference of the AUC between a method and the first one."""
+    first = next(iter(methods), method)
+    if method == first or method not in methods:
+        return "-"
+    gain = difference(methods[method], methods[first], ALL, "auc")
+    return format_interval(gain, sign="+")
 
 
 def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:

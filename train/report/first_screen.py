@@ -11,7 +11,7 @@ from renderer.io.images import read_square
 from train.data.photographs import DESCRIPTION, OTHER_PREFIX
 from train.evaluation.scores.metrics import AreaUnderCurve
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
-from train.evaluation.tables import Estimate
+from train.evaluation.tables import Estimate, Table
 from train.report import comparison as compare
 from train.report import plots
 from train.report.plots import Picture
@@ -47,6 +47,18 @@ class Number:
     def text(self, value: float) -> str:
         """Write a value in percent, or with two decimals."""
         return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
+
+    def cells(self) -> list[str]:
+        """Write the title and the value of each network, with its 95% interval."""
+        cells = [self.title]
+        for estimate in (self.before, self.after):
+            if estimate is None or estimate.value is None:
+                continue
+            cell = self.text(estimate.value)
+            if estimate.low is not None and estimate.high is not None:
+                cell += f" [{self.text(estimate.low)}, {self.text(estimate.high)}]"
+            cells.append(cell)
+        return cells
 
 
 class Answer(NamedTuple):
@@ -97,6 +109,12 @@ class FirstScreen:
     rows: dict[str, list[Contrast]]
     names: Sequence[str]
     images: str
+
+    def __str__(self) -> str:
+        """Return the answer, its reasons and the table of the metrics as text."""
+        rows = [number.cells() for number in self.numbers]
+        table = Table("", ["", *self.names], rows)
+        return f"{' '.join([self.answer, *self.sentences])}\n\n{table}"
 
 
 class Compared(NamedTuple):

@@ -287,7 +287,7 @@ class TestAnAuditWithoutMitsuba:
         monkeypatch.setattr(audit, "transfer_success", lambda *arguments: transferred)
 
     def test_leaves_the_laboratory_out_and_says_so(self, given, tmp_path):
-        report = run_audit(AuditSettings(**given))
+        report = run_audit(AuditSettings(**given)).path
         assert "The laboratory is left out, and hard_negatives with it" in report.read_text()
         assert not (tmp_path / "audit/renders").exists()
         assert not (tmp_path / "audit/classifier/laboratory").exists()
@@ -298,7 +298,7 @@ class TestAnAuditWithoutMitsuba:
             Image.new("RGB", (8, 8), color).save(tmp_path / "lab" / label / "a.png")
         given |= {"hard_negatives": [], "laboratory": str(tmp_path / "lab")}
         settings = AuditSettings(**given, hardened="dark in larger images")
-        report = run_audit(settings).read_text()
+        report = run_audit(settings).path.read_text()
         assert "The laboratory is left out" not in report
         assert "The networks take images of 8 and 12 pixels" in report
         summary = json.loads((tmp_path / "audit/classifier/laboratory/summary.json").read_text())

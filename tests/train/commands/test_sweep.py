@@ -175,15 +175,8 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
     assert run_sweep(swept, "seed=0,1") == 0
     assert read_files(folders) == before
     printed = capsys.readouterr().out
-    for folder in folders:
-        assert f"finished before: {folder}\n" in printed
     (table,) = read_markdown(printed).values()
-    assert [row[:2] for row in table] == [
-        ["network", "seed"],
-        ["none", "0"],
-        ["none", "1"],
-        ["none", "2 seeds"],
-    ]
+    assert [row[:2] for row in table] == [["network", "runs"], ["none", "2"]]
 
 
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
@@ -239,7 +232,6 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
 
     overrides = ["train.epochs=1", "train.learning_rate=-1,0.05,0.5"]
     wrong = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=-1")
-    right = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.05")
     unlucky = folder_of(tmp_path, "train.epochs=1", "train.learning_rate=0.5")
     with monkeypatch.context() as patch:
         patch.setattr(Run, "fit", broken)
@@ -253,18 +245,16 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
 
     assert run_sweep(tmp_path, *overrides) == 1
     printed = capsys.readouterr().out
-    assert f"finished before: {right}\n" in printed
     assert "2 of 3 runs are finished\n" in printed
     assert f"{wrong}: failed: " in printed
     assert not (unlucky / FAILURE).exists()
 
 
-def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, tmp_path, capsys):
+def test_a_run_that_another_process_trains_is_left_alone(run_sweep, folder_of, tmp_path):
     folder = folder_of(tmp_path, "seed=3")
     with locked(folder):
         assert run_sweep(tmp_path, "seed=3") == 1
         assert f"{folder}: in training\n" in format_sweep([folder])
-    assert f"in training elsewhere: {folder}\n" in capsys.readouterr().out
     assert [path.name for path in folder.iterdir()] == [LOCK]
 
 
@@ -306,7 +296,7 @@ def start_sweep(folder: Path, *overrides: str) -> subprocess.Popen:
     """Start a sweep of a small network in processes of its own, which print to output.txt."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     environment.pop("SUBMITIT_EXECUTOR", None)
-    arguments = ["-m", "train", "--multirun", *SMALL, f"sweep={folder}", *overrides]
+    arguments = ["-m", "train", "-v", "--multirun", *SMALL, f"sweep={folder}", *overrides]
     with open(folder.parent / "output.txt", "w") as output:
         return subprocess.Popen(
             [sys.executable, *arguments],

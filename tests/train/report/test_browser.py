@@ -89,7 +89,7 @@ def page(tmp_path_factory) -> Path:
             patch.delitem(lights.KINDS, name)
         patch.setitem(lights.KINDS, "lighting", kind)
         patch.setattr(audit, "LIGHTS", 1)
-        return run_audit(settings, networks)
+        return run_audit(settings, networks).path
 
 
 @pytest.fixture(params=[(1280, "light"), (400, "light"), (1280, "dark"), (400, "dark")])
