@@ -48,7 +48,8 @@ def all_gather_rows(part: Tensor, examples: Tensor, total: int, world_size: int)
     """
     if world_size == 1:
         return part
-    # `all_gather_object` replaces each entry by the object of one process.
+    # These entries are placeholders. `all_gather_object` replaces entry i by what
+    # process i sends.
     parts = [(part, examples)] * world_size
     dist.all_gather_object(parts, (part.cpu(), examples.cpu()))
     whole = part.new_empty(total, *part.shape[1:])

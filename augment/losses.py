@@ -36,7 +36,8 @@ def adversarial_cost(logits: Tensor, source: Tensor, target: Tensor | None = Non
     Raises:
         InputError: If a source class has no logit.
     """
-    require_known(source.clamp(min=0), logits)  # NO_CLASS passes as class 0.
+    # NO_CLASS is negative. `clamp` turns it into class 0, which passes the check.
+    require_known(source.clamp(min=0), logits)
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
     if target is not None:
         cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)

@@ -10,10 +10,10 @@ MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine he
 GROUP = Path("/sys/fs/cgroup")  # Linux writes the memory limit of a container here (cgroup v2).
 GIB = 2**30
 
-# Numbers that an attack on the light holds beside the operators: for each
-# value of the light of an example, for each pixel of all images, and for each
-# pixel of the images that are rendered at once, without and with effects of
-# the camera.
+# Numbers that an attack on the light keeps in memory beside the operators.
+# `NUMBERS_PER_LIGHT_VALUE` counts for each coefficient of each example,
+# `NUMBERS_PER_PIXEL` for each pixel of all images. The last two count for each
+# pixel of the images that are rendered at once.
 NUMBERS_PER_LIGHT_VALUE = 12
 NUMBERS_PER_PIXEL = 10
 NUMBERS_PER_RENDERED_PIXEL = 16

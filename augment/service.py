@@ -442,7 +442,7 @@ class AugmentationService:
                 attack,
                 seed,
             )
-        # Examples that were misclassified before the attack needed none.
+        # Examples that are misclassified before the attack count as successes.
         success = self._gather(is_fooled.all(1) | result.success_before, shard)
         parts = [getattr(result, item.name) for item in fields(result)]
         result = DescentResult(*[self._gather(part, shard) for part in parts])
@@ -476,7 +476,8 @@ class AugmentationService:
         if not self.positive_classes:
             return Criterion(self.labels[:, None])
         positive_classes = torch.tensor(self.positive_classes, device=self.labels.device)
-        # Negative labels are complementary labels, which name no class of the example.
+        # A negative label is a complementary label: it says which class the example does
+        # not have. Such an example has no source class.
         source = torch.where(self.labels < 0, NO_CLASS, self.labels)
         indices = torch.arange(len(self.labels), device=self.labels.device)
         target_in_turn = positive_classes[indices % len(positive_classes)]

@@ -47,8 +47,8 @@ MAX_BLUR = 1.5  # pixels
 # view grows, and beyond 45 degrees it could be inside of a normalized mesh.
 MIN_FOV = 1.0
 MAX_FOV = 45.0
-UNCHANGED = (1.0, 1.0)  # Range of a factor that changes nothing.
-NONE = (0.0, 0.0)  # Range of an amount that is always zero.
+UNCHANGED = (1.0, 1.0)  # Default range of factors: the factor is always 1.
+NONE = (0.0, 0.0)  # Default range of amounts: the amount is always 0.
 
 
 @dataclass
@@ -252,13 +252,13 @@ class SceneSettings(Settings):
         "more than 10,000.",
         minimum=0,
         maximum=MAX_VERTICES,
-        checks_type=False,  # Python code may give 1e4
+        checks_type=False,  # Python code may give a float, such as 1e4.
     )
     light: str = setting(
         "grace",
         "Environment lighting: grace, eucalyptus, st_peters, uniform, an environment map "
         "(.npy, .hdr, .exr) or coefficients (.json).",
-        checks_type=False,  # Python code may give coefficients
+        checks_type=False,  # Python code may give a tensor of coefficients.
     )
     degree: int | None = setting(
         None,
@@ -307,7 +307,7 @@ class RendererSettings(Settings):
     rasterizer: str = setting(
         "auto",
         "Rasterizer: auto (numba if it is installed, otherwise numpy), opengl, numba or numpy.",
-        checks_type=False,  # Python code may give one that was chosen
+        checks_type=False,  # Python code may give a `Rasterizer`.
     )
     samples: int | None = setting(
         None,
@@ -589,7 +589,7 @@ class AugmentationSettings(Settings):
     attack: TrainingAttackSettings = setting(
         TrainingAttackSettings,
         "The attack during training.",
-        checks_type=False,  # Python code may give an AttackSettings
+        checks_type=False,  # Python code may give an `AttackSettings`.
     )
 
     def __post_init__(self) -> None:

@@ -299,8 +299,7 @@ def reload(folder: str | Path) -> Adversary:
         # fault.
         is_named = str(error).startswith(str(folder))
         raise InputError(str(error) if is_named else f"{path}: {error}") from error
-    # JSON, and the types that it may hold instead of a description, raise many
-    # types of errors.
+    # A damaged file, or JSON of another kind, can raise errors of many types here.
     except Exception as error:
         message = f"{path} does not describe an adversary ({single_line(error)}): write it again"
         raise InputError(message) from error
@@ -313,7 +312,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     cameras = tuple(_camera(camera, angle_unit) for camera in description["cameras"])
     shown = _read_object(folder, description)
     for camera in cameras:
-        # A camera refuses a mesh around it.
+        # `depths` raises InputError if the camera is inside of the mesh.
         camera.depths(shown.mesh.vertices)
     local_lights = []
     for name in description["local_lights"]:
@@ -341,7 +340,7 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
 def _camera(description: dict[str, Any], angle_unit: str | None) -> Camera:
     """Create the camera of a description. The keys of the description tell its class."""
     described = angles_in_degrees(description, angle_unit)
-    # Files of earlier versions have the former name of the clipping range.
+    # Earlier versions of the library wrote `clip_range` under the name "reach".
     if "reach" in described:
         described["clip_range"] = described.pop("reach")
     if "roll" in described:

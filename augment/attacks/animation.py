@@ -16,7 +16,8 @@ SIDE = 160
 # Larger images are shown with this number of pixels per side, since a .gif file
 # takes up to a byte for each pixel of a frame.
 MAX_SIDE = 224
-# Milliseconds for which a frame is shown, and the first and the last frame.
+# Milliseconds for which each frame is shown. The first and the last frame are
+# shown for PAUSE instead.
 FRAME_TIME = 120
 PAUSE = 1200
 

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 LEAST_LIKELY = "least_likely"
 # Pixels per side of the ball that shows the light.
 BALL_SIZE = 96
-# Formats of animations, and their largest number of frames.
+# File formats of animations, and the largest number of frames of an animation.
 ANIMATION_SUFFIXES = (".gif", ".webp")
 MAX_FRAME_COUNT = 1000
 
@@ -403,7 +403,8 @@ def _attack(
         classifier = remembering(classifier)
     scene = with_needed_degree(scene, settings.material)
     problem = build_problem(settings, scene)
-    # The warning names the line that calls `attack`.
+    # With this stack level, Python shows the user's call of `attack` as the source
+    # of the warning.
     warn_of_changed_light(scene, problem.scene, stacklevel=4)
     model = preprocessed_model(settings, classifier)
 
@@ -461,7 +462,8 @@ def with_optimizer(settings: AttackSettings, classifier: Classifier) -> AttackSe
     if settings.optimizer is not None or classifier.has_gradients:
         return settings
     chosen = replace(settings, optimizer=RANDOM_SEARCH)
-    # The warning names the line that calls `attack`.
+    # With stacklevel=4, Python shows the user's call of `attack` as the source of
+    # the warning.
     warnings.warn(
         f"classifier {classifier.name} has no gradients: random search attacks it with at most "
         f"{chosen.query_limit} queries for each example (max_queries, optimizer)",
@@ -483,7 +485,8 @@ def _count_queries(
     if images is not descent.images:
         queries += view_count
     if settings.sensor_noise:
-        # `fooled_in_views` draws noise for these examples.
+        # `fooled_in_views` classifies each view of these examples again, once for
+        # each draw of noise.
         is_tested = criterion.reached_in_views(predicted).any(1)
         queries += NOISE_DRAWS * view_count * is_tested
     return queries

@@ -43,7 +43,7 @@ from renderer.validation import as_list, require_number
 # `check` repeats the attack with these multiples of its number of steps.
 GROWTH = (3, 10)
 
-# Results of `check` that `warnings` reads.
+# Keys of the result of `check` that `warnings` needs.
 CHECKED = {
     "success",
     "success_without_noise",

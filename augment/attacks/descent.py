@@ -376,8 +376,8 @@ class Descent:
         if self.settings.lead_over_noise:
             is_finished = self._with_lead_over_noise(is_finished, state, evaluation)
         is_accepted = is_finished | self._is_accepted(state, evaluation)
-        # An example without success keeps its last accepted candidate, or its
-        # first success. Then only a success of lower cost replaces a success.
+        # Until an example succeeds, its result is its last accepted candidate. A
+        # success replaces it. After that, only a success of lower cost does.
         is_cheaper_success = is_success & (cost < state.result.cost[active_rows])
         has_succeeded = state.result.success[active_rows]
         is_better = torch.where(has_succeeded, is_cheaper_success, is_success | is_accepted)

@@ -172,7 +172,8 @@ def _moved(images: Tensor, movements: Tensor) -> Tensor:
     across, down, angle, growth = movements.unbind(1)
     cos = (1 + growth) * angle.cos()
     sin = (1 + growth) * angle.sin()
-    # The rows of the affine maps; an image spans 2 in their coordinates.
+    # The affine map of each image as two rows of three numbers, shape (N, 6).
+    # `affine_grid` uses coordinates from -1 to 1, so an image is 2 units wide.
     rows = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1)
     grid = F.affine_grid(rows.view(-1, 2, 3), list(images.shape), align_corners=False)
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False)

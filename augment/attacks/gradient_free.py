@@ -31,7 +31,7 @@ class GradientFree(Descent):
     @torch.no_grad()
     def run(self, criterion: Criterion, examples: Tensor, start: Tensor) -> DescentResult:
         """Search until all examples are finished or have used up their queries."""
-        # The undecorated method of the base class would enable gradients.
+        # This method exists for its decorator: `Descent.run` would enable gradients.
         return super().run(criterion, examples, start)
 
     def _draw_normal(self, state: State, count: int) -> Tensor:
@@ -97,7 +97,8 @@ class GradientFree(Descent):
         classes = criterion.select(rows)
         logits = self.model(batch)
         expected_logits = self.expectation(self.model, batch, logits)
-        # In float32, the cost of a lead above 17 would be zero wherever one looks.
+        # In float32, the cross entropy rounds to zero for logit gaps above 17, so
+        # candidates could not be compared. In float64, they can.
         cost = adversarial_cost(expected_logits.double(), classes.source, classes.target)
         return Score(
             cost=cost.to(batch),

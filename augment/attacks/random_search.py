@@ -17,8 +17,9 @@ import torch
 from augment.attacks.descent import Decision, Evaluation, State
 from augment.attacks.gradient_free import GradientFree
 
-# Factors of the length of a change after an accepted candidate and after another.
-# Four of the second undo one of the first.
+# The length of the random changes is multiplied by GROWTH after an accepted
+# candidate and by SHRINKAGE after a rejected one. Four rejections undo one
+# acceptance (the 1/5 success rule of evolution strategies).
 GROWTH = 1.5
 SHRINKAGE = GROWTH**-0.25
 

@@ -234,7 +234,8 @@ class Classifier(nn.Module):
             )
         extremes = torch.aminmax(images.detach()) if len(images) else ()
         logits = self._call_network(self.function, images, len(self.classes))
-        # Checked after the network was started, because the CPU waits for the GPU here.
+        # The range is checked after the network was called: on a GPU, this check waits
+        # for results, and the network computes meanwhile.
         require_unit_range("images", *extremes)
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"{name} returned NaN or infinite logits: check its weights")

@@ -11,7 +11,8 @@ from augment.losses import adversarial_cost, logit_gap
 from augment.parameter_settings import StepSettings
 from augment.photographs.projected_light import ProjectedLight
 
-# Steps of this many radii in total reach any point of the ball (Madry et al. 2018).
+# All steps of an attack together have the length of this many radii, so that they
+# can cross the ball from any start (Madry et al. 2018).
 TRAVELED_RADII = 2.5
 
 

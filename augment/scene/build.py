@@ -144,7 +144,8 @@ def build_scene(
         degree_of(environment)
         require_bounded(light=environment)
     basis, lights = _build_lights(scene_settings, environment, degree)
-    # A named lighting can be loaded again with a higher degree, unless the user chose the degree.
+    # `lights_of_degree` loads the lighting again with another degree, which gloss may
+    # need. It is None if the user gave coefficients or chose the degree.
     lights_of_degree = None
     if is_named and scene_settings.degree is None:
         lights_of_degree = partial(_build_lights, scene_settings, scene_settings.light)
@@ -220,7 +221,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     fixed = [camera.fixed() for camera in given]
     if not normalize:
         return fixed
-    # The scene turns all cameras about the origin.
+    # The scene turns all cameras about the origin, which is the center of these cameras, too.
     return [camera.normalized(np.zeros(3), 1.0) for camera in fixed]
 
 

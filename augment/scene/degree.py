@@ -234,7 +234,8 @@ def with_needed_degree(
             reached.warn(f"degree={degree} takes less time, but", degree)
             basis, lights = scene.lights_of_degree(needed, reached.gloss)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    # Lighting without coefficients of the highest degree is complete.
+    # If the coefficients of the highest degree are zero, the lighting has no detail
+    # that a higher degree could add.
     highest_band = scene.lights[:, degree**2 : (degree + 1) ** 2]
     if highest_band.any():
         reached.warn(f"degree={degree}", degree)

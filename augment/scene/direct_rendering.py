@@ -34,8 +34,8 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from augment.scene.conditions import Conditions
 
-# Shadows and bounces are computed again if a coordinate of a vertex has moved farther than this
-# distance, in world units.
+# Shadows and bounces of a deformed mesh are kept from the previous call while each
+# coordinate of each vertex has moved by at most this distance, in world units.
 NEAR = 0.001
 
 

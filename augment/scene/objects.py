@@ -170,7 +170,8 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
     offset = np.array([0, 0, item.lowest])
     raised = []
     for prop in props:
-        # The vertices are rounded as `normalize` rounds those of the object.
+        # `normalize` rounds the vertices of the object to float32. Props are rounded
+        # in the same way.
         vertices = (prop.vertices + offset).astype(np.float32)
         raised.append(replace(prop, vertices=vertices.astype(np.float64)))
     return replace(item.joined(raised), props=props)
@@ -241,7 +242,7 @@ def rotated(item: SceneObject, rotation: np.ndarray) -> SceneObject:
         new lowest vertex.
     """
     mesh = select_faces(item.mesh, slice(item.own))
-    # The vertices are rounded as `normalize` rounds them.
+    # `normalize` rounds vertices to float32. Rotated vertices are rounded again.
     vertices = (mesh.vertices @ rotation.T).astype(np.float32)
     return _with_mesh(item, mesh.moved(vertices.astype(np.float64)))
 

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 # The pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
-# More views than this are counted on the console. A step of few views would take 4 % longer.
+# Progress is shown while more views than this are rendered. For fewer views, showing
+# it would make a step 4 % slower.
 UNCOUNTED_VIEWS = 8
 
 

@@ -238,9 +238,6 @@ def _draw_glosses(
     ]
 
 
-# Lighting, its effect on backgrounds, and camera effects.
-
-
 @dataclass(frozen=True, eq=False)
 class _DrawnLights:
     """The lighting of E examples.

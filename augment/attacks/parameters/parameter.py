@@ -11,7 +11,7 @@ from augment.parameter_settings import StepSettings
 from augment.scene.conditions import Conditions
 from renderer.light.ball import Ball
 
-# Length of the first random changes without a radius, in steps of the attack.
+# Without a radius, the random search begins with changes of this many step sizes.
 STEPS_OF_SEARCH = 4
 
 

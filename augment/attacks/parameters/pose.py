@@ -236,7 +236,8 @@ class _MovableObject:
             return vertices
         rotations = rotation_matrices(joint_rotations.view(-1, 3))
         displacement = self.skin.displacements(rotations)
-        # The scene pads the vertices of smaller meshes to those of the largest.
+        # All meshes of a scene have as many rows of vertices as its largest mesh. A
+        # smaller mesh ends with rows that no face uses.
         padding_count = len(vertices) - len(displacement)
         return vertices + F.pad(displacement, (0, 0, 0, padding_count))
 
