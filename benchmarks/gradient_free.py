@@ -125,7 +125,7 @@ def attack(
         result = nb.attack(network, scene, settings=settings, seed=seed, force=True)
         assert int(result.descent.queries.max()) <= settings.max_queries
         is_clean = result.clean_correct
-        gaps = logit_gap(result.logits, result.criterion.source)[:, 0]
+        gaps = logit_gap(result.logits, result.criterion.source[:, 0])
         successes.append(result.success[is_clean])
         leads.append(gaps[is_clean])
     return Outcome(torch.cat(successes), torch.cat(leads))

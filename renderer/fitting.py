@@ -442,7 +442,7 @@ class _Target(NamedTuple):
             grid: Subdivisions of the grid of directions in which the light is at
                 least `LEAST_RADIANCE`.
         """
-        [operator] = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
+        operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
         units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, COLORS)
         # Radiance of the P covered pixels per unit of each coefficient, (3, 49, P).
         shown = operator.radiance(units).permute(1, 0, 2)
@@ -497,7 +497,7 @@ class _Target(NamedTuple):
     def rendered(self, camera: Camera, light: Tensor) -> Tensor:
         """Render the mesh in linear light, shape (3, size²)."""
         options = asdict(self.options)
-        [image] = render(self.mesh, camera, light, self.size, self.gray, **options)
+        image = render(self.mesh, camera, light, self.size, self.gray, **options)
         return decode(image, self.options.encoding).flatten(1)
 
     def scene(self, camera: Camera) -> FittedScene:

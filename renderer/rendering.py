@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import torch
 from torch import Tensor
@@ -34,7 +34,7 @@ from renderer.shaded_view import ShadedView
 from renderer.shading.gloss import Gloss
 from renderer.surface.albedo import face_albedo, surface_albedo
 from renderer.transport.operator_stacks import TransferOperators
-from renderer.transport.operators import build_operators
+from renderer.transport.operators import TransferOperator, build_operators
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_list, as_tensor, require_kind, require_number
@@ -73,8 +73,10 @@ def render(
     bounces: int = 0,
     silhouettes: bool = False,
     rasterizer: str = "auto",
-) -> Float[Tensor, "V 3 size size"]:
+) -> Float[Tensor, "*views 3 size size"]:
     """Render a mesh from V cameras, differentiable in light, vertices, albedo and gloss.
+
+    A camera alone, outside a list, gives an image without a views dimension.
 
     NumPy arrays and lists are taken instead of tensors. The images have the
     dtype and the device of the light.
@@ -84,7 +86,7 @@ def render(
 
     Args:
         mesh: The mesh, of N vertices and F faces.
-        cameras: One camera, or V cameras.
+        cameras: One camera, or a list of V cameras.
         light: Coefficients of environment light, shape ((degree + 1)², 3), such
             as `renderer.load_light` returns. None for no environment light.
         size: Pixels per side of the images.
@@ -115,7 +117,8 @@ def render(
             surfaces move in the image.
 
     Returns:
-        Images in [0, 1], shape (V, 3, size, size).
+        Images in [0, 1], shape (V, 3, size, size), or (3, size, size) of one
+        camera.
 
     Raises:
         InputError: If an argument holds NaN or has another type, shapes do not
@@ -131,7 +134,7 @@ def render(
     require_mesh("mesh", mesh)
     per_side = samples_per_side(samples, silhouettes)
     settings = ImageSettings(size, per_side, encoding, normals, shadows, bounces, silhouettes)
-    cameras = _listed(cameras)
+    listed = _listed(cameras)
     _require_scale(albedo_scale)
     _require_gloss(gloss)
     require_choice("rasterizer", rasterizer, RASTERIZERS)
@@ -153,14 +156,14 @@ def render(
 
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
     moved = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
-    fixed = [camera.fixed() for camera in cameras]
+    fixed = [camera.fixed() for camera in listed]
     chosen = _choose(rasterizer)
     views = build_fragments(moved.vertices, mesh.faces, fixed, settings, chosen, closed=mesh.closed)
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
     transport = build_transport(moved, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved)
     images = []
-    for camera, view, behind in zip(cameras, views, backgrounds, strict=True):
+    for camera, view, behind in zip(listed, views, backgrounds, strict=True):
         fragments = view.to(like.device)
         indirect = None
         if transport:
@@ -179,7 +182,7 @@ def render(
         )
         seen = shown.pixel_radiance(camera, behind.flatten(1))
         images.append(composite(seen.radiance, seen.coverage, seen.pixels, behind, encoding))
-    return torch.stack(images)
+    return images[0] if isinstance(cameras, Camera) else torch.stack(images)
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
@@ -200,6 +203,40 @@ def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     return basis, values
 
 
+@overload
+def precompute_transfer(
+    mesh: Mesh,
+    cameras: Camera,
+    size: int = ...,
+    *,
+    albedo_scale: float = ...,
+    gloss: Gloss | None = ...,
+    samples: int = ...,
+    encoding: str = ...,
+    normals: str = ...,
+    shadows: bool = ...,
+    bounces: int = ...,
+    rasterizer: str = ...,
+) -> TransferOperator: ...
+
+
+@overload
+def precompute_transfer(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    size: int = ...,
+    *,
+    albedo_scale: float = ...,
+    gloss: Gloss | None = ...,
+    samples: int = ...,
+    encoding: str = ...,
+    normals: str = ...,
+    shadows: bool = ...,
+    bounces: int = ...,
+    rasterizer: str = ...,
+) -> TransferOperators: ...
+
+
 def precompute_transfer(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
@@ -213,7 +250,7 @@ def precompute_transfer(
     shadows: bool = False,
     bounces: int = 0,
     rasterizer: str = "auto",
-) -> TransferOperators:
+) -> TransferOperator | TransferOperators:
     """Compute a transfer operator for each camera.
 
     An operator gives images, and their gradients by the light, without rasterizing
@@ -222,7 +259,7 @@ def precompute_transfer(
 
     Args:
         mesh: The mesh.
-        cameras: One camera or several.
+        cameras: One camera, or a list of V cameras.
         size: Width and height of the images in pixels.
         albedo_scale: Factor of the albedo.
         gloss: Gloss instead of the mesh's.
@@ -235,7 +272,8 @@ def precompute_transfer(
         rasterizer: "auto", "opengl", "numba" or "numpy".
 
     Returns:
-        The operators, a sequence. Its method `image` renders all views in one call.
+        The operator of one camera, or the sequence of operators of a list of
+        cameras. The method `image` of the sequence renders all views in one call.
 
     Raises:
         InputError: If an argument is out of range, or if there is no camera.
@@ -255,7 +293,7 @@ def precompute_transfer(
     operators = build_operators(
         mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale, gloss=gloss
     )
-    return TransferOperators(operators)
+    return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
 
 
 def light_sphere(
@@ -289,10 +327,9 @@ def light_sphere(
     sky, local = split_light(basis, light.detach().cpu().float())
     sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
-    images = render(
+    return render(
         _white_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy"
     )
-    return images[0]
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:

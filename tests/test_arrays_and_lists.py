@@ -25,7 +25,7 @@ MESH = renderer.Mesh.plain(
 CAMERA = renderer.OrthographicCamera(57.3, 28.6, 4.0)
 LIGHT = renderer.load_light("grace")
 LAMP = Lamps(((2.0, 2.0, 2.0),))
-[OPERATOR] = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
+OPERATOR = renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
 COVERED = len(OPERATOR.pixels)
 SCENE = augment.build_scene([(MESH, "orange")], SIZE, views=2, light="uniform", samples=1)
 IMAGES = torch.rand(3, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))

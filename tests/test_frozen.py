@@ -339,6 +339,11 @@ scene.hard_negatives=[{mesh:'solid:ball:0',label:apple}]
 FOLDERS: dict[str, Path] = {}
 
 
+def listed(cameras: Any) -> list[renderer.Camera]:
+    """Return one camera or several as a list, so that images have a views dimension."""
+    return [cameras] if isinstance(cameras, renderer.Camera) else cameras
+
+
 def render_arguments(case: RenderCase, folder: Path) -> dict[str, Tensor]:
     """Make the light, the vertices and the albedo of a render in float32."""
     mesh = mesh_named(case.mesh, folder)
@@ -358,7 +363,7 @@ def test_render(name, tmp_path, verify):
     leaves = {key: arguments[key].float().requires_grad_() for key in case.differentiated}
     options = {"light": arguments["light"], **SOFTWARE, **case.options, **leaves}
     mesh = mesh_named(case.mesh, tmp_path)
-    images = renderer.render(mesh, case.cameras, size=SIZE, **options)
+    images = renderer.render(mesh, listed(case.cameras), size=SIZE, **options)
     verify(images, *gradients(images, list(leaves.values())))
 
 
@@ -370,7 +375,7 @@ def test_values_of_a_render(name, tmp_path, verify_values):
     leaves = {key: arguments[key].double().requires_grad_() for key in names}
     options = case.options | SOFTWARE | leaves
     mesh = mesh_named(case.mesh, tmp_path)
-    images = renderer.render(mesh, case.cameras, size=SIZE, **options)
+    images = renderer.render(mesh, listed(case.cameras), size=SIZE, **options)
     verify_values(images, *gradients(images, list(leaves.values())))
 
 
@@ -378,7 +383,7 @@ def render_by_operators(case: OperatorCase, lights: Tensor, folder: Path) -> lis
     """Return images of all cameras, the gradient of the lights, and the radiance of one camera."""
     mesh = mesh_named(case.mesh, folder)
     options = SOFTWARE | case.options
-    operators = renderer.precompute_transfer(mesh, case.cameras, SIZE, **options)
+    operators = renderer.precompute_transfer(mesh, listed(case.cameras), SIZE, **options)
     images = torch.stack([operator.image(lights, 0.3) for operator in operators])
     radiance = operators[0].radiance(lights.detach())
     return [images, *gradients(images, [lights]), radiance]
@@ -425,9 +430,9 @@ def test_attack(name, verify):
     result = augment.attack(classifier(), scene, case.target, settings, seed=5, force=True)
     assert (result.images - result.images_before).abs().max() > 1e-3
     verify(
-        result.images_before,
-        result.images,
-        result.logits,
+        result.images_in_views_before,
+        result.images_in_views,
+        result.logits_in_views,
         result.descent.values,
         result.descent.cost,
         result.steps,

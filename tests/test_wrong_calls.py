@@ -70,7 +70,7 @@ def small_result() -> AttackResult:
 
 @cache
 def operator() -> renderer.TransferOperator:
-    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)[0]
+    return renderer.precompute_transfer(MESH, CAMERA, SIZE, samples=1)
 
 
 def small_service(label: Any = 0, **options: Any) -> augment.AugmentationService:

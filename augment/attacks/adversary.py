@@ -69,8 +69,9 @@ class Adversary:
         basis: Basis of the light.
         background: Background in [0, 1], shape (3 or 1, size, size).
         settings: Settings of the images.
-        images_before: Images before the attack, shape (V, 3, size, size).
-        images: Images after the attack, of the same shape.
+        images_in_views_before: Images before the attack, shape
+            (V, 3, size, size).
+        images_in_views: Images after the attack, of the same shape.
         pixels: What the attack added to the images, of the same shape. None if
             it did not change pixels.
     """
@@ -81,9 +82,19 @@ class Adversary:
     basis: Basis
     background: Tensor
     settings: ImageSettings
-    images_before: Tensor
-    images: Tensor
+    images_in_views_before: Tensor
+    images_in_views: Tensor
     pixels: Tensor | None = None
+
+    @property
+    def images_before(self) -> Tensor:
+        """Images before the attack, (V, 3, size, size), or (3, size, size) of one view."""
+        return self.images_in_views_before.squeeze(0)
+
+    @property
+    def images(self) -> Tensor:
+        """Images after the attack, (V, 3, size, size), or (3, size, size) of one view."""
+        return self.images_in_views.squeeze(0)
 
     @staticmethod
     def of(
@@ -115,8 +126,8 @@ class Adversary:
             basis=scene.basis_under(after, row),
             background=scene.backgrounds[described.background].cpu(),
             settings=scene.settings,
-            images_before=before.cpu(),
-            images=images.cpu(),
+            images_in_views_before=before.cpu(),
+            images_in_views=images.cpu(),
             pixels=None if after.pixels is None else after.pixels[row].detach().cpu(),
         )
 
@@ -137,7 +148,6 @@ class Adversary:
             basis=self.basis,
         )
 
-    @torch.no_grad()
     def render(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
         """Render the images of the attacked example.
 
@@ -145,7 +155,20 @@ class Adversary:
             rasterizer: A rasterizer or its name. None for the default one.
 
         Returns:
-            Images in [0, 1] of the V cameras, shape (V, 3, size, size).
+            Images in [0, 1], shape (V, 3, size, size), or (3, size, size) of
+            one view.
+        """
+        return self.render_views(rasterizer).squeeze(0)
+
+    @torch.no_grad()
+    def render_views(self, rasterizer: Rasterizer | str | None = None) -> Tensor:
+        """Render the images of the attacked example, see `render`.
+
+        Args:
+            rasterizer: A rasterizer or its name. None for the default one.
+
+        Returns:
+            Images in [0, 1], shape (V, 3, size, size), also of one view.
         """
         if not isinstance(rasterizer, Rasterizer):
             rasterizer = choose(rasterizer or "auto")
@@ -208,8 +231,8 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     }
     if adversary.pixels is not None:
         write_numbers(folder / PIXELS, adversary.pixels.numpy())
-    _write_views(adversary.images_before, folder, BEFORE)
-    _write_views(adversary.images, folder, AFTER)
+    _write_views(adversary.images_in_views_before, folder, BEFORE)
+    _write_views(adversary.images_in_views, folder, AFTER)
     atomic_write(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     radiance = to_map(light, MAP_HEIGHT)
@@ -331,8 +354,8 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
         basis=basis,
         background=gray_or_image("background", background, settings.size),
         settings=settings,
-        images_before=_read_images(folder / f"{BEFORE}.npy", shape),
-        images=_read_images(folder / f"{AFTER}.npy", shape),
+        images_in_views_before=_read_images(folder / f"{BEFORE}.npy", shape),
+        images_in_views=_read_images(folder / f"{AFTER}.npy", shape),
         pixels=_read_images(folder / PIXELS, shape) if description["pixels"] else None,
     )
 

@@ -77,13 +77,14 @@ class AttackResult:
         criterion: Source and target class of each view.
         settings: Settings of the attack.
         seed: Seed of the attack.
-        images_before: Images before the attack, in [0, 1] and not rounded,
-            shape (E, V, 3, size, size).
-        images: Images after the attack, with the shadows and bounces of each
-            shape in its own colors. They have the same shape and range.
-        logits_before: Logits of the preprocessed images before the attack,
-            shape (E, V, C).
-        logits: Logits of the preprocessed images after it, shape (E, V, C).
+        images_in_views_before: Images before the attack, in [0, 1] and not
+            rounded, shape (E, V, 3, size, size).
+        images_in_views: Images after the attack, with the shadows and bounces of
+            each shape in its own colors. They have the same shape and range.
+        logits_in_views_before: Logits of the preprocessed images before the
+            attack, shape (E, V, C).
+        logits_in_views: Logits of the preprocessed images after it, shape
+            (E, V, C).
         success_in_views: Whether each view counts as a success, as
             `fooled_in_views` decides, shape (E, V), bool.
         descent: Where the descent ended. Its own success is that of its images
@@ -101,14 +102,34 @@ class AttackResult:
     criterion: Criterion
     settings: AttackSettings
     seed: int
-    images_before: Tensor
-    images: Tensor
-    logits_before: Tensor
-    logits: Tensor
+    images_in_views_before: Tensor
+    images_in_views: Tensor
+    logits_in_views_before: Tensor
+    logits_in_views: Tensor
     success_in_views: Tensor
     descent: DescentResult
     queries: Tensor
     seconds: dict[str, float]
+
+    @property
+    def images_before(self) -> Tensor:
+        """Images before the attack, (E, V, 3, size, size), or (E, 3, size, size) of one view."""
+        return self.images_in_views_before.squeeze(1)
+
+    @property
+    def images(self) -> Tensor:
+        """Images after the attack, (E, V, 3, size, size), or (E, 3, size, size) of one view."""
+        return self.images_in_views.squeeze(1)
+
+    @property
+    def logits_before(self) -> Tensor:
+        """Logits before the attack, (E, V, C), or (E, C) of one view."""
+        return self.logits_in_views_before.squeeze(1)
+
+    @property
+    def logits(self) -> Tensor:
+        """Logits after the attack, (E, V, C), or (E, C) of one view."""
+        return self.logits_in_views.squeeze(1)
 
     @property
     def preprocessed_model(self) -> nn.Module:
@@ -129,18 +150,18 @@ class AttackResult:
 
         All views count. An example that met the criterion before the attack is no success.
         """
-        return self.criterion.reached(self.logits.argmax(2)) & ~self.success_before
+        return self.criterion.reached(self.logits_in_views.argmax(2)) & ~self.success_before
 
     @property
     def success_with_margin(self) -> Tensor:
         """Return a mask of the successes (E,) that lead by `settings.margin` in all views."""
-        gaps = logit_gap(self.logits, self.criterion.source, self.criterion.target)
+        gaps = logit_gap(self.logits_in_views, self.criterion.source, self.criterion.target)
         return self.success & (gaps >= self.settings.margin).all(1)
 
     @property
     def success_before(self) -> Tensor:
         """Return a mask of the examples (E,) that met the criterion before the attack."""
-        return self.criterion.reached(self.logits_before.argmax(2))
+        return self.criterion.reached(self.logits_in_views_before.argmax(2))
 
     @property
     def clean_correct(self) -> Tensor:
@@ -148,7 +169,7 @@ class AttackResult:
 
         Success rates of attacks count only these examples.
         """
-        return (self.logits_before.argmax(2) == self.criterion.source).all(1)
+        return (self.logits_in_views_before.argmax(2) == self.criterion.source).all(1)
 
     @property
     def steps(self) -> Tensor:
@@ -187,12 +208,12 @@ class AttackResult:
         self._require_view(example, view)
         conditions = self.conditions
         basis = self.problem.scene.basis_under(conditions, example)
-        before = self.logits_before[example, view].softmax(0)
-        after = self.logits[example, view].softmax(0)
+        before = self.logits_in_views_before[example, view].softmax(0)
+        after = self.logits_in_views[example, view].softmax(0)
         return draw_attack(
-            self.images_before[example, view].cpu(),
+            self.images_in_views_before[example, view].cpu(),
             light_sphere(conditions.light[example], BALL_SIZE, basis=basis),
-            self.images[example, view].cpu(),
+            self.images_in_views[example, view].cpu(),
             before.cpu(),
             after.cpu(),
             self.classifier.classes,
@@ -256,9 +277,9 @@ class AttackResult:
     def _image_between(self, fraction: float, example: int, view: int) -> Tensor:
         """Render the image (3, size, size) of the values at a fraction of the way."""
         if fraction == 0:
-            return self.images_before[example, view]
+            return self.images_in_views_before[example, view]
         if fraction == 1:
-            return self.images[example, view]
+            return self.images_in_views[example, view]
         row = self.problem.all_examples[[example]]
         return self.problem.images(self._values_between(fraction), row)[0, view]
 
@@ -271,7 +292,7 @@ class AttackResult:
 
     def _require_view(self, example: int, view: int) -> None:
         """Raise InputError if there is no such example or view."""
-        example_count, view_count = self.images.shape[:2]
+        example_count, view_count = self.images_in_views.shape[:2]
         _require_index("example", example, example_count)
         _require_index("view", view, view_count)
 
@@ -346,7 +367,8 @@ def attack(
 
     Returns:
         The images, logits and successes of the E examples, before the attack
-        and after it.
+        and after it. Images and logits of one view per example have no views
+        dimension.
 
     Raises:
         InputError: If an argument has a wrong type, if an example is
@@ -365,7 +387,7 @@ def attack(
         >>> settings = nb.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
         >>> result = nb.attack(classifier, scene, settings=settings)
         >>> result.success, result.images.shape
-        (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
+        (tensor([True]), torch.Size([1, 3, 8, 8]))
     """
     require_kind("scene", scene, Scene, "a scene, such as augment.build_scene(...)")
     require_kind("settings", settings, AttackSettings | None, "augment.AttackSettings(...) or None")
@@ -437,10 +459,10 @@ def _attack(
         criterion=criterion,
         settings=settings,
         seed=seed,
-        images_before=images_before,
-        images=images,
-        logits_before=logits_before,
-        logits=logits,
+        images_in_views_before=images_before,
+        images_in_views=images,
+        logits_in_views_before=logits_before,
+        logits_in_views=logits,
         success_in_views=success_in_views,
         descent=descent,
         queries=_count_queries(descent, images, logits.argmax(2), criterion, settings),
@@ -682,7 +704,7 @@ def final_images(
     for row, example in enumerate(progress(examples.tolist(), "final images")):
         image = images[row]
         adversary = Adversary.of(scene, example, conditions, image, image, row)
-        rendered.append(adversary.render(scene.rasterizer))
+        rendered.append(adversary.render_views(scene.rasterizer))
     return torch.stack(rendered).to(images)
 
 

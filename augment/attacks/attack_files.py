@@ -88,7 +88,7 @@ def save(
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"example_{example:03d}" for example in range(len(result.images))]
+    paths = [folder / f"example_{example:03d}" for example in range(len(result.images_in_views))]
 
     lines = _write_examples(result, paths)
     versions = _versions(result, paths, verify)
@@ -128,7 +128,7 @@ def _write_examples(result: AttackResult, paths: Sequence[Path]) -> list[dict[st
     lines = []
     for example, path in enumerate(progress(paths, "saving")):
         write_image(path.with_suffix(".png"), figure(result, example))
-        images = result.images_before[example], result.images[example]
+        images = result.images_in_views_before[example], result.images_in_views[example]
         adversary = Adversary.of(scene, example, conditions_after, *images)
         light_numbers = write_adversary(adversary, path)
         exposure = scene.examples[example].exposure
@@ -142,7 +142,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     """Return the numbers of an example for attack.jsonl."""
     descent = result.descent
     classes = result.classifier.classes
-    before = predictions(result.logits_before[example], classes)
+    before = predictions(result.logits_in_views_before[example], classes)
     change = descent.values[[example]] - result.problem.start[[example]]
     changes = result.problem.split_by_parameter(change)
     largest_change = {parameter.name: float(part.abs().max()) for parameter, part in changes}
@@ -161,7 +161,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "label": [classes[index] for index in result.criterion.source[example].tolist()],
         "predicted_before": before["predicted"],
         "confidence_before": before["confidence"],
-        **predictions(result.logits[example], classes),
+        **predictions(result.logits_in_views[example], classes),
         "largest_change": largest_change,
     }
 
@@ -179,7 +179,7 @@ def _versions(
         renderers: Names of the renderers that render the examples again from
             these folders.
     """
-    images = result.images.cpu()
+    images = result.images_in_views.cpu()
     versions = {
         "float": images,
         "8 bits": to_unit(to_bytes(images)),
@@ -192,7 +192,7 @@ def _versions(
         versions[name] = torch.stack([images_by_renderer[name] for images_by_renderer in again])
     numbers = {}
     for name, version in versions.items():
-        numbers[name] = _numbers_of_version(result, version.to(result.images))
+        numbers[name] = _numbers_of_version(result, version.to(result.images_in_views))
     return numbers
 
 
@@ -220,7 +220,7 @@ def _numbers_of_version(result: AttackResult, images: Tensor) -> list[dict[str, 
     )
     success = success_in_views.all(1)
     without_noise = result.criterion.reached(predicted)
-    differences = (images - result.images).abs().flatten(1)
+    differences = (images - result.images_in_views).abs().flatten(1)
     numbers = []
     for example, difference in enumerate(differences):
         numbers.append(
@@ -253,7 +253,7 @@ def render_again(
     adversary = reload(folder)
     images = {}
     if "reload" in renderers:
-        images["reload"] = adversary.render(rasterizer)
+        images["reload"] = adversary.render_views(rasterizer)
     if MITSUBA in renderers:
         encoding = adversary.settings.encoding
         rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
@@ -279,16 +279,18 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     Returns:
         The figure.
     """
-    before = result.images_before[example]
-    after = result.images[example]
+    before = result.images_in_views_before[example]
+    after = result.images_in_views[example]
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
     # Differences of less than a step of 8 bits stay as small as they are.
     scale = 1 / max(1 / 255, *largest)
     captions = [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
+    predicted_before = _captions(result, result.logits_in_views_before, example)
+    predicted_after = _captions(result, result.logits_in_views, example)
     columns = {
-        "initial": tiles_of(before, _captions(result, result.logits_before, example), SIDE),
-        "adversarial": tiles_of(after, _captions(result, result.logits, example), SIDE),
+        "initial": tiles_of(before, predicted_before, SIDE),
+        "adversarial": tiles_of(after, predicted_after, SIDE),
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
         **_columns_of_light(result, example),
     }

@@ -279,7 +279,7 @@ def _as_classifier(
     if isinstance(network, Classifier):
         return network
     attacked = result.classifier
-    device = result.images.device
+    device = result.images_in_views.device
     options = (attacked.size, attacked.classes, normalization, value_range, device)
     return as_classifier(network, *options, argument)
 
@@ -412,7 +412,7 @@ def _count_draws(result: AttackResult) -> int:
     settings = result.settings
     if settings.uses_gradients:
         return settings.max_steps
-    passes_per_draw = result.images.shape[1] * (1 + settings.eot.draws)
+    passes_per_draw = result.images_in_views.shape[1] * (1 + settings.eot.draws)
     return max(1, settings.step_limit // passes_per_draw)
 
 
@@ -538,7 +538,7 @@ class _Adversaries:
         before = []
         after = []
         for example in chosen:
-            images = result.images_before[example], result.images[example]
+            images = result.images_in_views_before[example], result.images_in_views[example]
             before.append(Adversary.of(problem.scene, example, conditions_before, *images))
             after.append(Adversary.of(problem.scene, example, conditions_after, *images))
         return _Adversaries(result, chosen, before, after)
@@ -599,11 +599,11 @@ class _Adversaries:
         scene = self.result.problem.scene
         size = classifier.size
         if not adversaries:
-            return self.result.images.new_empty(0, scene.views, 3, size, size)
+            return self.result.images_in_views.new_empty(0, scene.views, 3, size, size)
         images = []
         for adversary in progress(adversaries, "transfer"):
-            images.append(adversary.render(scene.rasterizer))
-        return torch.stack(images).to(self.result.images)
+            images.append(adversary.render_views(scene.rasterizer))
+        return torch.stack(images).to(self.result.images_in_views)
 
     def _logits(self, images: Tensor, classifier: Classifier) -> Tensor:
         """Return the logits (A, V, C) of images (A, V, 3, size, size), on the CPU."""

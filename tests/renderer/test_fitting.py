@@ -38,7 +38,7 @@ def positive_light(name: str) -> Tensor:
 def coverage_of(mesh: renderer.Mesh, camera: Camera, size: int) -> Tensor:
     """Render the part of each pixel that a mesh covers, shape (size, size)."""
     black = torch.zeros(49, 3, dtype=torch.float64)
-    background = renderer.render(mesh, camera, black, size, 1.0, samples=8)[0]
+    background = renderer.render(mesh, camera, black, size, 1.0, samples=8)
     return 1 - background[0]
 
 
@@ -60,7 +60,7 @@ def irradiance_error(
 ) -> float:
     """Compare the irradiance of the visible surface under the light found and the true light."""
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
-    [operator] = renderer.precompute_transfer(white, camera, 64)
+    operator = renderer.precompute_transfer(white, camera, 64)
     expected = operator.radiance(light)
     difference = operator.radiance(found.light) - expected
     return float(difference.norm() / expected.norm())
@@ -83,7 +83,7 @@ def nearby_fit(brightness: float) -> NearbyFit:
     """Fit a mushroom under a light of some brightness, of which an image shows values up to 1."""
     mesh = renderer.normalize(renderer.solid("mushroom"))
     light = brightness * positive_light("eucalyptus")
-    [image] = renderer.render(mesh, FAR, light, 32, 0.0, samples=8)
+    image = renderer.render(mesh, FAR, light, 32, 0.0, samples=8)
     mask = coverage_of(mesh, FAR, 32)
     start = replace(FAR, polar=FAR.polar + 3, azimuth=FAR.azimuth - 3)
     found = fit_scene(image.clamp(0, 1), mask, mesh, start=start)
@@ -107,7 +107,7 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
     mesh = renderer.normalize(renderer.solid("mushroom"))
     light = positive_light("eucalyptus")
     background = draw_uniform(3, 48, 48)
-    [image] = renderer.render(mesh, FAR, light, 48, background, samples=8)
+    image = renderer.render(mesh, FAR, light, 48, background, samples=8)
     found = fit_scene(image, coverage_of(mesh, FAR, 48), mesh)
     require_same_camera(found.camera, FAR)
     assert irradiance_error(found, mesh, FAR, light) < 0.05
@@ -152,7 +152,7 @@ def test_the_polar_angle_of_the_camera_is_found_from_an_image_of_a_round_object(
     """
     mesh = renderer.normalize(renderer.solid("bottle", 3))
     camera = PerspectiveCamera(31.5, 286.5, 2.6, 0.1, 0.1, distance=4.0)
-    [image] = renderer.render(mesh, camera, positive_light("st_peters"), 64, 0.0, samples=8)
+    image = renderer.render(mesh, camera, positive_light("st_peters"), 64, 0.0, samples=8)
     mask = coverage_of(mesh, camera, 64)
     found = fit_scene(image.clamp(0, 1), mask, mesh, fov=camera.angle)
     assert found.camera.polar == pytest.approx(camera.polar, abs=1)

@@ -19,7 +19,7 @@ def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
 
 
 def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndarray:
-    image = renderer.render(mesh, camera, renderer.load_light("grace").double(), SIZE, 0.0)[0]
+    image = renderer.render(mesh, camera, renderer.load_light("grace").double(), SIZE, 0.0)
     return to_bytes(image.permute(1, 2, 0)).numpy()
 
 
@@ -49,7 +49,7 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
         size,
         0.0,
         samples=8,
-    )[0]
+    )
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
     assert error(window.cut(pixels, size), expected) < 0.04
     assert error(straight, expected) > 0.1
@@ -83,7 +83,7 @@ def test_a_window_without_perspective_is_what_the_moved_camera_renders():
         48,
         0.0,
         samples=8,
-    )[0]
+    )
     assert error(window.cut(pixels, 48), expected) < 0.02
 
 

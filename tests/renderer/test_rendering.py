@@ -59,6 +59,18 @@ def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals)
         torch.testing.assert_close(operator.image(light, 0.3), image, rtol=0, atol=13 * 8 * EPS32)
 
 
+def test_images_of_a_camera_alone_are_those_of_a_list_without_their_first_dimension(stone, light):
+    camera = CAMERAS[1]
+    [expected] = renderer.render(stone, [camera], light, **SMALL)
+    assert torch.equal(renderer.render(stone, camera, light, **SMALL), expected)
+
+    lights = light.float() * torch.tensor([0.5, 1.0])[:, None, None]
+    [expected] = renderer.precompute_transfer(stone, [camera], **SMALL).image(lights)
+    operator = renderer.precompute_transfer(stone, camera, **SMALL)
+    assert torch.equal(operator.image(lights), expected)
+    assert expected.shape == (2, 3, 9, 9)
+
+
 @pytest.fixture
 def variables(stone, light) -> dict[str, Tensor]:
     """Return the inputs of `render` that have gradients."""

@@ -313,7 +313,7 @@ def success_by_light(
     atomic_write(out / f"{kind}.npz", content.getbuffer())
     if is_wrong.any():
         example = int(is_wrong.nonzero()[0])
-        logits = torch.stack([result.logits_before[example, 0], result.logits[example, 0]])
+        logits = torch.stack([result.logits_before[example], result.logits[example]])
         counts |= predictions(logits, classifier.classes)
         counts["slider"] = frames_of(result, example)
         write_image(out / f"{kind}.png", _draw_pair(result, example))
@@ -322,8 +322,8 @@ def success_by_light(
 
 def _draw_pair(result: AttackResult, example: int) -> Image.Image:
     """Draw the first view of an example before and after the attack, side by side."""
-    before = result.images_before[example, 0]
-    after = result.images[example, 0]
+    before = result.images_before[example]
+    after = result.images[example]
     pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
     is_enlarged = before.shape[-1] < SIDE
     method = Image.Resampling.NEAREST if is_enlarged else Image.Resampling.LANCZOS

@@ -151,7 +151,7 @@ def run(settings: AttackExperimentSettings) -> None:
     with keyed(name="classifier"):
         classifier = load_chosen(settings).to(device)
     if adversary is not None:
-        images = adversary.render(_start_rasterizer(settings)).to(device)
+        images = adversary.render_views(_start_rasterizer(settings)).to(device)
         views = format_reloaded(adversary, images, classifier, settings.attack, settings.seed)
         print("\n".join(shortened(views)))
         if not settings.attack.parameters:
@@ -527,7 +527,7 @@ def format_reloaded(
         settings=settings,
         seed=seed,
     )
-    differences = (images - adversary.images.to(images)).abs().flatten(1).amax(1)
+    differences = (images - adversary.images_in_views.to(images)).abs().flatten(1).amax(1)
     named = predictions(logits[0], classifier.classes)
     lines = []
     for view in range(len(images)):

@@ -51,8 +51,8 @@ def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
 
 def adversary_of(done: augment.AttackResult) -> Adversary:
     """Return the first example of an attack as it is written."""
-    before = done.images_before[0]
-    return Adversary.of(done.problem.scene, 0, done.conditions, before, done.images[0])
+    before = done.images_in_views_before[0]
+    return Adversary.of(done.problem.scene, 0, done.conditions, before, done.images_in_views[0])
 
 
 def tolerance(kinds: set[str]) -> float:

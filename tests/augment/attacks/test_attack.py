@@ -30,21 +30,36 @@ def test_every_parameter_alone_and_with_others_lowers_the_cost(result):
 
 
 def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
-    assert result.images.shape == (2, 1, 3, 8, 8)
+    assert result.images.shape == (2, 3, 8, 8)
     labels = result.criterion.source[:, 0]
     before = (result.images_before, result.logits_before, result.descent.cost_before)
     after = (result.images, result.logits, result.descent.cost)
     for images, logits, cost in (before, after):
-        assert torch.equal(logits[:, 0], by_color(images[:, 0]))
-        expected = adversarial_cost(logits[:, 0], labels)
+        assert torch.equal(logits, by_color(images))
+        expected = adversarial_cost(logits, labels)
         # Sums of 64 pixels in another order differ by rounding.
         torch.testing.assert_close(cost, expected, rtol=0, atol=1e-4)
-    assert torch.equal(result.success, result.logits[:, 0].argmax(1) != 0)
+    assert torch.equal(result.success, result.logits.argmax(1) != 0)
 
 
 def test_the_images_are_those_of_the_values(result):
     images = result.problem.render(result.descent.values, torch.arange(2))
-    torch.testing.assert_close(images.detach(), result.images, rtol=0, atol=1e-6)
+    torch.testing.assert_close(images.detach(), result.images_in_views, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("views", "dimensions"), [(1, ()), (2, (2,))])
+def test_images_and_logits_have_a_dimension_for_views_only_if_there_are_several(
+    attacked, by_color, tmp_path, views, dimensions
+):
+    scene = {"views": views, "shared": True, "backgrounds": [0.2, 0.4, 0.6]}
+    result = attacked("lighting", scene, by_color, max_steps=0)
+    assert result.images.shape == result.images_before.shape == (3, *dimensions, 3, 8, 8)
+    assert result.logits.shape == result.logits_before.shape == (3, *dimensions, 4)
+    assert torch.equal(result.images, result.images_in_views.view(result.images.shape))
+    augment.save(result, tmp_path, verify=())
+    adversary = augment.reload(tmp_path / "example_002")
+    assert torch.equal(adversary.images, result.images[2])
+    assert adversary.render().shape == result.images[2].shape
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -111,7 +126,7 @@ def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(
     settings = augment.AttackSettings(geometry=steps, albedo=steps, max_steps=2)
     result = augment.attack(by_color, scene, settings=settings, force=True)
     with_initial_shadows = result.problem.images(result.descent.values)
-    assert (with_initial_shadows - result.images).abs().max() > 0.5 / 255
+    assert (with_initial_shadows - result.images_in_views).abs().max() > 0.5 / 255
     (line,) = augment.save(result, tmp_path)
     assert line["versions"]["reload"]["largest_difference"] < 0.1 / 255
 

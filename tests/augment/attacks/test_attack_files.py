@@ -74,7 +74,7 @@ def test_each_line_has_the_predictions_before_and_after(saved):
         ("_before", saved.result.logits_before),
         ("", saved.result.logits),
     ):
-        for line, probabilities in zip(saved.lines, logits[:, 0].softmax(1), strict=True):
+        for line, probabilities in zip(saved.lines, logits.softmax(1), strict=True):
             assert line[f"predicted{suffix}"] == [CLASSES[probabilities.argmax()]]
             assert line[f"confidence{suffix}"] == [pytest.approx(probabilities.max().item())]
     for line in saved.lines:
@@ -83,7 +83,7 @@ def test_each_line_has_the_predictions_before_and_after(saved):
 
 def test_a_success_with_margin_leads_all_other_classes_by_the_margin(saved):
     for example, line in enumerate(saved.lines):
-        logits = saved.result.logits[example, 0]
+        logits = saved.result.logits[example]
         lead = logits[1] - logits[[0, 2, 3]].max()
         expected = bool(lead >= saved.margin)
         assert line["success_with_margin"] is expected
@@ -91,7 +91,7 @@ def test_a_success_with_margin_leads_all_other_classes_by_the_margin(saved):
 
 
 def test_each_line_tells_how_the_image_of_8_bits_is_classified(saved, by_color):
-    for images, line in zip(saved.result.images, saved.lines, strict=True):
+    for images, line in zip(saved.result.images_in_views, saved.lines, strict=True):
         rounded = (images * 255).round() / 255
         probabilities = by_color(rounded).softmax(1)[0]
         predicted = CLASSES[probabilities.argmax()]
@@ -256,7 +256,7 @@ def places_of(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
 def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they_are(result, size):
     before = random_images(size, 0)
     after = random_images(size, 1)
-    sheet = sheet_of(replace(result, images_before=before, images=after))
+    sheet = sheet_of(replace(result, images_in_views_before=before, images_in_views=after))
     side = math.ceil(SIDE / size) * size
     # The captions of the differences have two lines.
     row_height = side + 2 + 2 * LINE_HEIGHT + GAP
@@ -278,7 +278,7 @@ def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(r
     expected[0, 0, 1, 2] = 255
     expected[1, :, 3, 0] = 64
     expected[:, 1, 0, 0] = 159
-    sheet = sheet_of(replace(result, images_before=before, images=after))
+    sheet = sheet_of(replace(result, images_in_views_before=before, images_in_views=after))
     for image in expected / 255:
         [(_, column)] = places_of(sheet, image)
         assert column == MARGIN + 2 * COLUMN_WIDTH

@@ -220,8 +220,8 @@ def test_the_attacked_network_itself_predicts_the_same(attacked, parameters):
     assert row["network"] == "orange12"
     assert all(row["clean_correct"])
     assert all(row["success"])
-    assert row["confidence_before"] == confidence(result.logits_before[chosen])
-    assert row["confidence"] == confidence(result.logits[chosen])
+    assert row["confidence_before"] == confidence(result.logits_in_views_before[chosen])
+    assert row["confidence"] == confidence(result.logits_in_views[chosen])
 
 
 @pytest.fixture(scope="module")
@@ -274,14 +274,14 @@ def test_a_transfer_to_another_mesh_is_to_a_scene_with_it(result):
 
 
 def test_only_clean_correct_examples_are_transferred(result):
-    logits_before = result.logits_before.clone()
+    logits_before = result.logits_in_views_before.clone()
     logits_before[0] *= -1  # The first example becomes misclassified.
-    (row,) = augment.transfer(replace(result, logits_before=logits_before), [network()])
-    assert row["confidence"] == confidence(result.logits[1:])
+    (row,) = augment.transfer(replace(result, logits_in_views_before=logits_before), [network()])
+    assert row["confidence"] == confidence(result.logits_in_views[1:])
 
 
 def test_nothing_is_transferred_if_every_example_was_misclassified(result):
-    misclassified = replace(result, logits_before=-result.logits_before)
+    misclassified = replace(result, logits_in_views_before=-result.logits_in_views_before)
     (row,) = augment.transfer(misclassified, [network()])
     assert row["confidence"] == []
     assert row["success"] == []

@@ -28,9 +28,9 @@ def test_a_plot_shows_the_images_and_the_light_of_its_example(result):
     before, light, after, _ = (axes for axes in figure.axes)
     ball = renderer.light_sphere(result.conditions.light[1], 96)
     for axes, expected in (
-        (before, result.images_before[1, 0]),
+        (before, result.images_before[1]),
         (light, ball),
-        (after, result.images[1, 0]),
+        (after, result.images[1]),
     ):
         shown = axes.images[0].get_array()
         np.testing.assert_allclose(shown, expected.permute(1, 2, 0).clamp(0, 1), atol=1e-6)
@@ -39,7 +39,7 @@ def test_a_plot_shows_the_images_and_the_light_of_its_example(result):
 def test_the_bars_are_the_probabilities_before_and_after(result):
     bars = result.plot(example=0).axes[3]
     names = [label.get_text() for label in bars.get_yticklabels()]
-    expected = [result.logits_before[0, 0].softmax(0), result.logits[0, 0].softmax(0)]
+    expected = [result.logits_before[0].softmax(0), result.logits[0].softmax(0)]
     for container, probabilities in zip(bars.containers, expected, strict=True):
         widths = [bar.get_width() for bar in container]
         rows = [result.classifier.label(name) for name in names]
@@ -62,7 +62,7 @@ def test_an_animation_shows_the_images_from_before_to_after(result, tmp_path, su
             pixels = np.asarray(frame.convert("RGB"), dtype=float) / 255
             means.append(pixels[MARGIN : MARGIN + SIDE, MARGIN : MARGIN + SIDE].mean())
     assert len(means) == 5
-    values = [result.images_before[1, 0], result.images[1, 0]]
+    values = [result.images_before[1], result.images[1]]
     expected = [float(image.mean()) for image in values]
     assert [means[0], means[-1]] == pytest.approx(expected, abs=0.01)
     # The light is interpolated linearly, and so is an image in light alone.

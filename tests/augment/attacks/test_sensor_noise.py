@@ -183,8 +183,8 @@ def threshold_of(attacked, parameter: str, scene: dict, share: float) -> float:
         share: 0 for the first images, 1 for what the attacks reach.
     """
     far = attacked(parameter, scene, nervous(1e3), max_steps=8, force=True)
-    before = resemblance(far.images_before[:, 0]).max()
-    after = resemblance(far.images[:, 0]).min()
+    before = resemblance(far.images_before).max()
+    after = resemblance(far.images).min()
     return float(before + share * (after - before).clamp(min=0.02))
 
 
@@ -275,7 +275,7 @@ def test_adversarial_poses_and_materials_survive_the_noise_of_other_seeds(
         images = []
         for row in is_chosen.nonzero()[:, 0].tolist():
             images.append(augment.reload(folder / f"example_{row:03d}").render())
-        images = torch.cat(images)
+        images = torch.stack(images)
         classifier = result.classifier
         rates[noise_margin] = [survival(images, classifier, each) for each in (0.25, 1.0)]
     assert min(rates[None]) > 0.95

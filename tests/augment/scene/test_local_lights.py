@@ -134,8 +134,8 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
     )
     shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=request.param))
     done = augment.attack(by_mean_color(), shown, settings=settings, force=True)
-    before = done.images_before[0]
-    written = Adversary.of(done.problem.scene, 0, done.conditions, before, done.images[0])
+    before = done.images_in_views_before[0]
+    written = Adversary.of(done.problem.scene, 0, done.conditions, before, done.images_in_views[0])
     folder = tmp_path_factory.mktemp("joint")
     write_adversary(written, folder)
     return done, written, folder
@@ -180,8 +180,8 @@ def moved_lamps(tmp_path_factory) -> tuple[augment.AttackResult, Adversary, Path
     positions = StepSettings("l2", 0.6, "unit", 0.5)
     settings = augment.AttackSettings(positions=positions, max_steps=3)
     done = augment.attack(by_mean_color(), scene(exposure=0.3), settings=settings, force=True)
-    before = done.images_before[1]
-    written = Adversary.of(done.problem.scene, 1, done.conditions, before, done.images[1])
+    before = done.images_in_views_before[1]
+    written = Adversary.of(done.problem.scene, 1, done.conditions, before, done.images_in_views[1])
     folder = tmp_path_factory.mktemp("moved")
     write_adversary(written, folder)
     return done, written, folder

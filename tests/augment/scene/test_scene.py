@@ -207,7 +207,7 @@ def test_light_of_a_higher_degree_shows_the_image_of_the_renderer(glossy, map_op
     light = renderer.load_light(map_options["light"], 12, 0.35)
     mesh = glossy.objects[1].mesh
     camera = glossy.cameras[1][0]
-    expected = renderer.render(mesh, camera, light, 16, samples=1, rasterizer="numpy")[0]
+    expected = renderer.render(mesh, camera, light, 16, samples=1, rasterizer="numpy")
     torch.testing.assert_close(image, expected, rtol=0, atol=1e-5)
 
 
@@ -231,7 +231,7 @@ def test_attacked_light_of_a_higher_degree_is_read_back_to_its_image(glossy, tmp
     conditions = problem.conditions(values, torch.arange(2))
     image = problem.images(values)[1]
     write_adversary(Adversary.of(glossy, 1, conditions, image, image), tmp_path / "adversary")
-    found = reload(tmp_path / "adversary").render(RASTERIZER)
+    found = reload(tmp_path / "adversary").render_views(RASTERIZER)
     torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
 
 

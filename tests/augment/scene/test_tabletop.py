@@ -103,11 +103,11 @@ def compare(surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0) -
     placed = place(surface, camera)
     camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))
-    ball = renderer.render(BALL, camera, even, **RENDERED)[0, 0]
-    flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0, 0]
+    ball = renderer.render(BALL, camera, even, **RENDERED)[0]
+    flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0]
     is_surface = (ball == 0) & (flat > 0.999 * flat.max())
     both = concatenate([BALL, placed.mesh])
-    expected = renderer.render(both, camera, sky, lights=list(lamps), **RENDERED)[0].double()
+    expected = renderer.render(both, camera, sky, lights=list(lamps), **RENDERED).double()
     around = tabletop.Room(Rays(BALL), 1.8, placed.height, placed.wall)
     image = ImageSettings(SIZE, samples=3)
     found = scale * tabletop.irradiance(around, camera, image, *light)
@@ -160,7 +160,7 @@ def test_light_from_above_meets_a_ball_and_its_table_at_their_own_x_and_y(camera
     x = -placed[1] * camera.width / 2
 
     even = ambient(torch.ones(3))
-    shown = renderer.render(ball, camera, even, SIZE, 0.0, samples=1)[0, 0].numpy()
+    shown = renderer.render(ball, camera, even, SIZE, 0.0, samples=1)[0].numpy()
     is_ball = shown > 0
     assert 0.2 < is_ball.mean() < 0.8
     table = np.stack([x, y, np.full_like(x, -1.0)])

@@ -48,8 +48,7 @@ def rendered(
 ) -> Tensor:
     """Render an image (3, size, size) whose gradients see outlines move."""
     choices = {"light": LIGHT, "background": 0.3, "albedo_scale": 0.8, "silhouettes": True}
-    [image] = renderer.render(mesh, camera, size=size, samples=samples, **choices | options)
-    return image
+    return renderer.render(mesh, camera, size=size, samples=samples, **choices | options)
 
 
 def soft_front_light(radiance: float) -> Tensor:

@@ -120,7 +120,7 @@ def test_the_slider_goes_from_the_natural_to_the_adversarial_prediction(views):
     example = int((result.clean_correct & result.success).nonzero()[0])
     slider = frames_of(result, example)
     ends = [slider["frames"][index]["probabilities"] for index in (0, -1)]
-    expected = [result.logits_before[example, 0], result.logits[example, 0]]
+    expected = [result.logits_before[example], result.logits[example]]
     assert slider["classes"] == ["orange", "other"]
     for probabilities, logits in zip(ends, expected, strict=True):
         np.testing.assert_allclose(probabilities, logits.softmax(0), atol=1e-4)

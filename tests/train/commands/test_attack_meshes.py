@@ -56,7 +56,7 @@ def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
         cameras += [(camera,), (camera,)]
     scene = result.problem.scene
     assert scene.cameras == cameras
-    corners = result.images_before[:, 0, :, 0, 0]
+    corners = result.images_before[:, :, 0, 0]
     grays = torch.tensor([0.2, 0.6] * 3)[:, None].expand(-1, 3)
     torch.testing.assert_close(corners, grays, rtol=1e-6, atol=0)
     assert torch.equal(scene.lights, probe("grace").expand(6, -1, -1))

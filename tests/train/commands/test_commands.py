@@ -192,8 +192,8 @@ def test_grab_cut_finds_the_outline_of_a_solid_in_a_box_around_it():
     shown = renderer.solid("orange"), camera, renderer.load_light("uniform"), 96
     generator = torch.Generator().manual_seed(0)
     background = 0.2 + 0.1 * torch.rand(3, 96, 96, generator=generator)
-    image = renderer.render(*shown, background, encoding="srgb")[0]
-    is_object = (renderer.render(*shown, 0.0)[0].amax(0) > 0).numpy()
+    image = renderer.render(*shown, background, encoding="srgb")
+    is_object = (renderer.render(*shown, 0.0).amax(0) > 0).numpy()
     is_found = grab_cut(to_pixels(image), [10, 10, 86, 86]) > 0
     intersection = (is_found & is_object).sum()
     union = (is_found | is_object).sum()
@@ -227,8 +227,8 @@ def photographed_cup(here) -> Path:
         background,
         samples=4,
         encoding="srgb",
-    )[0]
-    white_behind_black = renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)[0]
+    )
+    white_behind_black = renderer.render(mesh, camera, 0 * light, size, 1.0, samples=4)
     Image.fromarray(to_pixels(photograph)).save(here / "photo.png")
     Image.fromarray(to_pixels(1 - white_behind_black)).save(here / "mask.png")
     return here
@@ -272,14 +272,14 @@ def test_a_scene_that_was_fitted_is_rendered_and_scored_as_it_was_photographed(
 
     # The render differs from the photograph in the pixels of the object alone.
     background = read_image(scene.backgrounds[0], 64).double()
-    image = renderer.render(mesh, camera, light, 64, background, samples=4, encoding="srgb")[0]
+    image = renderer.render(mesh, camera, light, 64, background, samples=4, encoding="srgb")
     difference = (image - background).abs().amax(0)
     assert (difference > 0).double().mean() > 0.2
     assert float(difference[difference > 0].mean()) < 0.06
 
     # The printed error is that of images in the size of the default classifier.
     background = read_image(scene.backgrounds[0], 224).double()
-    image = renderer.render(mesh, camera, light, 224, background, samples=2, encoding="srgb")[0]
+    image = renderer.render(mesh, camera, light, 224, background, samples=2, encoding="srgb")
     is_inside = read_image(photographed_cup / "fitted" / "mask.png", 224)[0] > 0.98
     rendered = decode(image[:, is_inside], "srgb")
     photographed = decode(background[:, is_inside], "srgb")

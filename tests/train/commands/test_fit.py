@@ -94,7 +94,7 @@ def irradiance(mesh: Mesh, camera: Camera, light: Tensor) -> Tensor:
     """Compute the irradiance of the visible surface without shadows, shape (3, pixels)."""
     white = Mesh.plain(mesh.vertices, mesh.faces)
     dim = 1e-3  # Values are so small that none is clamped.
-    return renderer.render(white, camera, dim * light.double(), 96, 0.0)[0].flatten(1) / dim
+    return renderer.render(white, camera, dim * light.double(), 96, 0.0).flatten(1) / dim
 
 
 def check_fit(
