@@ -37,7 +37,8 @@ class StepSettings(Settings):
     The radii of the paper (Section 4.1) are 0.1 per coefficient of the lighting and 0.002 per
     axis of a vertex, both with norm="linf".
 
-    >>> StepSettings(norm="l2", radius=1.0).step
+    >>> import norm_balls as nb
+    >>> nb.StepSettings(norm="l2", radius=1.0).step
     'unit'
 
     Attributes:
@@ -168,7 +169,7 @@ class MaterialSettings(StepSettings):
     """Attack on the specular material and the hue of the object.
 
     Each part is measured in the unit that its field gives. A part with the unit 0 stays as it
-    is. See `renderer.Gloss` for roughness, metallic and strength.
+    is. See `nb.Gloss` for roughness, metallic and strength.
     """
 
     needs_noise_margin = True

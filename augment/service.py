@@ -162,7 +162,7 @@ class AugmentationService:
             InputError: If an argument has the wrong type or shape, or if the
                 settings need a scene or images that are not given.
         """
-        expected = "augment.AugmentationSettings(...)"
+        expected = "nb.AugmentationSettings(...)"
         require_kind("settings", self.settings, AugmentationSettings, expected)
         require_seed("seed", self.seed)
         require_kind("scene", self.scene, Scene | None, "the scene of build_scene, or None")
@@ -227,13 +227,15 @@ class AugmentationService:
                 `build_scene`.
 
         Example:
+            >>> from torch import nn
+            >>> import norm_balls as nb
             >>> meshes = [("solid:orange", 0), ("solid:apple", 1)]
-            >>> service = AugmentationService.from_meshes(meshes, 8, views=1, samples=1)
+            >>> service = nb.AugmentationService.from_meshes(meshes, 8, views=1, samples=1)
             >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
             >>> service.regenerate(model, number=0).images.shape
             torch.Size([10, 3, 8, 8])
         """
-        expected = "augment.AugmentationSettings(...) or None"
+        expected = "nb.AugmentationSettings(...) or None"
         require_kind("settings", settings, AugmentationSettings | None, expected)
         require_seed("seed", seed)
         expected = (

@@ -137,7 +137,8 @@ class ObjectSettings(MeshSettings):
     Props are in the image, too, and cast and receive the shadows of the object, but they are
     never attacked.
 
-    >>> ObjectSettings("solid:orange", label="orange").albedo_scale
+    >>> import norm_balls as nb
+    >>> nb.ObjectSettings("solid:orange", label="orange").albedo_scale
     1.0
     """
 
@@ -153,7 +154,7 @@ class ObjectSettings(MeshSettings):
             if isinstance(prop, Mapping):
                 self.props[index] = settings_from(PropSettings, prop, f"props[{index}]")
             elif not isinstance(prop, PropSettings):
-                expected = "give mappings, or a list of augment.PropSettings"
+                expected = "give mappings, or a list of nb.PropSettings"
                 raise InputError(f"props[{index}] is {describe(prop)}: {expected}", "props")
 
 
@@ -396,7 +397,8 @@ class VariationSettings(Settings):
     By default nothing is drawn, which keeps the grid of the paper. Backgrounds keep the lighting
     that was drawn, also while an attack changes the lighting of the object.
 
-    >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
+    >>> import norm_balls as nb
+    >>> nb.VariationSettings(shift=0.1).moves, nb.VariationSettings(exposure=[0.5, 2.0]).moves
     (True, False)
     """
 
@@ -549,7 +551,9 @@ class TrainingAttackSettings(AttackSettings):
 class AugmentationSettings(Settings):
     """Renders of an augmentation service, and the interval at which they are regenerated.
 
-    >>> AugmentationSettings(mode="random", random_light=RandomLightSettings(radius=1.5)).renders
+    >>> import norm_balls as nb
+    >>> random_light = nb.RandomLightSettings(radius=1.5)
+    >>> nb.AugmentationSettings(mode="random", random_light=random_light).renders
     True
     """
 

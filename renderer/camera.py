@@ -330,7 +330,9 @@ class OrthographicCamera(Camera):
 
     The attributes are those of `Camera`.
 
-    >>> camera = OrthographicCamera(polar=90.0, azimuth=0.0, width=2.0)  # It lies on +x.
+    >>> import numpy as np
+    >>> import norm_balls as nb
+    >>> camera = nb.OrthographicCamera(polar=90.0, azimuth=0.0, width=2.0)  # It lies on +x.
     >>> camera.project(np.array([[0.0, 1.0, 0.5]]))[:, :2].round(6).tolist()  # x and y
     [[1.0, 0.5]]
     """
@@ -359,7 +361,9 @@ class PerspectiveCamera(Camera):
     The attributes are those of `Camera`. From a large distance, the image is
     the same as the image of an orthographic camera of the same width.
 
-    >>> camera = PerspectiveCamera(polar=90.0, azimuth=0.0, width=2.0, distance=4.0)
+    >>> import numpy as np
+    >>> import norm_balls as nb
+    >>> camera = nb.PerspectiveCamera(polar=90.0, azimuth=0.0, width=2.0, distance=4.0)
     >>> point = np.array([[2.0, 0.5, 0.0]])  # It has half the distance of the origin.
     >>> camera.project(point)[0, 0].round(6).item()
     1.0
@@ -417,7 +421,7 @@ class PinholeCamera(PerspectiveCamera):
     """Pinhole camera with any position, direction, roll and principal point.
 
     `from_matrix` creates it from a view matrix and intrinsics, and
-    `renderer.load_cameras` from the files of COLMAP and nerfstudio. It shows
+    `nb.load_cameras` from the files of COLMAP and nerfstudio. It shows
     everything in front of it. Where `Camera` has the origin, this camera has its
     center: polar angle, azimuth, distance, right, up and width are relative to
     the center. Attacks on the pose turn the camera about this point.
@@ -437,9 +441,11 @@ class PinholeCamera(PerspectiveCamera):
         pixel_aspect: Focal length in vertical pixels over the focal length in
             horizontal pixels.
 
+    >>> import numpy as np
+    >>> import norm_balls as nb
     >>> view = np.eye(4)
     >>> view[2, 3] = 5.0  # The origin lies 5 units in front of the camera.
-    >>> camera = PinholeCamera.from_matrix(view, [[50, 0, 16], [0, 50, 20], [0, 0, 1]], size=32)
+    >>> camera = nb.PinholeCamera.from_matrix(view, [[50, 0, 16], [0, 50, 20], [0, 0, 1]], size=32)
     >>> image_position = camera.project(np.array([[0.0, 0.0, 0.0]]))[0, :2]
     >>> (16 + 16 * image_position * [1, -1]).round(6).tolist()  # in pixels, y down
     [16.0, 20.0]
@@ -693,9 +699,10 @@ def orbit_cameras(
     Raises:
         InputError: If a value is out of range.
 
-    >>> [camera.azimuth for camera in orbit_cameras(views=4, width=2.0)]
+    >>> import norm_balls as nb
+    >>> [camera.azimuth for camera in nb.orbit_cameras(views=4, width=2.0)]
     [0.0, 90.0, 180.0, 270.0]
-    >>> orbit_cameras(views=1, width=2.0, fov=30.0)[0].distance.__round__(3)
+    >>> nb.orbit_cameras(views=1, width=2.0, fov=30.0)[0].distance.__round__(3)
     3.732
     """
     require_whole("views", views)

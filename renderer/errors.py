@@ -52,7 +52,8 @@ class InputError(ValueError):
     Attributes:
         argument: The same name.
 
-    >>> require_range("samples", 0, 1, 64)
+    >>> import norm_balls as nb
+    >>> nb.ImageSettings(size=32, samples=0)
     Traceback (most recent call last):
     renderer.errors.InputError: samples=0 must be at least 1 and at most 64
     """
@@ -73,7 +74,9 @@ class InputError(ValueError):
         Returns:
             Error whose sentence begins with the key.
 
-        >>> InputError("views=0 must be at least 1", "views").within("scene", ["views", "light"])
+        >>> import norm_balls as nb
+        >>> error = nb.InputError("views=0 must be at least 1", "views")
+        >>> error.within("scene", ["views", "light"])
         InputError('scene.views=0 must be at least 1')
         """
         if not key:

@@ -311,11 +311,12 @@ def fit_scene(
         InputError: If the mask holds no object, or if shapes do not fit.
 
     Example:
+        >>> import norm_balls as nb
         >>> mesh = nb.solid("cup")
-        >>> camera = nb.orbit_cameras(1, width=2.4)[0]
+        >>> camera = nb.OrthographicCamera(polar=60.0, azimuth=0.0, width=2.4)
         >>> light = 0.3 * nb.load_light("grace")
-        >>> photograph = nb.render(mesh, camera, light, size=32)[0].clamp(0, 1)
-        >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0, 0]
+        >>> photograph = nb.render(mesh, camera, light, size=32).clamp(0, 1)
+        >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0]
         >>> found = nb.fit_scene(photograph, mask, mesh)  # doctest: +SKIP
     """
     size = photograph.shape[-1]

@@ -28,6 +28,7 @@ def attach(
         `__getattr__`, `__dir__` and `__all__` of the package.
 
     Example:
+        >>> import renderer
         >>> attach("renderer", renderer.__file__)[2][0]
         'Camera'
     """

@@ -88,12 +88,12 @@ def render(
         mesh: The mesh, of N vertices and F faces.
         cameras: One camera, or a list of V cameras.
         light: Coefficients of environment light, shape ((degree + 1)², 3), such
-            as `renderer.load_light` returns. None for no environment light.
+            as `nb.load_light` returns. None for no environment light.
         size: Pixels per side of the images.
         background: Gray value, color (3,) or images in [0, 1], see
             `renderer.image.as_background`. One for all views, or an image for each.
 
-        lights: Local lights, such as `renderer.light.lamps.Lamps`, alone for full
+        lights: Local lights, such as `nb.Lamps`, alone for full
             white power or in pairs with coefficients (size, 3). They cast shadows
             and do not bounce.
 
@@ -125,6 +125,8 @@ def render(
             fit, a choice is unknown, or the albedo is not in [0, 1].
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> light = nb.load_light("grace").requires_grad_()
         >>> cameras = nb.orbit_cameras(2, 2.2)
         >>> image = nb.render(nb.solid("apple"), cameras, light, size=16)
@@ -279,6 +281,8 @@ def precompute_transfer(
         InputError: If an argument is out of range, or if there is no camera.
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> cameras = nb.orbit_cameras(2, 2.2)
         >>> operators = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
         >>> lights = torch.stack([nb.load_light("grace"), nb.load_light("st_peters")])
@@ -320,6 +324,7 @@ def light_sphere(
         InputError: If the light has values that are not finite.
 
     Example:
+        >>> import norm_balls as nb
         >>> image = nb.light_sphere(nb.load_light("grace"), size=16)
         >>> image.shape
         torch.Size([3, 16, 16])
@@ -334,7 +339,7 @@ def light_sphere(
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
     """Return one camera or several as a list."""
-    advice = "a camera or a list of cameras, such as renderer.orbit_cameras(10, width=2.0)"
+    advice = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
     listed = as_list(
         "cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice
     )
@@ -352,16 +357,14 @@ def _require_scale(albedo_scale: float) -> None:
 def _require_gloss(gloss: Gloss | None) -> None:
     """Check that gloss is a record of its three values, not one of these."""
     require_kind(
-        "gloss", gloss, Gloss | None, "renderer.Gloss(roughness, metallic, specular_factor) or None"
+        "gloss", gloss, Gloss | None, "nb.Gloss(roughness, metallic, specular_factor) or None"
     )
 
 
 def _as_light(light: object) -> Tensor:
     """Convert the coefficients of environment light."""
     if isinstance(light, str):
-        raise InputError(
-            f"light is {light!r}: give coefficients, such as renderer.load_light({light!r})"
-        )
+        raise InputError(f"light is {light!r}: give coefficients, such as nb.load_light({light!r})")
     coefficients = as_tensor("light", light)
     degree_of(coefficients)
     return coefficients

@@ -360,7 +360,8 @@ def _expected(hint: Any) -> str:
 class ImageSettings(Settings):
     """Size, sampling and shading of rendered images.
 
-    >>> ImageSettings(size=224, samples=2, encoding="srgb", bounces=1).global_illumination
+    >>> import norm_balls as nb
+    >>> nb.ImageSettings(size=224, samples=2, encoding="srgb", bounces=1).global_illumination
     True
     """
 

@@ -1,30 +1,41 @@
-"""The examples in docstrings of public functions run and print what they say."""
+"""The examples in docstrings run and print what they say. Those of public names use `nb`."""
 
 import doctest
 import importlib
+from pathlib import Path
 from types import FunctionType, ModuleType
 
 import pytest
 import torch
 from torch import Tensor
 
-import augment
-import norm_balls
-import renderer
+import norm_balls as nb
 
-PUBLIC = {}
-for package in (renderer, augment):
-    for name in package.__all__:
-        PUBLIC[f"{package.__name__}.{name}"] = getattr(package, name)
-
-
-def module_of(value: object) -> str:
-    """Return the name of a module, or of the module that defines a function or a class."""
-    return value.__name__ if isinstance(value, ModuleType) else value.__module__
-
-
-MODULES = {module_of(value) for value in PUBLIC.values()}
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("renderer", "augment", "train")
+FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+PUBLIC = {name: getattr(nb, name) for name in nb.__all__}
 FUNCTIONS = [name for name, value in PUBLIC.items() if isinstance(value, FunctionType)]
+
+
+def modules_with_examples() -> list[str]:
+    """List the names of the modules whose text has an example."""
+    names = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if ">>>" in path.read_text(encoding="utf-8"):
+                parts = path.relative_to(ROOT).with_suffix("").parts
+                names.append(".".join(parts).removesuffix(".__init__"))
+    return names
+
+
+def is_public(module: ModuleType, name: str) -> bool:
+    """Tell whether `norm_balls` exports a module, or a name of it such as "Mesh.plain"."""
+    exported = list(PUBLIC.values())
+    if any(value is module for value in exported):
+        return True
+    defined = getattr(module, name.split(".")[0], None)
+    return any(value is defined for value in exported)
 
 
 def logits(images: Tensor) -> Tensor:
@@ -33,35 +44,29 @@ def logits(images: Tensor) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def result() -> augment.AttackResult:
-    """Define what the example of `augment.attack` defines."""
-    classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
-    scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
-    light = augment.StepSettings(step_size=0.5)
-    settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
-    return augment.attack(classifier, scene, settings=settings)
+def result() -> nb.AttackResult:
+    """Define what the example of `nb.attack` defines."""
+    classifier = nb.Classifier(logits, size=8, classes=["orange", "other"])
+    scene = nb.build_scene([("solid:orange", "orange")], classifier.size)
+    light = nb.StepSettings(step_size=0.5)
+    settings = nb.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
+    return nb.attack(classifier, scene, settings=settings)
 
 
-@pytest.mark.parametrize("module", sorted(MODULES))
-def test_examples_run(module, result, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", modules_with_examples())
+def test_examples_run(name, result, tmp_path, monkeypatch):
+    """Examples of public names run without the names of their module, as those of a user do."""
     monkeypatch.chdir(tmp_path)
-    flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
-    names = {
-        "nb": norm_balls,
-        "augment": augment,
-        "renderer": renderer,
-        "torch": torch,
-        "nn": torch.nn,
-        "result": result,
-    }
-    failures, _ = doctest.testmod(
-        importlib.import_module(module),
-        extraglobs=names,
-        optionflags=flags,
-    )
-    assert not failures
+    module = importlib.import_module(name)
+    runner = doctest.DocTestRunner(optionflags=FLAGS)
+    for test in doctest.DocTestFinder(exclude_empty=True).find(module):
+        if test.examples and is_public(module, test.name.removeprefix(f"{name}.")):
+            assert "import norm_balls as nb\n" in [example.source for example in test.examples]
+            test.globs = {"result": result}
+        runner.run(test)
+    assert runner.summarize().failed == 0
 
 
-@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "augment.attack"])
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_public_function_has_an_example(name):
     assert ">>>" in PUBLIC[name].__doc__

@@ -295,7 +295,7 @@ def _write_views(images: Tensor, folder: Path, name: str) -> None:
 
 
 def reload(folder: str | Path) -> Adversary:
-    """Read the folder of an example that `augment.save` wrote.
+    """Read the folder of an example that `nb.save` wrote.
 
     Args:
         folder: The folder, such as "adversaries/example_000".
@@ -307,6 +307,7 @@ def reload(folder: str | Path) -> Adversary:
         InputError: If a file is missing or damaged.
 
     Example:
+        >>> import norm_balls as nb
         >>> lines = nb.save(result, "adversaries")
         >>> adversary = nb.reload("adversaries/example_000")
         >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)

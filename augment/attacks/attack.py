@@ -68,8 +68,8 @@ MAX_FRAME_COUNT = 1000
 class AttackResult:
     """Result of an attack on E examples of V views, seen by a classifier of C classes.
 
-    It is a value that `augment.check`, `augment.success_by_radius`,
-    `augment.transfer` and `augment.save` take.
+    It is a value that `nb.check`, `nb.success_by_radius`,
+    `nb.transfer` and `nb.save` take.
 
     Attributes:
         problem: The attacked scene, and the parameters that were changed.
@@ -242,6 +242,8 @@ class AttackResult:
             OSError: If the file cannot be written.
 
         Example:
+            >>> from pathlib import Path
+            >>> import torch
             >>> import norm_balls as nb
             >>> def logits(images):
             ...     mean = images.mean((1, 2, 3))
@@ -318,7 +320,7 @@ def require_result(result: object) -> None:
     Raises:
         InputError: If it is something else.
     """
-    require_kind("result", result, AttackResult, "the result of augment.attack")
+    require_kind("result", result, AttackResult, "the result of nb.attack")
 
 
 def attack(
@@ -378,6 +380,8 @@ def attack(
             row of logits for each image.
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> def logits(images):
         ...     mean = images.mean((1, 2, 3))
         ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
@@ -389,8 +393,8 @@ def attack(
         >>> result.success, result.images.shape
         (tensor([True]), torch.Size([1, 3, 8, 8]))
     """
-    require_kind("scene", scene, Scene, "a scene, such as augment.build_scene(...)")
-    require_kind("settings", settings, AttackSettings | None, "augment.AttackSettings(...) or None")
+    require_kind("scene", scene, Scene, "a scene, such as nb.build_scene(...)")
+    require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
     require_seed("seed", seed)
     require_flag("force", force)
     size = scene.settings.size

@@ -48,12 +48,12 @@ def save(
 ) -> list[dict[str, Any]]:
     """Write a figure and a folder with the whole adversary of each example, and attack.jsonl.
 
-    `augment.reload` reads such a folder.
+    `nb.reload` reads such a folder.
 
     Args:
-        result: The result of `augment.attack`.
+        result: The result of `nb.attack`.
         folder: The folder to write.
-        checks: The result of `augment.check`, for the last line of
+        checks: The result of `nb.check`, for the last line of
             attack.jsonl.
         verify: Renderers that render the adversaries again from the folders:
             "reload", "mitsuba" or both. The illumination of Mitsuba is direct,
@@ -71,6 +71,8 @@ def save(
             or not installed.
 
     Example:
+        >>> from pathlib import Path
+        >>> import norm_balls as nb
         >>> [line] = nb.save(result, "adversaries")
         >>> sorted(path.name for path in Path("adversaries").iterdir())
         ['attack.jsonl', 'example_000', 'example_000.png']
@@ -80,10 +82,10 @@ def save(
     require_result(result)
     folder = as_folder("folder", folder)
     if checks is not None:
-        require_kind("checks", checks, Mapping, "the result of augment.check")
+        require_kind("checks", checks, Mapping, "the result of nb.check")
         if missing := CHECKED - checks.keys():
             names = ", ".join(sorted(missing))
-            raise InputError(f"checks lacks {names}: give the result of augment.check")
+            raise InputError(f"checks lacks {names}: give the result of nb.check")
     verify = [verify] if isinstance(verify, str) else verify
     verify = as_list("verify", verify, str, "a list of renderers")
     require_renderers(verify)

@@ -64,7 +64,7 @@ def check(result: AttackResult) -> dict[str, Any]:
     the result.
 
     Args:
-        result: The result of `augment.attack`.
+        result: The result of `nb.attack`.
 
     Returns:
         Fractions of examples, and mean costs. "cost_fell" is a fraction of the
@@ -78,6 +78,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         InputError: If `result` is no result of an attack.
 
     Example:
+        >>> import norm_balls as nb
         >>> checks = nb.check(result)
         >>> checks["success"], checks["cost"] < checks["cost_before"]
         (1.0, True)
@@ -145,7 +146,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     radius, take `max_steps` more steps, and get as many random draws.
 
     Args:
-        result: The result of `augment.attack`.
+        result: The result of `nb.attack`.
         scales: Factors of radii and steps or, for parameters without a radius,
             the radii.
 
@@ -161,6 +162,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
             positive numbers.
 
     Example:
+        >>> import norm_balls as nb
         >>> small, large = nb.success_by_radius(result, [0.001, 1])
         >>> small["radii"], small["adversarial"], large["adversarial"]
         ({'lighting': 0.001}, tensor([False]), tensor([True]))
@@ -205,7 +207,7 @@ def transfer(
     pixel offsets are resized.
 
     Args:
-        result: The result of `augment.attack`.
+        result: The result of `nb.attack`.
         classifiers: Other classifiers, for each of which the adversaries are
             rendered at its size, or plain networks that take the images and
             have the classes of the attacked classifier.
@@ -229,6 +231,7 @@ def transfer(
             class.
 
     Example:
+        >>> import norm_balls as nb
         >>> function = result.classifier.function
         >>> larger = nb.Classifier(function, size=12, classes=["orange", "other"])
         >>> [network, turned] = nb.transfer(result, [larger], azimuths=[20.0])
@@ -236,7 +239,7 @@ def transfer(
         ([['other']], '+20°')
     """
     require_result(result)
-    expected = "a list of torch.nn.Module, functions to logits, or augment.Classifier"
+    expected = "a list of torch.nn.Module, functions to logits, or nb.Classifier"
     networks = as_list("classifiers", classifiers, Callable, expected)
     objects = as_list(
         "objects",

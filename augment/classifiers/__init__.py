@@ -110,7 +110,7 @@ def load_classifier(
             `squeezenet_caffe`, `torchvision:NAME`, `timm:NAME`,
             `python:package.module:function`, or the path of a file of
             TorchScript, `torch.export` (.pt2) or ONNX (.onnx). The commands
-            also take `run:FOLDER`, which is `train.load_run(FOLDER)` in Python.
+            also take `run:FOLDER`, which is `nb.load_run(FOLDER)` in Python.
         weights: File of weights. None for the weights that the source contains
             or downloads. The number of classes is read from the file.
         classes: Names of the classes in the order of the outputs, or a text
@@ -133,7 +133,8 @@ def load_classifier(
             network has, or if a package is not installed.
 
     Example:
-        >>> load_classifier("torchvision:squeezenet1_1", "absent.pt")
+        >>> import norm_balls as nb
+        >>> nb.load_classifier("torchvision:squeezenet1_1", "absent.pt")
         Traceback (most recent call last):
         renderer.errors.InputError: absent.pt does not exist: give the path of a file of weights
     """

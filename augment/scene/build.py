@@ -65,7 +65,7 @@ def build_scene(
         size: Pixels per side of the images.
         views: Number of cameras on the circle.
         cameras: Cameras of every mesh instead of a circle, such as those of
-            `renderer.load_cameras`. They replace `views`.
+            `nb.load_cameras`. They replace `views`.
         normalize: Whether the cameras see each mesh moved to the origin and
             scaled to span [-1, 1]. If False, they see it where it is, in the
             units of its file. The scene then moves and scales the cameras with
@@ -94,14 +94,15 @@ def build_scene(
             memory.
 
     Example:
+        >>> from dataclasses import replace
+        >>> import norm_balls as nb
         >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
-        >>> scene = build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], samples=1)
+        >>> scene = nb.build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], samples=1)
         >>> len(scene), scene.labels[0]
         (12, 'orange')
 
         A mesh and cameras in world units, as photogrammetry gives them:
 
-        >>> import norm_balls as nb
         >>> mesh = nb.solid("orange")
         >>> placed = replace(mesh, vertices=mesh.vertices + [10.0, 0.0, 0.0])
         >>> view = [[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 15], [0, 0, 0, 1]]
@@ -175,7 +176,7 @@ def _require_known(options: Mapping[str, Any]) -> None:
 
 def _as_meshes(meshes: object) -> list[Any]:
     """Check that the argument is a list of `ObjectSettings`, or of pairs of a mesh and a label."""
-    expected = "a list of pairs such as ('solid:orange', 'orange'), or of augment.ObjectSettings"
+    expected = "a list of pairs such as ('solid:orange', 'orange'), or of nb.ObjectSettings"
     members = as_list("meshes", meshes, ObjectSettings | tuple | list, expected)
     if not members:
         raise InputError(f"meshes is empty: give {expected}")
@@ -212,7 +213,7 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
                 "normalize=False needs cameras: give cameras=[...] of the mesh's world"
             )
         return []
-    expected = "a list of cameras, such as list(renderer.load_cameras(path).values())"
+    expected = "a list of cameras, such as list(nb.load_cameras(path).values())"
     given = as_list("cameras", cameras, Camera, expected)
     if not given:
         raise InputError(f"cameras is empty: give {expected}")

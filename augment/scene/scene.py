@@ -72,8 +72,9 @@ class Scene:
         InputError: If an argument is of another kind, shape or range, or memory is too small.
 
     Example:
-        >>> from augment.scene.build import build_scene
-        >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> scene = nb.build_scene([("solid:orange", "orange")], size=8, views=2)
         >>> examples = torch.arange(len(scene))
         >>> scene.render(scene.conditions(examples), examples).shape
         torch.Size([2, 1, 3, 8, 8])
@@ -92,7 +93,7 @@ class Scene:
         one_light: bool = False,
         lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None,
     ):
-        require_kind("settings", settings, ImageSettings, "renderer.ImageSettings(size)")
+        require_kind("settings", settings, ImageSettings, "nb.ImageSettings(size)")
         require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
         effects = "a function of images and examples"
         require_kind("camera_effects", camera_effects, Callable | None, effects)

@@ -69,7 +69,7 @@ class Mesh:
         textures: sRGB-encoded textures, shape (H, W, 3) each, uint8. Row 0 is
             the top.
         gloss: Roughness, metallic and specular factor of each face in [0, 1]
-            (`renderer.Gloss`), shape (F, 3), float32. None for a matte mesh.
+            (`nb.Gloss`), shape (F, 3), float32. None for a matte mesh.
         gloss_textures: For each of the textures, factors of roughness and
             metallic, shape (H, W, 2) each, uint8. Empty without such textures.
         skin: Joints that carry the vertices. None without joints.
@@ -79,8 +79,9 @@ class Mesh:
             an index is out of range.
 
     Example:
+        >>> import norm_balls as nb
         >>> corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-        >>> square = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
+        >>> square = nb.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
         >>> square.face_areas().tolist()
         [0.5, 0.5]
         >>> square.face_normals()[0].tolist()
@@ -310,8 +311,8 @@ def require_mesh(name: str, value: object) -> None:
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
         raise InputError(
-            f"{name} is {describe(value)}: give a renderer.Mesh, "
-            f"such as renderer.load_mesh({path}) or renderer.Mesh.plain(vertices, faces)"
+            f"{name} is {describe(value)}: give an nb.Mesh, "
+            f"such as nb.load_mesh({path}) or nb.Mesh.plain(vertices, faces)"
         )
     if not value.displayable:
         raise InputError(
@@ -402,7 +403,9 @@ def normalize(mesh: Mesh) -> Mesh:
         InputError: If the surface has no area. `load_mesh` ensures that it has.
 
     Example:
-        >>> bottle = normalize(nb.solid("bottle"))
+        >>> import numpy as np
+        >>> import norm_balls as nb
+        >>> bottle = nb.normalize(nb.solid("bottle"))
         >>> float(np.abs(bottle.vertices).max())
         1.0
     """
@@ -479,8 +482,9 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
         InputError: If the number is not whole or out of range.
 
     Example:
+        >>> import norm_balls as nb
         >>> table = nb.solid("table")
-        >>> finer = subdivide(table, vertices=1000)
+        >>> finer = nb.subdivide(table, vertices=1000)
         >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
         (True, 0)
     """

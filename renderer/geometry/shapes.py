@@ -57,7 +57,8 @@ def solid(name: str, seed: int = 0) -> Mesh:
     Raises:
         InputError: If the name is unknown or the seed is negative.
 
-    >>> orange = solid("orange", seed=3)
+    >>> import norm_balls as nb
+    >>> orange = nb.solid("orange", seed=3)
     >>> orange.faces.shape, orange.closed
     ((5120, 3), True)
     """

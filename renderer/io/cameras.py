@@ -50,6 +50,8 @@ def load_cameras(path: str | Path) -> dict[str, PinholeCamera]:
             camera has distortion.
 
     Example:
+        >>> import json
+        >>> from pathlib import Path
         >>> import norm_balls as nb
         >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]]
         >>> frames = [{"file_path": "front.png", "transform_matrix": pose}]

@@ -62,9 +62,10 @@ def export_mesh(
     Raises:
         InputError: If an argument is invalid, or if the file cannot be written.
 
+    >>> import norm_balls as nb
     >>> apple = nb.normalize(nb.solid("apple"))
     >>> cameras = nb.orbit_cameras(views=3, width=2.2)
-    >>> export_mesh(apple, "apple.glb", cameras=cameras)
+    >>> nb.export_mesh(apple, "apple.glb", cameras=cameras)
     """
     require_mesh("mesh", mesh)
     path = as_path("path", path)

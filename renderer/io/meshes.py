@@ -87,9 +87,10 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
             weights that do not sum to one, or missing joints.
 
     Example:
+        >>> import norm_balls as nb
         >>> cup = nb.solid("cup")
         >>> nb.export_mesh(cup, "cup.glb")
-        >>> load_mesh("cup.glb").faces.shape == cup.faces.shape
+        >>> nb.load_mesh("cup.glb").faces.shape == cup.faces.shape
         True
     """
     path = as_path("path", path)

@@ -224,7 +224,7 @@ class LightPaths(NamedTuple):
 class LocalBasis(Basis):
     """Light from sources within the scene, which casts shadows and does not bounce.
 
-    A subclass is a frozen dataclass. `renderer.render` takes it as it is. Its
+    A subclass is a frozen dataclass. `nb.render` takes it as it is. Its
     name is that of its settings and of its file in the folder of an adversary.
 
     Attributes:

@@ -8,9 +8,11 @@ The polynomial form has no polar angles, so it is exact at the poles. The
 derivatives of the paper's form (appendix B.1) are not finite there.
 
 Example:
+    >>> import torch
+    >>> import norm_balls as nb
     >>> up = torch.tensor([0.0, 0.0, 1.0])
-    >>> harmonics = basis(up, degree=1)  # Y₀₀, then Y₁ in the order y, z, x
-    >>> [round(value, 4) for value in harmonics.tolist()]
+    >>> values = nb.harmonics.basis(up, degree=1)  # Y₀₀, then Y₁ in the order y, z, x
+    >>> [round(value, 4) for value in values.tolist()]
     [0.2821, 0.0, 0.4886, 0.0]
 """
 

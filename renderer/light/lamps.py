@@ -45,7 +45,8 @@ class Lamps(LocalBasis):
         InputError: If there is no position, or one at the origin.
 
     Example:
-        >>> lamps = Lamps(((2.0, 0.0, 2.0), (0.0, 2.0, 2.0)), radius=0.2)
+        >>> import norm_balls as nb
+        >>> lamps = nb.Lamps(((2.0, 0.0, 2.0), (0.0, 2.0, 2.0)), radius=0.2)
         >>> lamps.size, str(lamps)
         (2, '2 lamps')
     """

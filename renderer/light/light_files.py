@@ -51,8 +51,10 @@ def save_light(
             file cannot be written.
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> light = nb.load_light("grace")
-        >>> save_light("light.json", light)
+        >>> nb.save_light("light.json", light)
         >>> torch.equal(nb.load_light("light.json"), light)
         True
     """

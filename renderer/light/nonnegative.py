@@ -130,6 +130,7 @@ def project_nonnegative(lights: Tensor) -> Tensor:
         non-negative everywhere keeps its bits.
 
     Example:
+        >>> import norm_balls as nb
         >>> physical = project_nonnegative(nb.load_light("grace"))
         >>> physical.shape
         torch.Size([49, 3])

@@ -88,7 +88,7 @@ def load_light(
         light: Name of a probe ("grace", "eucalyptus" or "st_peters"); "uniform",
             in which a surface shows its albedo; the file of an environment map
             (.npy, .hdr, .exr); or a file of coefficients (.json, as
-            `renderer.save_light` writes it).
+            `nb.save_light` writes it).
         degree: Degree of the result. None for the degree of a file of
             coefficients, or 6 for any other light.
         roughness: Roughness in [0, 1] of the smoothest surface that the light
@@ -104,9 +104,10 @@ def load_light(
             light, or the light has a higher degree.
 
     Example:
-        >>> load_light("grace").shape
+        >>> import norm_balls as nb
+        >>> nb.load_light("grace").shape
         torch.Size([49, 3])
-        >>> uniform = load_light("uniform")  # the same radiance from everywhere
+        >>> uniform = nb.load_light("uniform")  # the same radiance from everywhere
         >>> bool((uniform[1:] == 0).all())
         True
     """

@@ -40,7 +40,8 @@ class Projector(LocalBasis):
         InputError: If an attribute is out of range.
 
     Example:
-        >>> beamer = Projector(pixels=4)
+        >>> import norm_balls as nb
+        >>> beamer = nb.Projector(pixels=4)
         >>> beamer.size, str(beamer)
         (16, 'a projector of 4² pixels')
     """

@@ -75,8 +75,9 @@ def coefficients(
         InputError: If a parameter is outside of its range, NaN or infinite.
 
     Example:
-        >>> noon = coefficients(30.0, 0.0, 3.0)
-        >>> evening = coefficients(80.0, 0.0, 3.0)
+        >>> import norm_balls as nb
+        >>> noon = nb.skylight.coefficients(30.0, 0.0, 3.0)
+        >>> evening = nb.skylight.coefficients(80.0, 0.0, 3.0)
         >>> noon.shape, bool(noon[0].sum() > evening[0].sum())  # index 0: the mean
         (torch.Size([49, 3]), True)
     """

@@ -81,7 +81,8 @@ class Gloss:
             Otherwise the textures are ignored.
 
     Example:
-        >>> varnished = Gloss(roughness=0.3).on(nb.solid("orange"))
+        >>> import norm_balls as nb
+        >>> varnished = nb.Gloss(roughness=0.3).on(nb.solid("orange"))
         >>> varnished.gloss.shape == varnished.faces.shape
         True
     """

@@ -37,6 +37,8 @@ class TransferOperators(Sequence[TransferOperator]):
     which take about as much memory again.
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> cameras = nb.orbit_cameras(5, 2.2)
         >>> operators = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
         >>> probes = [nb.load_light("grace"), nb.load_light("st_peters")]

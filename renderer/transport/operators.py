@@ -85,8 +85,10 @@ class TransferOperator:
             without such entries.
 
     Example:
-        >>> cameras = nb.orbit_cameras(1, 2.2)
-        >>> [operator] = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> camera = nb.OrthographicCamera(polar=60.0, azimuth=0.0, width=2.2)
+        >>> operator = nb.precompute_transfer(nb.solid("pear"), camera, size=16)
         >>> light = nb.load_light("grace")
         >>> twice = operator.radiance(2 * light)  # Before clamping, this is linear.
         >>> torch.allclose(twice, 2 * operator.radiance(light))
@@ -159,8 +161,10 @@ class TransferOperator:
                 hold NaN or have another shape.
 
         Example:
-            >>> cameras = nb.orbit_cameras(1, 2.2)
-            >>> [operator] = nb.precompute_transfer(nb.solid("pear"), cameras, size=16)
+            >>> import torch
+            >>> import norm_balls as nb
+            >>> camera = nb.OrthographicCamera(polar=60.0, azimuth=0.0, width=2.2)
+            >>> operator = nb.precompute_transfer(nb.solid("pear"), camera, size=16)
             >>> light = nb.load_light("grace")
             >>> target = torch.zeros(3, 16, 16)
             >>> image, gradient = operator.image_and_gradient(light, lambda x: 2 * (x - target))

@@ -1,4 +1,4 @@
-"""The numbers of an audit, as `train.audit` returns them."""
+"""The numbers of an audit, as `nb.audit` returns them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -68,7 +68,7 @@ class MeshAttack(NamedTuple):
     Attributes:
         name: Name of the mesh: its file or its solid.
         scene: Settings of the attacked scene.
-        result: Result of `augment.attack`.
+        result: Result of `nb.attack`.
     """
 
     name: str
@@ -118,7 +118,7 @@ class TransferTargets:
         return bool(self.classifiers or self.azimuths or self.objects)
 
     def transfer(self, result: AttackResult) -> list[dict[str, Any]]:
-        """Show the adversaries of a result to all targets, see `augment.transfer`."""
+        """Show the adversaries of a result to all targets, see `nb.transfer`."""
         return transfer(
             result,
             classifiers=self.classifiers,

@@ -87,8 +87,14 @@ def audit(
         InputError: If an input cannot be read, or if a network lacks a class.
 
     Example:
-        >>> report = audit(network, ["solid:orange"], laboratory="pretrained/laboratory",
-        ...     classes=["orange", "apple"], size=32)  # doctest: +SKIP
+        >>> import norm_balls as nb
+        >>> report = nb.audit(
+        ...     network,
+        ...     ["solid:orange"],
+        ...     classes=["orange", "apple"],
+        ...     size=32,
+        ...     laboratory="pretrained/laboratory",
+        ... )  # doctest: +SKIP
         >>> report.network.attacks["lamps"].adversarial  # doctest: +SKIP
         (0, 1, 5, 12)
     """

@@ -92,11 +92,12 @@ def evaluate(
             class, or if the photographs cannot be read.
 
     Example:
+        >>> import norm_balls as nb
         >>> def logits(images):
         ...     return images.mean((2, 3))
         >>> classes = ["orange", "lemon", "pear"]
         >>> folder = "pretrained/laboratory"
-        >>> scores = evaluate(logits, folder, "orange", classes=classes, size=8)
+        >>> scores = nb.evaluate(logits, folder, "orange", classes=classes, size=8)
         >>> scores.overall.recall.n
         280
     """

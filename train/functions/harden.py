@@ -117,8 +117,15 @@ def harden(
             as "train.epochs".
 
     Example:
-        >>> hardened = harden(network, ["orange.glb"], "photos", classes=classes,
-        ...     normalization="imagenet")  # doctest: +SKIP
+        >>> import torch
+        >>> import norm_balls as nb
+        >>> hardened = nb.harden(
+        ...     network,
+        ...     ["orange.glb"],
+        ...     "photos",
+        ...     classes=classes,
+        ...     normalization="imagenet",
+        ... )  # doctest: +SKIP
         >>> torch.save(hardened.state_dict(), "hardened.pth")  # doctest: +SKIP
     """
     require_kind("network", network, nn.Module, "a torch.nn.Module, whose weights are trained")

@@ -44,7 +44,8 @@ def load(name: str) -> PublishedNetwork:
         InputError: If there is no published network of this name.
 
     Example:
-        >>> network = load("best")
+        >>> import norm_balls as nb
+        >>> network = nb.load("best")
         >>> network.size, len(network.classes)
         (32, 100)
         >>> round(network.results["photographs/auc"].value, 3)

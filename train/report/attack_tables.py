@@ -31,7 +31,7 @@ METHODS = {"adversarial": "adversarial", "random": "random search, as many rende
 # End of the names of what counts without a sensor's noise.
 WITHOUT_NOISE = "_without_noise"
 
-# Result of `augment.success_by_radius`: at each radius, whether each method
+# Result of `nb.success_by_radius`: at each radius, whether each method
 # succeeds on each example.
 Sweep = Sequence[Mapping[str, Any]]
 
@@ -46,9 +46,9 @@ def format_attack(
 
     Args:
         name: Name of the mesh.
-        result: Result of `augment.attack`.
-        checks: Result of `augment.check`. None if nothing was checked.
-        lines: Lines of attack.jsonl, as `augment.save` returns them.
+        result: Result of `nb.attack`.
+        checks: Result of `nb.check`. None if nothing was checked.
+        lines: Lines of attack.jsonl, as `nb.save` returns them.
 
     Returns:
         Lines. The first one says how often the attack succeeds.
@@ -158,7 +158,7 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
     """Write how often adversaries succeed elsewhere.
 
     Args:
-        transfers: Results of `augment.transfer`.
+        transfers: Results of `nb.transfer`.
         path: File, which gets a line of JSON for each result.
 
     Returns:
@@ -191,7 +191,7 @@ def format_sweep(sweep: Sweep) -> str:
     """Write the success at each radius as a table.
 
     Args:
-        sweep: Result of `augment.success_by_radius`.
+        sweep: Result of `nb.success_by_radius`.
 
     Returns:
         Table with a row for each radius.
@@ -223,7 +223,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     of several.
 
     Args:
-        sweeps: Result of `augment.success_by_radius` for each mesh.
+        sweeps: Result of `nb.success_by_radius` for each mesh.
         norms: Norm of the radius of each parameter.
         out: Folder that the files are written to.
     """

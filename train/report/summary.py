@@ -556,7 +556,7 @@ class AttackSummary:
         without_noise: Number of successes without noise.
         correct: Number of examples that were correct before the attack, of
             which successes are counted.
-        checks: Results of `augment.check` by name.
+        checks: Results of `nb.check` by name.
     """
 
     folder: Path

@@ -55,10 +55,10 @@ def load_network(
     """Load a classifier by its name: a trained network, or one that was trained elsewhere.
 
     Args:
-        name: "run:FOLDER" for the network of a run, or a name that `augment.load_classifier`
+        name: "run:FOLDER" for the network of a run, or a name that `nb.load_classifier`
             takes.
         weights: A local file of weights, if the source brings none.
-        classes: Names of the classes, or a file of them, as for `augment.load_classifier`.
+        classes: Names of the classes, or a file of them, as for `nb.load_classifier`.
         size: Pixels per side of the images, as there.
         normalization: Normalization of the images, as there.
         normalize_light: Whether the light of each image is normalized first, as there.
@@ -109,7 +109,8 @@ def load_run(
         InputError: If there is no such network, `weights` is given, or `model` is missing.
 
     Example:
-        >>> load_run("pretrained/best").size
+        >>> import norm_balls as nb
+        >>> nb.load_run("pretrained/best").size
         32
     """
     if weights is not None:
