@@ -268,9 +268,11 @@ class Classifier(nn.Module):
             InputError: If the light is normalized already.
 
         Example:
+            >>> import torch
+            >>> import norm_balls as nb
             >>> def logits(images):
             ...     return images.mean((2, 3))
-            >>> classifier = Classifier(logits, size=8, classes=["red", "green", "blue"])
+            >>> classifier = nb.Classifier(logits, size=8, classes=["red", "green", "blue"])
             >>> dark = torch.full((1, 3, 8, 8), 0.1)
             >>> classifier.normalizing_light({"level": 1.0})(dark).round(decimals=3)
             tensor([[1., 1., 1.]])

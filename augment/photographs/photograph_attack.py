@@ -155,7 +155,8 @@ def attack_photographs(
             network.
 
     Example:
-        >>> result = augment.attack_photographs(network, photographs,
+        >>> import norm_balls as nb
+        >>> result = nb.attack_photographs(network, photographs,
         ...     normalization="imagenet")  # doctest: +SKIP
         >>> result.kept("adversarial").float().mean()  # doctest: +SKIP
         tensor(0.4100)

@@ -186,8 +186,10 @@ def relight_photographs(
         InputError: If the photographs are no such tensor.
 
     Example:
+        >>> import torch
+        >>> import norm_balls as nb
         >>> photographs = torch.full((2, 3, 8, 8), 128, dtype=torch.uint8)
-        >>> augment.relight_photographs(photographs, seed=1).shape
+        >>> nb.relight_photographs(photographs, seed=1).shape
         torch.Size([2, 3, 8, 8])
     """
     require_photographs("photographs", photographs)
