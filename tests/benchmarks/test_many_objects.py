@@ -1,0 +1,97 @@
+"""Networks are scored on objects that no training shows, and intervals are over setups."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import nn
+
+from augment.classifiers import Classifier
+from benchmarks import many_objects
+from train.evaluation.laboratory import lab_patterns
+
+CLASSES = ["orange", "lemon", "packet"]
+
+
+@pytest.fixture
+def data(tmp_path) -> Path:
+    """Write balls instead of the meshes, a wheel that holds some of them, and maps."""
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(1)
+    for folder in ("meshes", "hdri", "packages"):
+        (tmp_path / folder).mkdir()
+    for name in ("banana", "golf_ball", "orange_studio", "orange_sketchfab"):
+        ball.export(tmp_path / f"meshes/{name}.glb")
+    for name in ("orange_leaf", "orange_scan", "apple_scan"):
+        ball.export(tmp_path / f"meshes/{name}.glb")
+    for maps in many_objects.MAPS.values():
+        for name in maps:
+            np.save(tmp_path / f"hdri/{name}.npy", rng.random((8, 16, 3), np.float32))
+    text = ball.export(file_type="obj")
+    with zipfile.ZipFile(tmp_path / "packages/objects.whl", "w") as archive:
+        for name in many_objects.PACKAGED:
+            if name.endswith(".obj"):
+                archive.writestr(name, text)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_each_class_has_equally_many_renders_in_each_light(data, monkeypatch):
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(lab_patterns, "RESOLUTION", 16)
+    folders = ["--data", str(data), "--packages", str(data / "packages"), "--out", str(data / "o")]
+    many_objects.main(["make", *folders, "--renders", "6", "--size", "8", "--spp", "1"])
+    found = {split: many_objects.find_renders(data / "o" / split) for split in many_objects.OBJECTS}
+    for parts in found.values():
+        assert len({(part.group, part.light) for part in parts}) == len(parts) == 3 * 4
+        for part in parts:
+            counts = [part.labels.count(label) for label in set(part.labels)]
+            assert min(counts) == max(counts) == 6 * many_objects.FACTORS[part.group]
+
+
+def test_the_splits_share_only_the_objects_of_the_training():
+    validation, test = many_objects.OBJECTS.values()
+    for group in validation:
+        meshes = [{item["mesh"] for item in split[group]} for split in (validation, test)]
+        assert meshes[0].isdisjoint(meshes[1]) == (group != many_objects.SAME)
+    trained = {item["label"] for item in many_objects.TRAINED} | {"lemon"}
+    for split in (validation, test):
+        assert {item["label"] for item in split[many_objects.OTHERS]} <= trained
+        assert trained.isdisjoint(item["label"] for item in split[many_objects.UNTRAINED])
+    patterns = many_objects.PATTERNS
+    assert set(patterns["validation"]).isdisjoint(patterns[many_objects.TEST])
+
+
+def test_a_hard_slide_has_two_complementary_saturated_colors_and_black():
+    slide = many_objects.draw_slide(np.random.default_rng(0), has_stripes=False)
+    colors = {color for _, color in slide.getcolors()}
+    black = (0, 0, 0)
+    assert black in colors
+    first, second = colors - {black}
+    # The values of complementary saturated colors add up to white.
+    assert np.allclose(np.add(first, second), 255, atol=1)
+
+
+def test_the_interval_is_as_wide_as_that_of_one_value_of_each_setup():
+    values = np.random.default_rng(0).integers(0, 2, 50).astype(float)
+    alone = many_objects.mean_with_interval(values, np.arange(50))
+    repeated = many_objects.mean_with_interval(values.repeat(4), np.arange(50).repeat(4))
+    assert repeated == alone
+    # The interval of the normal approximation.
+    error = 1.96 * values.std() / np.sqrt(50)
+    assert alone.high - alone.low == pytest.approx(2 * error, rel=0.15)
+
+
+def test_weights_between_two_networks_of_one_layer_give_logits_between():
+    networks = []
+    for seed in (0, 1):
+        torch.manual_seed(seed)
+        layers = nn.Sequential(nn.Flatten(), nn.Linear(12, 3)).eval()
+        networks.append(Classifier(layers, 2, CLASSES))
+    images = torch.rand(4, 3, 2, 2)
+    between = many_objects.interpolate(*networks, 0.25)
+    expected = 0.75 * networks[0](images) + 0.25 * networks[1](images)
+    torch.testing.assert_close(between(images), expected)
