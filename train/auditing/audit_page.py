@@ -188,7 +188,7 @@ def _compare(
         subjects=NETWORKS,
         place=place_of(images, images.name),
     )
-    return compare_networks(compared, contrasts(original[1], hardened[1], images, label))
+    return compare_networks(compared, contrasts(original[1], hardened[1], images, [label]))
 
 
 def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:

@@ -294,34 +294,34 @@ def contrasts(
     before: Path,
     after: Path,
     images: Path,
-    label: str,
+    labels: Sequence[str],
     subjects: tuple[str, str] = NETWORKS,
 ) -> dict[str, list[Contrast]]:
     """Choose the images that only one of two networks gets right.
 
-    An image counts as right if it is predicted as the class under study exactly
-    if it shows this class.
+    An image of a class under study counts as right if it is predicted as this
+    class. Another image counts as right if it is predicted as none of them.
 
     Args:
         before: Folder of the scores of the original network.
         after: Folder of the scores of the hardened network on the same images.
         images: Folder of the images.
-        label: Class under study.
+        labels: Classes under study.
         subjects: Both networks in words.
 
     Returns:
         At most PICTURES images in each row, by the title of the row. They are
         of different objects and lights, if there are enough.
     """
-    pairs = list(
-        zip(
-            read_predictions(before / PREDICTIONS, label),
-            read_predictions(after / PREDICTIONS, label),
-            strict=True,
-        )
-    )
-    gained = [pair for pair in pairs if _is_right(pair[1]) and not _is_right(pair[0])]
-    lost = [pair for pair in pairs if _is_right(pair[0]) and not _is_right(pair[1])]
+    pairs = zip(_read_one_each(before, labels), _read_one_each(after, labels), strict=True)
+    gained = []
+    lost = []
+    for pair in pairs:
+        was_right, is_right = (_is_right(prediction, labels) for prediction in pair)
+        if is_right and not was_right:
+            gained.append(pair)
+        elif was_right and not is_right:
+            lost.append(pair)
     original, hardened = subjects
     return {
         f"Only {hardened} is right": _draw(gained, images),
@@ -333,9 +333,22 @@ def contrasts(
 Pair = tuple[Prediction, Prediction]
 
 
-def _is_right(prediction: Prediction) -> bool:
-    """Return whether a network tells the class under study from other things in an image."""
-    return (prediction.predicted == prediction.label) == prediction.positive
+def _read_one_each(folder: Path, labels: Sequence[str]) -> list[Prediction]:
+    """Read one prediction of each image: for its own class, or for the first one."""
+    predictions = []
+    for prediction in read_predictions(folder / PREDICTIONS, labels):
+        shown = prediction.photograph.label
+        if prediction.label == (shown if shown in labels else labels[0]):
+            predictions.append(prediction)
+    return predictions
+
+
+def _is_right(prediction: Prediction, labels: Sequence[str]) -> bool:
+    """Return whether a network predicts the class under study that an image shows, if any."""
+    shown = prediction.photograph.label
+    if shown in labels:
+        return prediction.predicted == shown
+    return prediction.predicted not in labels
 
 
 def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:

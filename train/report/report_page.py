@@ -331,12 +331,12 @@ def _compare_on(group: Scored) -> FirstScreen | None:
     label = " or ".join(map(in_words, scored.scores.labels))
     images = images_folder(scored.run, scored.name)
     rows = {}
-    if images is not None and len(scored.scores.labels) == 1:
+    if images is not None:
         rows = contrasts(
             group[base][0].folder,
             scored.folder,
             images,
-            scored.scores.labels[0],
+            scored.scores.labels,
             subjects,
         )
     compared = Compared(
