@@ -456,7 +456,9 @@ class EvaluateSettings(ClassifierSettings):
     calibrate: str | None = setting(
         None, "A folder like photos. null: the threshold that a published network carries, if any."
     )
-    by: str = setting("source", "Groups of the tables: columns of photos.csv.", choices=GROUPS)
+    by: str = setting(
+        "source", "Groups of the tables: a column of photos.csv, or class.", choices=GROUPS
+    )
     skip_unreadable: bool = setting(False, "Skip photographs that cannot be read.")
     overwrite: bool = setting(False, "Replace results in the folder `out`.")
     precision: str = setting(

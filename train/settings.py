@@ -51,7 +51,7 @@ AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 OPTIMIZERS = ("sgd", "adamw")
 COMPILE = ("auto", "always", "never")
 # Columns of photos.csv by which scores are grouped.
-GROUPS = ("source", "mesh")
+GROUPS = ("source", "mesh", "class")
 # Pixels per side of the smallest images that can be padded by reflection.
 MIN_SIZE = 5
 MAX_IMAGES = 10**6

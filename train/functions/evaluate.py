@@ -71,7 +71,8 @@ def evaluate(
             normalization.
         normalize_light: Whether the light of each photograph is normalized
             first, as `load_classifier` takes it.
-        by: "mesh" to score each object of photos.csv, too. Otherwise "source".
+        by: "mesh" to score each object of photos.csv, too, "class" to score
+            each class. Otherwise "source".
         calibrate: Folder like `folder`, on which a threshold on the log-odds of
             each label is chosen for `false_positive_rate`. None for the
             thresholds that the network carries, if any.

@@ -16,6 +16,7 @@ from augment.settings import MODES
 from renderer.errors import InputError
 from train.evaluation.scores.metrics import (
     METRICS,
+    TOP_RANKS,
     Metrics,
     Pool,
     Pooled,
@@ -40,6 +41,8 @@ from train.report.summary import (
 )
 from train.settings import PHOTOGRAPHS
 
+# Largest number of classes in a table by class of a report.
+MAX_CLASSES = 30
 # Titles of the columns of metrics.
 TITLES = [metric_title(name) for name in METRICS]
 # Metrics of the table that is printed without --verbose.
@@ -53,8 +56,8 @@ class Part:
     Attributes:
         by: "all" for the images of all sources that are not excluded.
             Otherwise the property that the images of the part share: "label",
-            "source" or "mesh".
-        name: Name of the label, the source or the mesh. Empty for all images.
+            "source", "mesh" or "class".
+        name: Name of the label, source, mesh or class. Empty for all images.
     """
 
     by: str = "all"
@@ -107,7 +110,8 @@ def pools_of(pooled: Pooled, *properties: str) -> dict[Part, Pool]:
 
     Args:
         pooled: Pools of one evaluation.
-        *properties: "label", "source" or "mesh", in the order of the pools.
+        *properties: "label", "source", "mesh" or "class", in the order of the
+            pools.
 
     Returns:
         Pools by part. `ALL` is the first.
@@ -116,6 +120,7 @@ def pools_of(pooled: Pooled, *properties: str) -> dict[Part, Pool]:
         "label": pooled.by_label,
         "source": pooled.by_source,
         "mesh": pooled.by_mesh,
+        "class": pooled.by_class,
     }
     pools = {ALL: pooled.all}
     for by in properties:
@@ -130,8 +135,7 @@ def read_evaluations(group: Scored, exclude: Sequence[str] = (), by: str = "sour
     Args:
         group: Scored runs of each method, from `group_by_images`.
         exclude: Sources that the pool of all images leaves out.
-        by: "source" for a pool of each source, or "mesh" for a pool of each
-            mesh.
+        by: "source", "mesh" or "class" for a pool of each of them.
 
     Returns:
         Evaluations by method. Published networks have no predictions and are
@@ -203,7 +207,7 @@ def group_table(methods: Evaluations, overall: str = "all", by: str = "source") 
     Args:
         methods: Evaluations of each method.
         overall: Title of the rows of all images.
-        by: "source" or "mesh": the title of the first column.
+        by: "source", "mesh" or "class": the title of the first column.
 
     Returns:
         Table with a row for each part and each method. Cells hold the means
@@ -241,6 +245,33 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
                 pairs.append((method, reference))
     trained = [method for method, run in first_runs.items() if run.method != INITIAL]
     return pairs + [(method, trained[0]) for method in trained[1:]]
+
+
+def class_table(group: Scored) -> Table:
+    """Make a table of top-1 and top-5 by class, among all classes of the network.
+
+    Args:
+        group: Scored runs of each method, from `group_by_images`.
+
+    Returns:
+        Table with a row for each class that the networks have, and each method. It has no rows
+        if there is one such class, or if there are more than MAX_CLASSES.
+    """
+    methods = read_evaluations(group, by="class")
+    header = ["class", "images", "network", "top-1", "top-5"]
+    rows: list[list[str]] = []
+    classes: dict[Part, int] = {}
+    for evaluations in methods.values():
+        for part, pool in evaluations[0].pools.items():
+            if part.by == "class" and pool.classified:
+                classes[part] = len(pool.classified)
+    if 1 < len(classes) <= MAX_CLASSES:
+        for part, image_count in classes.items():
+            for method, evaluations in methods.items():
+                metrics = (mean_metric(evaluations, part, name) for name in TOP_RANKS)
+                cells = map(format_interval, metrics)
+                rows.append([part.name, str(image_count), method, *cells])
+    return Table("by class, among all classes of the network", header, rows)
 
 
 @dataclass(frozen=True)
@@ -332,8 +363,8 @@ def difference_tables(
     Args:
         methods: Evaluations of each method.
         overall: Title of the row of all images.
-        by: "source" or "mesh": the title of the first column.
-        overall_only: Whether to leave out the rows of single sources or meshes.
+        by: "source", "mesh" or "class": the title of the first column.
+        overall_only: Whether to leave out the rows of single sources, meshes or classes.
 
     Returns:
         A table for each pair from `choose_pairs`, with a row for each part of
@@ -436,8 +467,7 @@ def format_comparison(
         exclude: Sources that the metrics on all images leave out.
         photographs: Name of the sub-folder of each run with its scores on
             photographs.
-        by: "source" for metrics of each source, or "mesh" for metrics of each
-            mesh.
+        by: "source", "mesh" or "class" for metrics of each of them.
 
     Returns:
         Markdown tables of the accuracy, the metrics, their differences, and the

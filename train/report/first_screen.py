@@ -142,6 +142,12 @@ class Compared(NamedTuple):
         """Subtract a metric of the original network from that of the hardened network."""
         return compare.difference(self.after, self.before, compare.ALL, name)
 
+    @property
+    def has_several_classes(self) -> bool:
+        """Whether several classes are under study."""
+        pool = self.after[0].pools[compare.ALL]
+        return len({prediction.label for prediction in pool.positives}) > 1
+
     def number(self, title: str, note: str, name: str) -> Number | None:
         """Return a metric of both networks. None if it is unknown."""
         before = compare.mean_metric(self.before, compare.ALL, name)
@@ -177,11 +183,14 @@ def compare_networks(compared: Compared, rows: dict[str, list[Contrast]]) -> Fir
         The first screen. None if recall, false-positive rate or AUC is unknown.
     """
     label = compared.label
-    asked = (
+    asked = [
         ("recall", f"Images of {label} recognized", "higher is better"),
         ("false_positive_rate", f"Other objects called {label}", "lower is better"),
         ("auc", "Ranking quality (AUC)", "higher is better; 0.5 is chance"),
-    )
+    ]
+    if compared.has_several_classes:
+        title = "Top-1 among all classes, mean over classes"
+        asked.append(("class_top1", title, "higher is better"))
     numbers = []
     for name, title, note in asked:
         number = compared.number(title, note, name)
@@ -268,19 +277,23 @@ def _sentences(
         )
     equal = compared.difference(EQUAL_RATE)
     if equal is not None:
-        sentences.append(_equal_rate_sentence(equal))
+        text = "At an equal rate of 10% false positives, recall"
+        sentences.append(_gain_sentence(text, equal))
+    top1 = compared.difference("class_top1") if compared.has_several_classes else None
+    if top1 is not None:
+        text = "Among all classes of the network, top-1 (the mean over classes)"
+        sentences.append(_gain_sentence(text, top1))
     return sentences
 
 
-def _equal_rate_sentence(equal: compare.Difference) -> str:
-    """Compare the recall at an equal rate of false positives."""
-    assert equal.low is not None and equal.high is not None
+def _gain_sentence(subject: str, change: compare.Difference) -> str:
+    """Compare a metric of both networks, and say whether the difference is proven."""
+    assert change.low is not None and change.high is not None
     verdicts = {1: "a proven gain", -1: "a proven loss", 0: "a difference is not proven"}
-    verdict = verdicts[_direction(equal)]
-    interval = f"95% interval: {_points(equal.low)} to {_points(equal.high)} points"
+    verdict = verdicts[_direction(change)]
+    interval = f"95% interval: {_points(change.low)} to {_points(change.high)} points"
     return (
-        f"At an equal rate of 10% false positives, recall is {equal.after:.0%} instead of "
-        f"{equal.before:.0%}; {verdict} ({interval})."
+        f"{subject} is {change.after:.0%} instead of {change.before:.0%}; {verdict} ({interval})."
     )
 
 

@@ -402,6 +402,7 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
         if evaluations:
             rocs = _rocs(evaluations)
             tables += _evaluation_tables(evaluations)
+            tables.append(compare.class_table(group))
     except InputError as error:
         problem = str(error)
     return {

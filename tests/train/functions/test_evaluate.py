@@ -50,6 +50,14 @@ def test_scores_count_the_photographs_of_each_class(photographs):
     assert (scores.overall.recall.hits, scores.overall.recall.n) == (5, 7)
 
 
+def test_top_1_is_a_mean_over_classes_and_is_known_by_class(photographs):
+    scores = nb.evaluate(Brightness().eval(), photographs, by="class", **OPTIONS)
+    assert scores.overall.class_top1.value == pytest.approx((3 / 4 + 2 / 3) / 2)
+    assert scores.class_metrics["dark"].class_top1.value == pytest.approx(3 / 4)
+    assert scores.class_metrics["bright"].class_top1.value == pytest.approx(2 / 3)
+    assert scores.overall.class_top5.value == 1
+
+
 @pytest.mark.parametrize("label", ["bright", 1])
 def test_a_label_is_a_name_or_an_index(photographs, label):
     scores = nb.evaluate(Brightness().eval(), photographs, label, **OPTIONS)

@@ -1,6 +1,6 @@
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from shutil import copytree
 
@@ -12,9 +12,9 @@ from tests.train.helpers import read_markdown
 from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import pool
 from train.evaluation.scores.predictions import Prediction, write_predictions
-from train.report.comparison import format_comparison, format_result, format_table
+from train.report.comparison import class_table, format_comparison, format_result, format_table
 from train.report.report_page import write_report
-from train.report.summary import summarize
+from train.report.summary import ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
 Scores = dict[str | None, tuple[Sequence[float], Sequence[float]]]
@@ -90,6 +90,30 @@ def compared_sources(scored_run, made_up_run, tmp_path) -> dict[str, list[list[s
         made_up_run(tmp_path / "without_scores", "random"),
     ]
     return compare(folders, ["studio"])
+
+
+def test_a_report_has_top_1_by_class_of_each_network(scored_run):
+    def with_pears(correct: int) -> list[Prediction]:
+        pears = []
+        for number in range(10):
+            score = -1 if number < correct else 1
+            made = prediction(100 + number, "pear", "web", score)
+            pears.append(replace(made, true_rank=1 if number < correct else 2))
+        return predictions_of(STUDIO_AND_WEB) + pears
+
+    group = {}
+    for method, correct in (("none", 3), ("random", 7)):
+        folder = scored_run(method, STUDIO_AND_WEB)
+        write_predictions(folder / "photographs" / "predictions.csv", with_pears(correct))
+        group[method] = [ScoredRun(summarize(folder), "photographs")]
+    rows = class_table(group).rows
+    assert [row[:3] for row in rows] == [
+        ["orange", "11", "none"],
+        ["orange", "11", "random"],
+        ["pear", "10", "none"],
+        ["pear", "10", "random"],
+    ]
+    assert [row[3].partition(" ")[0] for row in rows] == ["0.545", "0.545", "0.300", "0.700"]
 
 
 def test_a_comparison_shows_every_source_and_the_total_without_an_excluded_one(compared_sources):

@@ -1,9 +1,10 @@
-"""Metrics of an evaluation with 95% intervals: recall, false-positive rate and AUC.
+"""Metrics of an evaluation with 95% intervals: recall, false-positive rate, AUC and top-1.
 
 A `Pool` holds predictions that are scored together and computes their
 `Metrics`. `Pooled` holds all pools of one evaluation: the pool of all images,
-and those of each label, source and mesh. Below them are the statistics that
-they use: the bootstrap, the AUC, and the recall at a given false-positive rate.
+and those of each label, source, mesh and class. Below them are the statistics
+that they use: the bootstrap, the AUC, the recall at a given false-positive rate,
+and the means over classes.
 
 A label is the name of a positive class. For a prediction about a label, an
 image is positive if it shows this class, and negative otherwise.
@@ -29,12 +30,15 @@ RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
 # Names of the metrics that `Pool` computes only if it has thresholds: the
 # recall and the false-positive rate at these thresholds.
 AT_THRESHOLD: tuple[str, ...] = ("recall_at_threshold", "false_positive_rate_at_threshold")
+# Names of the metrics among all classes of the network, and the highest rank of
+# the true class that counts. They are means over the classes of the images.
+TOP_RANKS = {"class_top1": 1, "class_top5": 5}
 # Names of the metrics that `Pool.outcomes` computes as fractions of images. The
 # table of an evaluation shows them in this order.
 COUNTED: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
 # Names of the metrics that the tables of reports show, in this order. A slash
 # separates the keys of nested entries of summary.json.
-METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD)
+METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD, *TOP_RANKS)
 # Titles by which `metric_title` replaces these names in tables.
 TITLES = {
     "recall": "recall",
@@ -43,6 +47,8 @@ TITLES = {
     "auc": "AUC",
     "recall_at_threshold": "recall at threshold",
     "false_positive_rate_at_threshold": "FPR at threshold",
+    "class_top1": "top-1, mean over classes",
+    "class_top5": "top-5, mean over classes",
 }
 
 # Operating points: for each label, the log-odds above which an image counts as
@@ -105,6 +111,11 @@ class Metrics:
             log-odds exceed the threshold. None without a threshold.
         auc: Area under the ROC curve.
         recall_at: Recall at each false-positive rate in `RATES`.
+        class_top1: Fraction of the images whose class is the most probable of
+            all classes of the network, as a mean over the classes. Images of
+            classes that the network lacks do not count. None if there are no
+            others.
+        class_top5: The same for the five most probable classes.
     """
 
     n: int
@@ -115,6 +126,8 @@ class Metrics:
     false_positive_rate_at_threshold: Proportion | None = None
     auc: AreaUnderCurve
     recall_at: Mapping[str, Estimate]
+    class_top1: Estimate | None = None
+    class_top5: Estimate | None = None
 
     def find(self, name: str) -> Estimate | None:
         """Return the metric with a name.
@@ -223,6 +236,7 @@ class Pool:
         for name, outcome in self.outcomes.items():
             proportions[name] = fraction(sum(outcome.hits), len(outcome.hits))
         auc, *recalls = self._ranked_estimates()
+        tops = self._top_estimates()
         auc_with_counts = AreaUnderCurve(
             value=auc.value,
             low=auc.low,
@@ -237,7 +251,42 @@ class Pool:
             auc=auc_with_counts,
             recall_at=dict(zip(RATES, recalls, strict=True)),
             **proportions,
+            class_top1=tops.get("class_top1"),
+            class_top5=tops.get("class_top5"),
         )
+
+    @cached_property
+    def classified(self) -> list[Prediction]:
+        """One prediction for each photograph of a class that the network has."""
+        by_path: dict[PurePosixPath, Prediction] = {}
+        for prediction in (*self.positives, *self.negatives):
+            if prediction.true_rank is not None:
+                by_path.setdefault(prediction.photograph.path, prediction)
+        return list(by_path.values())
+
+    def _top_estimates(self) -> dict[str, Estimate]:
+        """Compute the metrics in `TOP_RANKS` with their bootstrap intervals."""
+        if not self.classified:
+            return {}
+        values = self._top_statistic(np.ones(len(self.classified)))
+        object_count = len(np.unique(_object_indices(self.classified)))
+        estimates = {}
+        for name, value, replicates in zip(TOP_RANKS, values, self._top_replicates, strict=True):
+            estimates[name] = _estimate_or_wilson(float(value), replicates, object_count)
+        return estimates
+
+    @property
+    def _top_statistic(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Function that computes the metrics in `TOP_RANKS` of drawn images."""
+        names = [prediction.photograph.label for prediction in self.classified]
+        ranks = np.array([prediction.true_rank for prediction in self.classified])
+        hits = np.stack([ranks <= rank for rank in TOP_RANKS.values()])
+        return partial(class_means, hits, names)
+
+    @cached_property
+    def _top_replicates(self) -> np.ndarray:
+        """Bootstrap replicates of the metrics in `TOP_RANKS`, shape (2, REPLICATES)."""
+        return bootstrap(self._top_statistic, _object_indices(self.classified))
 
     def _ranked_estimates(self) -> list[Estimate]:
         """Compute the metrics in `RANKED` with their bootstrap intervals."""
@@ -245,23 +294,11 @@ class Pool:
             return [Estimate() for _ in RANKED]
         estimates = []
         values = auc_and_recalls(*self.scores)
-        for value, replicates in zip(values, self._ranked_replicates, strict=True):
-            metric = estimate(float(value), replicates)
-            if metric.low == metric.high:
-                metric = self._widened(metric)
-            estimates.append(metric)
-        return estimates
-
-    def _widened(self, metric: Estimate) -> Estimate:
-        """Replace an interval of zero width by Wilson's, as if each object had one image."""
         groups = (self.ranked.positives, self.ranked.negatives)
         object_count = min(len(np.unique(_object_indices(group))) for group in groups)
-        assert metric.value is not None
-        wilson = fraction(round(metric.value * object_count), object_count)
-        assert wilson.low is not None and wilson.high is not None
-        low = min(wilson.low, metric.value)
-        high = max(wilson.high, metric.value)
-        return Estimate(value=metric.value, low=low, high=high)
+        for value, replicates in zip(values, self._ranked_replicates, strict=True):
+            estimates.append(_estimate_or_wilson(float(value), replicates, object_count))
+        return estimates
 
     @property
     def _can_rank(self) -> bool:
@@ -286,7 +323,23 @@ class Pool:
                 replicates[name] = bootstrap(statistic, _object_indices(outcome.predictions))
         if self._can_rank:
             replicates.update(zip(RANKED, self._ranked_replicates, strict=True))
+        if self.classified:
+            replicates.update(zip(TOP_RANKS, self._top_replicates, strict=True))
         return replicates
+
+
+def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:
+    """Add the percentile interval to the value of a metric.
+
+    If it has zero width, Wilson's interval replaces it, as if each object had
+    one image.
+    """
+    metric = estimate(value, replicates)
+    if metric.low != metric.high:
+        return metric
+    wilson = fraction(round(value * object_count), object_count)
+    assert wilson.low is not None and wilson.high is not None
+    return Estimate(value=value, low=min(wilson.low, value), high=max(wilson.high, value))
 
 
 def _object_indices(predictions: Sequence[Prediction]) -> np.ndarray:
@@ -330,7 +383,7 @@ def pool(predictions: Sequence[Prediction], thresholds: Thresholds | None = None
 
 @dataclass(frozen=True)
 class Pooled:
-    """All pools of one evaluation: of all images, and of each label, source and mesh.
+    """All pools of one evaluation: of all images, and of each label, source, mesh and class.
 
     Attributes:
         predictions: Predictions about one or several labels.
@@ -397,30 +450,37 @@ class Pooled:
 
     @cached_property
     def by_mesh(self) -> dict[str, Pool]:
-        """Pool of the images of each mesh.
+        """Pool of the images of each mesh, see `_by_content`."""
+        return self._by_content(lambda prediction: prediction.photograph.mesh)
 
-        The images of a mesh of a positive class are ranked against the
-        negatives of all meshes. The images of any other mesh are ranked against
-        the positives of all meshes.
+    @cached_property
+    def by_class(self) -> dict[str, Pool]:
+        """Pool of the images of each class, see `_by_content`."""
+        return self._by_content(lambda prediction: prediction.photograph.label)
+
+    def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
+        """Pool the images by what they show: a mesh or a class.
+
+        The images of a positive class are ranked against the negatives of all
+        images. Other images are ranked against the positives of all images.
         """
         labels = {prediction.label for prediction in self.predictions}
-        groups = _group(self._included, lambda prediction: prediction.photograph.mesh)
         pools = {}
-        for mesh, group in groups.items():
-            mesh_pool = pool(group, self.thresholds)
+        for name, group in _group(self._included, name_of).items():
+            own_pool = pool(group, self.thresholds)
             # Example with the labels orange and lemon: an image of an orange is a
             # positive for the label orange and a negative for the label lemon.
             # Such negatives are left out here, because all negatives of this
-            # mesh would be images of the mesh itself.
+            # mesh or class would be images of the mesh or class itself.
             negatives = []
-            for prediction in mesh_pool.negatives:
+            for prediction in own_pool.negatives:
                 if prediction.photograph.label not in labels:
                     negatives.append(prediction)
             ranked = Ranked(
-                positives=mesh_pool.positives or self.all.positives,
+                positives=own_pool.positives or self.all.positives,
                 negatives=negatives or self.all.negatives,
             )
-            pools[mesh] = replace(mesh_pool, ranked=ranked)
+            pools[name] = replace(own_pool, ranked=ranked)
         return pools
 
     @cached_property
@@ -536,6 +596,28 @@ def weighted_mean(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
         Weighted mean, shape (...).
     """
     return counts @ values / counts.sum(axis=-1)
+
+
+def class_means(hits: np.ndarray, names: Sequence[str], counts: np.ndarray) -> np.ndarray:
+    """Compute the mean over classes of the fraction of hits in each class.
+
+    An image weighs 1 / n if its class has n images. The mean of all images with
+    these weights is the mean over classes. With fixed `hits` and `names`, this
+    is a statistic for `bootstrap`, whose replicates vary with the classes of
+    the drawn objects, too.
+
+    Args:
+        hits: Whether each image is a hit in each of K ways, shape (K, n).
+        names: Name of the class of each image.
+        counts: How often each image counts, shape (..., n).
+
+    Returns:
+        Mean over classes, shape (K, ...).
+    """
+    _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
+    weights = 1 / class_sizes[class_of_image]
+    total = counts @ weights
+    return np.stack([counts @ (weights * row) / total for row in hits])
 
 
 def estimate(value: float, replicates: np.ndarray) -> Estimate:

@@ -25,6 +25,7 @@ from train.data.photographs import TABLE, require_outside
 from train.evaluation.scores.metrics import (
     COUNTED,
     RANKED,
+    TOP_RANKS,
     Metrics,
     Pool,
     Pooled,
@@ -85,6 +86,7 @@ class Scores:
         by_source: Metrics of each source.
         by_mesh: Metrics of each mesh. None if they were not asked for.
         by_class: Scores of the photographs of each class.
+        class_metrics: Metrics of each class. None if they were not asked for.
     """
 
     predicted: FolderPredictions
@@ -95,6 +97,7 @@ class Scores:
     by_source: Mapping[str, Metrics]
     by_mesh: Mapping[str, Metrics] | None
     by_class: Mapping[str, ClassScores]
+    class_metrics: Mapping[str, Metrics] | None = None
 
     @property
     def label(self) -> str:
@@ -126,6 +129,7 @@ class Scores:
             - by_label, by_source, by_mesh: fields of `Metrics` by name. The
               first is there with several labels, the last if it was asked for;
             - by_class: fields of `ClassScores` by class;
+            - class_metrics: fields of `Metrics` by class, if they were asked for;
             - unreadable, left_out: paths of these files.
         """
         predicted = self.predicted
@@ -152,6 +156,8 @@ class Scores:
         if self.by_mesh is not None:
             summary["by_mesh"] = _entries(self.by_mesh)
         summary["by_class"] = {name: asdict(scores) for name, scores in self.by_class.items()}
+        if self.class_metrics is not None:
+            summary["class_metrics"] = _entries(self.class_metrics)
         summary["unreadable"] = predicted.unreadable
         summary["left_out"] = predicted.left_out
         return summary
@@ -201,20 +207,21 @@ def score(
 ) -> Scores:
     """Score predictions for photographs.
 
-    Fractions have 95% Wilson intervals. The AUC and the recall at a
-    false-positive rate have bootstrap intervals over images and, where
-    photos.csv names them, over objects.
+    Fractions have 95% Wilson intervals. The AUC, the recall at a
+    false-positive rate and the means over classes have bootstrap intervals over
+    images and, where photos.csv names them, over objects.
 
     Args:
         predicted: Predictions for the photographs of a folder.
-        by: "mesh" to score each mesh, too. Otherwise "source".
+        by: "mesh" to score each mesh, too, "class" to score each class in the
+            same metrics. Otherwise "source".
         points: Operating point of each label, or none.
 
     Returns:
         Scores of all photographs, and of each label, source, mesh and class.
 
     Raises:
-        InputError: If `by` is neither, or if it is "mesh" and no mesh is known.
+        InputError: If `by` is none of these, or if it is "mesh" and no mesh is known.
     """
     require_choice("by", by, GROUPS)
     if by == "mesh" and not any(item.photograph.mesh for item in predicted.predictions):
@@ -232,6 +239,7 @@ def score(
         by_source=_metrics_of(pooled.by_source),
         by_mesh=_metrics_of(pooled.by_mesh) if by == "mesh" else None,
         by_class=_score_classes(predicted),
+        class_metrics=_metrics_of(pooled.by_class) if by == "class" else None,
     )
 
 
@@ -408,10 +416,10 @@ def format_overall(scores: Scores) -> str:
 
 
 def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
-    """Name the metrics that tables show: of all images, each label, and each mesh or source."""
+    """Name the metrics that tables show: of all images, each label, and each group."""
     yield "all", scores.overall
     yield from scores.by_label.items()
-    groups = scores.by_source if scores.by_mesh is None else scores.by_mesh
+    groups = scores.by_mesh or scores.class_metrics or scores.by_source
     yield from groups.items()
 
 
@@ -426,8 +434,9 @@ def _counted_table(scores: Scores) -> Table:
 
 
 def _ranked_table(scores: Scores) -> Table:
-    """Make the table of the metrics that rank images, with what their intervals are over."""
+    """Make the table of the metrics with bootstrap intervals, and say what these are over."""
     auc = scores.overall.auc
+    resampled_metrics = (*RANKED, *TOP_RANKS)
     resampled = "images"
     if auc.has_repeated_objects:
         counts = (
@@ -436,8 +445,9 @@ def _ranked_table(scores: Scores) -> Table:
         resampled = f"objects and images ({counts})"
     rows = []
     for title, metrics in _rows_of(scores):
-        rows.append([title, *(format_interval(metrics.find(name)) for name in RANKED)])
-    return Table(f"95 % intervals over {resampled}", ["", *map(metric_title, RANKED)], rows)
+        rows.append([title, *(format_interval(metrics.find(name)) for name in resampled_metrics)])
+    header = ["", *map(metric_title, resampled_metrics)]
+    return Table(f"95 % intervals over {resampled}", header, rows)
 
 
 def _class_table(scores: Scores) -> Table:

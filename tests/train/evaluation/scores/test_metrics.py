@@ -1,23 +1,29 @@
 from fractions import Fraction
 from functools import partial
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap as scipy_bootstrap
 from scipy.stats import mannwhitneyu
 
+from train.data.photographs import Photograph
 from train.evaluation.scores.metrics import (
     RANKED,
     RATES,
     REPLICATES,
     auc_and_recalls,
     bootstrap,
+    class_means,
     estimate,
+    pool,
     replicate_difference,
     thresholds,
 )
+from train.evaluation.scores.predictions import rank_classes
 
 # The scores have few values, so that ties are common.
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)
@@ -130,3 +136,77 @@ def test_a_single_seed_adds_no_spread(is_paired):
     single = SCORE_OF_SEED[:1]
     difference = replicate_difference(single + 0.5, single, is_paired)
     np.testing.assert_array_equal(difference, 0.5)
+
+
+def draw_ranks(seed: int) -> tuple[list[str], np.ndarray]:
+    """Draw the class and the rank of the true class of 60 images of 5 classes of all sizes."""
+    generator = np.random.default_rng(seed)
+    names = generator.choice(["a", "b", "c", "d", "e"], 60, p=[0.5, 0.2, 0.15, 0.1, 0.05])
+    return names.tolist(), generator.integers(1, 9, 60)
+
+
+def test_means_over_classes_are_the_mean_of_the_means():
+    names, ranks = draw_ranks(0)
+    means = []
+    for name in sorted({*names}):
+        own_ranks = [rank for other, rank in zip(names, ranks, strict=True) if other == name]
+        means.append(sum(rank == 1 for rank in own_ranks) / len(own_ranks))
+    (value,) = class_means(ranks[None] == 1, names, np.ones(60))
+    assert value == pytest.approx(np.mean(means))
+
+
+def test_means_over_drawn_classes_count_repeated_images():
+    names, ranks = draw_ranks(1)
+    hits = np.stack([ranks <= 1, ranks <= 5])
+    counts = np.random.default_rng(2).integers(0, 3, (4, 60))
+    sizes = [names.count(name) for name in names]
+    for replicate, row in enumerate(counts):
+        drawn = np.arange(60).repeat(row)
+        weights = np.array([1 / sizes[image] for image in drawn])
+        for way in range(2):
+            expected = np.average(hits[way, drawn], weights=weights)
+            assert class_means(hits, names, counts)[way, replicate] == pytest.approx(expected)
+
+
+def photograph(name: str, number: int) -> Photograph:
+    """Return the photograph of a class. Each object has two photographs."""
+    mesh = f"{name}_{number // 2}.glb"
+    return Photograph(PurePosixPath(f"{name}/{number}.png"), name, None, (), mesh)
+
+
+@pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])
+def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
+    classes = ["orange", "lemon", "pear", *map(str, range(9))]
+    generator = torch.Generator().manual_seed(0)
+    photographs = [
+        photograph(name, number)
+        for name, count in {"orange": 8, "lemon": 4, "pear": 2, "other_ball": 6}.items()
+        for number in range(count)
+    ]
+    logits = torch.randn(len(photographs), len(classes), generator=generator)
+    logits[:, :3] += 1.5
+    metrics = pool(rank_classes(photographs, logits, classes, labels)).metrics
+
+    for rank, metric in ((1, metrics.class_top1), (5, metrics.class_top5)):
+        best = logits.topk(rank).indices
+        by_class = []
+        for name in ("orange", "lemon", "pear"):
+            rows = [row for row, item in enumerate(photographs) if item.label == name]
+            hits = (best[rows] == classes.index(name)).any(1)
+            by_class.append(hits.float().mean().item())
+        assert metric.value == pytest.approx(np.mean(by_class))
+        assert metric.low < metric.value < metric.high
+
+
+def test_the_interval_of_one_image_per_class_is_that_of_scipys_bootstrap_over_images():
+    """Compare up to chance: a step is 1/40, and the standard error of an end is below 0.01."""
+    names = [f"class {number}" for number in range(40)]
+    ranks = np.random.default_rng(4).integers(1, 4, 40)
+    hits = ranks == 1
+    reference = scipy_bootstrap(
+        (hits.astype(float),), np.mean, method="percentile", n_resamples=5000, rng=5
+    ).confidence_interval
+    replicates = bootstrap(partial(class_means, hits[None], names), np.arange(40))
+    metric = estimate(hits.mean(), replicates[0])
+    assert metric.low == pytest.approx(reference.low, abs=0.03)
+    assert metric.high == pytest.approx(reference.high, abs=0.03)
