@@ -46,8 +46,10 @@ DATA_SETS = ("cifar100", "npz", "folder", "unlabelled", "shapes")
 DATA_SETS_WITH_PATH = ("npz", "folder", "unlabelled")
 SCHEDULES = ("step", "cosine", "one_cycle")
 FLIPS = ("random", "alternating")
-TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
-AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
+TRANSFORMS = ("color_jitter", "trivial_augment", "augmix", "color_jitter+augmix")
+# Augmentation by the light of a projector; see `train.training.relit_batches`.
+RELIGHT = "relight"
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd", RELIGHT)
 OPTIMIZERS = ("sgd", "adamw")
 COMPILE = ("auto", "always", "never")
 # Columns of photos.csv by which scores are grouped.
@@ -232,8 +234,22 @@ class TrainSettings(Settings):
     )
     augmentation: str = setting(
         "none",
-        "Augmentation of every training image.",
+        "Augmentation of every training image. relight: the light of a projector with random "
+        "slides.",
         choices=AUGMENTATIONS,
+    )
+    relight_gain: float = setting(
+        3.0,
+        "Largest factor of a channel of a slide for augmentation=relight. Its inverse is the "
+        "smallest.",
+        minimum=1,
+        maximum=100,
+    )
+    relight_steps: int = setting(
+        0,
+        "Steps along the gradient that find these factors. 0: random factors.",
+        minimum=0,
+        maximum=1000,
     )
     label_smoothing: float = setting(0.0, "Label smoothing.", minimum=0, below=1)
     ranking_weight: float = setting(
@@ -248,6 +264,18 @@ class TrainSettings(Settings):
         "On renders, this counts classes other than `label`.",
         minimum=0,
         maximum=MAX_SCALE,
+    )
+    consistency_weight: float = setting(
+        0.0,
+        "Weight of the divergence of the predictions for augmented images from those of the "
+        "network train.init_from for the same images without augmentation.",
+        minimum=0,
+        maximum=MAX_SCALE,
+    )
+    interpolate: bool = setting(
+        False,
+        "At the end, interpolate between the weights of train.init_from and the trained weights, "
+        "by the factor that validates best on unchanged and relit images (WiSE-FT).",
     )
     ema_decay: float = setting(
         0.0,
@@ -309,6 +337,12 @@ class TrainSettings(Settings):
         if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
             needed = "distillation_weight, soup and eval_mode need a network to begin with"
             raise InputError(f"{needed}: set init_from")
+        if (self.consistency_weight or self.interpolate) and not self.init_from:
+            needed = "consistency_weight and interpolate need a network to begin with"
+            raise InputError(f"{needed}: set init_from")
+        if self.relight_steps and not self.consistency_weight:
+            needed = "relight_steps attacks the predictions of the network init_from"
+            raise InputError(f"{needed}: set consistency_weight", "relight_steps")
 
 
 @dataclass

@@ -60,7 +60,7 @@ class Best:
 @torch.no_grad()
 def search_gain(
     model: nn.Module,
-    photographs: Tensor,
+    albedo: Tensor,
     light: ProjectedLight,
     source: Tensor,
     candidates: list[Tensor],
@@ -69,7 +69,7 @@ def search_gain(
 
     Args:
         model: Network from images in [0, 1] to logits.
-        photographs: Photographs in [0, 1], shape (B, 3, H, W).
+        albedo: Linear values of the photographs, shape (B, 3, H, W).
         light: Light on them.
         source: Classes of the unchanged photographs, shape (B,).
         candidates: Logarithms of factors, shape (B, 3, cells, cells) each.
@@ -79,14 +79,14 @@ def search_gain(
     """
     best = Best(candidates[0])
     for log_gain in candidates:
-        best.update(log_gain, model(light.apply(photographs, log_gain)), source)
+        best.update(log_gain, model(light.expose(albedo, log_gain)), source)
     return best.log_gain
 
 
 @torch.enable_grad()
 def descend_gain(
     model: nn.Module,
-    photographs: Tensor,
+    albedo: Tensor,
     light: ProjectedLight,
     source: Tensor,
     start: Tensor,
@@ -99,7 +99,7 @@ def descend_gain(
     Args:
         model: Network from images in [0, 1] to logits, without gradients of its
             parameters.
-        photographs: Photographs in [0, 1], shape (B, 3, H, W).
+        albedo: Linear values of the photographs, shape (B, 3, H, W).
         light: Light on them.
         source: Classes of the unchanged photographs, shape (B,).
         start: Logarithms of the factors at the start, shape
@@ -121,7 +121,7 @@ def descend_gain(
     log_gain = start
     for _ in range(steps):
         log_gain = log_gain.detach().requires_grad_(True)
-        logits = model(light.apply(photographs, log_gain))
+        logits = model(light.expose(albedo, log_gain))
         if best is not None:
             best.update(log_gain, logits, source)
         cost = adversarial_cost(logits.float(), source).sum()

@@ -34,7 +34,7 @@ from augment.photographs.projected_light import (
 from augment.progress import progress
 from augment.random_streams import generator
 from renderer.errors import InputError
-from renderer.image import to_bytes, to_unit
+from renderer.image import decode, to_bytes, to_unit
 from renderer.validation import require_kind, require_seed
 
 # Light on a photograph: the slide as it is, or with factors that a search finds.
@@ -267,19 +267,21 @@ class _PhotographAttack:
                 for draws in streams
             ]
             candidates.append(torch.cat(drawn).to(self.device))
-        problem = self._load(rows), self._light(rows, slide), self.source[rows].to(self.device)
-        return search_gain(self.model, *problem, candidates).cpu()
+        albedo = decode(self._load(rows), "srgb")
+        light = self._light(rows, slide)
+        source = self.source[rows].to(self.device)
+        return search_gain(self.model, albedo, light, source, candidates).cpu()
 
     def _descend(self, rows: Tensor, slide: int) -> Tensor:
         """Return the factors that the gradient finds, shape (A, 3, cells, cells)."""
-        photographs = self._load(rows)
+        albedo = decode(self._load(rows), "srgb")
         light = self._light(rows, slide)
         source = self.source[rows].to(self.device)
         start = torch.zeros_like(self.log_gain[ADVERSARIAL][rows, slide]).to(self.device)
         best = Best(start)
         last = descend_gain(
             self.model,
-            photographs,
+            albedo,
             light,
             source,
             start,
@@ -288,7 +290,7 @@ class _PhotographAttack:
             best,
         )
         with torch.no_grad():
-            best.update(last, self.model(light.apply(photographs, last)), source)
+            best.update(last, self.model(light.expose(albedo, last)), source)
         return best.log_gain.cpu()
 
     @torch.no_grad()

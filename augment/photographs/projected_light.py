@@ -86,10 +86,7 @@ class ProjectedLight:
         return slide * self.shading + self.ambient
 
     def apply(self, photographs: Tensor, log_gain: Tensor | None = None) -> Tensor:
-        """Compute what a camera sees. The result is differentiable in the gain.
-
-        The exposure makes the mean luminance, before overexposed values are
-        clamped, 2^stops times that of the photograph.
+        """Compute what a camera sees of photographs.
 
         Args:
             photographs: Photographs in [0, 1], sRGB, shape (B, 3, H, W).
@@ -98,7 +95,21 @@ class ProjectedLight:
         Returns:
             Images in [0, 1], sRGB, shape (B, 3, H, W).
         """
-        albedo = decode(photographs, "srgb")
+        return self.expose(decode(photographs, "srgb"), log_gain)
+
+    def expose(self, albedo: Tensor, log_gain: Tensor | None = None) -> Tensor:
+        """Compute what a camera sees. The result is differentiable in the gain.
+
+        The exposure makes the mean luminance, before overexposed values are
+        clamped, 2^stops times that of the photograph.
+
+        Args:
+            albedo: Linear values of the photographs, shape (B, 3, H, W).
+            log_gain: Logarithm of the factor of the slide; see `light`.
+
+        Returns:
+            Images in [0, 1], sRGB, shape (B, 3, H, W).
+        """
         radiance = albedo * self.light(log_gain)
         wanted = luminance(albedo).mean((2, 3), keepdim=True)
         given = luminance(radiance).mean((2, 3), keepdim=True)

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from benchmarks import (
     common,
     gpu,
     gradient_free,
     lights,
+    relit_photographs,
     renderer,
     scene,
     steps,
@@ -192,3 +194,34 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys):
     header, _, *rows = capsys.readouterr().out.splitlines()
     assert header == "|optimizer|2 passes|20 passes|"
     assert [row.split("|")[1] for row in rows] == ["gradient", "random search", "CMA-ES"]
+
+
+def test_relit_photographs_are_scored_for_each_network(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    for index in range(0, 50, 5):
+        pixels = rng.integers(0, 256, (40, 40, 3)).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{index:03d}_thing.png")
+    none, best = "run:pretrained/none", "run:pretrained/best"
+    relit_photographs.main([str(tmp_path), none, best, "--slides=2", "--passes=3"])
+    _, separator, *rows = capsys.readouterr().out.splitlines()
+    assert separator.count("|") == 1 + 8
+    assert [row.split("|")[1] for row in rows] == [none, best]
+    for row in rows:
+        values = [float(cell.split(",")[0]) for cell in row.split("|")[2:-1]]
+        unchanged, _, _, _, one_slide, random_search, gradient = values
+        assert gradient <= one_slide <= unchanged
+        assert random_search <= one_slide
+
+
+def test_the_intervals_of_relit_photographs_are_those_of_scipy():
+    from scipy.stats import bootstrap
+
+    draws = torch.Generator().manual_seed(1)
+    column, first = torch.randint(0, 2, (2, 60), generator=draws).double()
+    text = relit_photographs.cell(column, first)
+    low, high = (float(end) for end in text.partition("[")[2].rstrip("]").split(","))
+    difference = (column - first).numpy()
+    expected = bootstrap((difference,), np.mean, method="percentile", rng=0).confidence_interval
+    assert text.startswith(f"{column.mean():.3f}, {difference.mean():+.3f}")
+    assert low == pytest.approx(expected.low, abs=0.03)
+    assert high == pytest.approx(expected.high, abs=0.03)

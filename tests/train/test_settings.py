@@ -18,7 +18,7 @@ from train.data.batches import rounds_of_epoch
 from train.settings import OTHER, ExperimentSettings, TrainingSceneSettings
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "run=here"]
-EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper"]
+EXPERIMENTS = ["best", "classifier", "cpu", "demo", "fast", "harden", "paper", "photographs"]
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -30,7 +30,7 @@ def test_every_experiment_takes_other_data(experiment):
     assert settings.train.init_from == "b"
 
 
-@pytest.mark.parametrize("experiment", ["harden", "best", "classifier"])
+@pytest.mark.parametrize("experiment", ["harden", "best", "classifier", "photographs"])
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
     with pytest.raises(InputError, match=r"^train\.init_from is empty"):
         train_command.read([f"experiment={experiment}", *OTHER_DATA])

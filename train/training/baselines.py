@@ -27,7 +27,7 @@ class Baseline:
     Args:
         name: "none"; "pgd", an attack on pixels; or one of torchvision's transforms:
             "color_jitter" (at half the strengths of Chen et al. 2020, as is usual for small
-            images), "trivial_augment" or "augmix".
+            images), "trivial_augment", "augmix" or "color_jitter+augmix".
         model: The network that PGD attacks.
         seed: The seed of the run.
         absent: Other classes that no image with a complementary label shows. See
@@ -75,11 +75,14 @@ def _transform(name: str) -> Any:
     """Return one of torchvision's transforms."""
     from torchvision.transforms import v2  # torchvision takes a second to import
 
+    jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
     if name == "color_jitter":
-        return v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
+        return jitter
     if name == "trivial_augment":
         return v2.TrivialAugmentWide()
-    return v2.AugMix()
+    if name == "augmix":
+        return v2.AugMix()
+    return v2.Compose([jitter, v2.AugMix()])
 
 
 @torch.enable_grad()

@@ -31,7 +31,7 @@ from train.runs import checkpoint
 from train.runs.checkpoint import random_state, restore_random_state
 from train.runs.epoch_metrics import epoch_metrics, format_epoch
 from train.runs.run_log import PHASES, RunLog
-from train.settings import TrainSettings
+from train.settings import RELIGHT, TrainSettings
 from train.system.device import GraphedModel, MixedPrecision, compiles
 from train.system.processes import SignalHandler, all_reduce_sum, wrap_ddp
 from train.system.user_errors import keyed
@@ -39,6 +39,7 @@ from train.training.averages import Averages
 from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
 from train.training.recipe import build_optimizer, learning_rate
+from train.training.relit_batches import RelitBatches
 
 # Images that are evaluated at a time.
 EVALUATION_BATCH = 512
@@ -190,14 +191,17 @@ class Trainer:
             self.optimizer = build_optimizer(self.model, settings)
         is_scaled = self.model.precision == "float16"
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
-        teacher = self.initial if settings.distillation_weight else None
+        has_teacher = settings.distillation_weight or settings.consistency_weight
+        teacher = self.initial if has_teacher else None
         self._loss = TrainingLoss(replica, settings, positive_classes, teacher, labeled).compute
-        self._baseline = Baseline(
+        self._baseline: Baseline | RelitBatches = Baseline(
             settings.augmentation,
             self.model,
             self.seed,
             positive_classes[1:],
         )
+        if settings.augmentation == RELIGHT:
+            self._baseline = RelitBatches(settings, self.model, teacher, self.seed)
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
         with keyed(choice="compile"):
@@ -354,15 +358,15 @@ class Trainer:
         done = progress if settings.soup else (self.epoch + progress) / settings.epochs
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(settings, done)
-        images = self._baseline.apply(images, labels, number)
+        augmented = self._baseline.apply(images, labels, number)
+        # The consistency term compares both versions. Otherwise only one is shown.
+        tensors = [augmented, labels, rendered]
+        if settings.consistency_weight:
+            tensors = [images, labels, rendered, augmented]
         self.optimizer.zero_grad(set_to_none=True)
         sums = torch.zeros(2, device=self.device)
-        parts = zip(
-            images.chunk(settings.accumulation_steps),
-            labels.chunk(settings.accumulation_steps),
-            rendered.chunk(settings.accumulation_steps),
-            strict=True,
-        )
+        chunks = [tensor.chunk(settings.accumulation_steps) for tensor in tensors]
+        parts = zip(*chunks, strict=True)
         for part in parts:
             loss, hits = self._loss(*part)
             self.scaler.scale(loss / settings.accumulation_steps).backward()

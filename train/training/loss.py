@@ -13,15 +13,17 @@ from train.settings import TrainSettings
 class TrainingLoss:
     """The loss of a batch of images, some of which are renders.
 
-    It is the mean of the label loss. With their weights in the settings, two terms are added: the
-    ranking loss of the positive classes, and the divergence from a teacher's predictions.
+    It is the mean of the label loss. With their weights in the settings, three terms are added:
+    the ranking loss of the positive classes, the divergence from a teacher's predictions, and the
+    divergence of the predictions for augmented images from the teacher's predictions for the same
+    images without augmentation.
 
     Args:
         model: The network, from images in [0, 1] to logits.
         settings: The settings, with the weights of the terms.
         positive_classes: Indices of the positive classes, which the ranking
             loss ranks against the others. Empty without a ranking loss.
-        teacher: The network whose predictions are kept; None without distillation.
+        teacher: The network whose predictions are kept. None without distillation and consistency.
         labeled: Whether the labels of the data are known. Otherwise only renders have a label
             loss, and the teacher's predictions are the labels of all other images.
     """
@@ -40,13 +42,21 @@ class TrainingLoss:
         self._teacher = teacher
         self._labeled = labeled
 
-    def compute(self, images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
+    def compute(
+        self,
+        images: Tensor,
+        labels: Tensor,
+        rendered: Tensor,
+        augmented: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """Compute the loss of a batch.
 
         Args:
             images: The images, uint8, shape (B, 3, H, W).
             labels: Their classes, shape (B,).
             rendered: Which of them are renders, bool, shape (B,).
+            augmented: The images after an augmentation, for the consistency
+                term. None without this term.
 
         Returns:
             The loss, a scalar, and the number of correct predictions.
@@ -69,6 +79,10 @@ class TrainingLoss:
         if targets is not None:
             changes = self._changes(logits, targets, rendered)
             loss = loss + settings.distillation_weight * changes.mean()
+        if targets is not None and augmented is not None:
+            answers = self._model(to_unit(augmented))
+            changes = kl_divergence(answers, targets) * ~rendered
+            loss = loss + settings.consistency_weight * changes.mean()
         if self._positive_classes and settings.ranking_weight:
             ranked = sum(ranking_loss(logits, labels, label) for label in self._positive_classes)
             loss = loss + settings.ranking_weight * ranked / len(self._positive_classes)

@@ -56,6 +56,13 @@ from train.training.initial import (
     choose_validation,
     load_initial,
 )
+from train.training.interpolation import (
+    INTERPOLATION,
+    agreement,
+    interpolate,
+    predict,
+    predict_relit,
+)
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
 from train.training.renders import build_service
@@ -171,6 +178,8 @@ class Run:
         self._scores |= self._test_scores()
         if self._initial_predictions is not None and CLASSIFIER in trainer.architecture:
             self._scores["test/agreement"] = self._agreement(self._initial_predictions)
+        if trainer.initial and self.settings.train.consistency_weight:
+            self._scores |= self._relit_scores(trainer.initial)
         if self.log:
             for name in self.scored_folders:
                 scores = self._score_photographs(trainer.selected, name, self.folder)
@@ -309,7 +318,9 @@ class Run:
         last = evaluate(trainer.selected, test)["accuracy"]
         selected = last
         best = checkpoint.load(self.folder / checkpoint.BEST)
-        if best["epoch"] != trainer.epoch:
+        if self.settings.train.interpolate:
+            best = self._interpolated(best)
+        if best["epoch"] != trainer.epoch or INTERPOLATION in best:
             trainer.selected.network.load_state_dict(best["model"])
             selected = evaluate(trainer.selected, test)["accuracy"]
         console.debug(
@@ -319,11 +330,31 @@ class Run:
             last,
             describe_test_images(self.settings, self.data),
         )
-        return {
+        scores = {
             "test/accuracy": selected,
             "test/accuracy_last": last,
             "test/epoch": best["epoch"],
         }
+        if INTERPOLATION in best:
+            scores["test/interpolation"] = best[INTERPOLATION]
+        return scores
+
+    def _interpolated(self, best: dict[str, Any]) -> dict[str, Any]:
+        """Return the checkpoint of the interpolated network, and write it as best.pt.
+
+        The run may have written it before it was stopped.
+        """
+        trainer = self.trainer
+        if INTERPOLATION in best or trainer.initial is None:
+            return best
+        validation = self.data.train[self.held_out]
+        weights, factor = interpolate(
+            trainer.initial, trainer.selected, best["model"], validation, self.settings.seed
+        )
+        interpolated = best | {"model": weights, INTERPOLATION: factor}
+        if distributed.rank() == 0:
+            checkpoint.save(self.folder / checkpoint.BEST, interpolated)
+        return interpolated
 
     def _agreement(self, initial_predictions: Tensor) -> float:
         """Return the fraction of test images that both networks predict as the same class."""
@@ -338,6 +369,22 @@ class Run:
             agreement,
         )
         return agreement
+
+    def _relit_scores(self, initial: MixedPrecision) -> dict[str, float]:
+        """Return how often both networks predict relit test images as the initial one unchanged."""
+        test = self.data.test
+        wanted = predict(initial, test)
+        scores = {"test/agreement": agreement(predict(self.trainer.selected, test), wanted)}
+        for name, model in (("before", initial), ("after", self.trainer.selected)):
+            predicted = predict_relit(model, test, self.settings.seed, "test")
+            scores[f"test/relit_agreement_{name}"] = agreement(predicted, wanted)
+        console.info(
+            "agreement with the original on %d photographs kept aside: unchanged %.3f; "
+            "in the light of a projector %.3f before, %.3f after",
+            len(test),
+            *scores.values(),
+        )
+        return scores
 
     def _score_photographs(self, model: Model, name: str, folder: Path) -> Scores:
         """Score a model on one of the folders of photographs of this run.

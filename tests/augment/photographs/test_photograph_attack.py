@@ -13,7 +13,7 @@ from augment.photographs.photograph_attack import ADVERSARIAL, LIGHTS, RANDOM, a
 from augment.photographs.projected_light import draw_projected_light
 from augment.random_streams import generator
 from renderer.errors import InputError
-from renderer.image import to_unit
+from renderer.image import decode, to_unit
 
 SIZE = 16
 SETTINGS = RelightingSettings(gain=2.0, cells=3, passes=9, slides=2)
@@ -101,7 +101,9 @@ def test_steps_lower_the_confidence_in_the_source(photographs):
     light = draw_projected_light(len(images), SIZE, generator(0))
     source = network(images).argmax(1)
     start = torch.zeros(len(images), 3, 3, 3)
-    log_gain = descend_gain(network, images, light, source, start, math.log(2), steps=4)
+    log_gain = descend_gain(
+        network, decode(images, "srgb"), light, source, start, math.log(2), steps=4
+    )
     before = network(light.apply(images)).log_softmax(1)
     after = network(light.apply(images, log_gain)).log_softmax(1)
     change = (after - before).gather(1, source[:, None])

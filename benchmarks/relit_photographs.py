@@ -1,0 +1,152 @@
+"""Accuracy of networks on photographs, unchanged and in the light of a projector.
+
+The name of each photograph begins with the index of its class, such as
+`340_zebra.jpg`. Run it as a module in the root of the repository:
+
+    python -m benchmarks.relit_photographs FOLDER efficientnet_lite0 run:runs/relit
+
+It prints a Markdown table. Differences are from the first network, with 95%
+intervals of a bootstrap over photographs.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import norm_balls as nb
+from augment.classifiers import Classifier
+from renderer.image import to_unit
+from train.data.photographs import find_unlabeled, load_photographs
+from train.runs.saved_networks import load_network
+
+# Photographs per pass.
+BATCH = 32
+# Draws of the bootstrap.
+DRAWS = 10_000
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Score each network, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder of photographs")
+    parser.add_argument("networks", nargs="+", help="names of classifiers, the original first")
+    parser.add_argument("--every", type=int, default=10, help="classes whose index it divides")
+    parser.add_argument("--slides", type=int, default=4, help="random slides of each photograph")
+    parser.add_argument("--passes", type=int, default=11, help="passes of each search")
+    parser.add_argument("--seed", type=int, default=1000, help="seed of the light")
+    options = parser.parse_args(arguments)
+    wanted: Tensor | None = None
+    first: dict[str, Tensor] = {}
+    for name in options.networks:
+        classifier = load_network(name)
+        photographs, labels = load(options.folder, classifier.size, options.every)
+        if wanted is None:
+            wanted = predict(classifier, photographs)
+        columns = score(classifier, photographs, labels, wanted, options)
+        if not first:
+            first = columns
+            print(f"|network|{'|'.join(columns)}|")
+            print("|-" * (1 + len(columns)) + "|")
+        cells = [cell(column, first[title]) for title, column in columns.items()]
+        print(f"|{name}|{'|'.join(cells)}|", flush=True)
+
+
+def load(folder: Path, size: int, every: int) -> tuple[Tensor, Tensor]:
+    """Load the photographs of some classes.
+
+    Args:
+        folder: Folder of photographs.
+        size: Pixels per side.
+        every: Classes with an index that this number divides are loaded.
+
+    Returns:
+        Photographs, uint8, shape (N, 3, size, size), and their classes, shape
+        (N,).
+    """
+    chosen = []
+    for photograph in find_unlabeled(folder):
+        if class_of(photograph.path.name) % every == 0:
+            chosen.append(photograph)
+    found, images, _ = load_photographs(folder, chosen, size)
+    return images, torch.tensor([class_of(item.path.name) for item in found])
+
+
+def class_of(name: str) -> int:
+    """Return the index of the class with which the name of a photograph begins."""
+    return int(name.partition("_")[0])
+
+
+def score(
+    classifier: Classifier,
+    photographs: Tensor,
+    labels: Tensor,
+    wanted: Tensor,
+    options: argparse.Namespace,
+) -> dict[str, Tensor]:
+    """Score a network on each photograph, by column of the table.
+
+    Args:
+        classifier: Network.
+        photographs: Photographs, uint8, shape (N, 3, size, size).
+        labels: Their classes, shape (N,).
+        wanted: Classes that the original network predicts, shape (N,).
+        options: Options of the command line.
+
+    Returns:
+        Numbers in [0, 1], shape (N,) each.
+    """
+    predicted = predict(classifier, photographs)
+    right = []
+    kept = []
+    for slide in range(options.slides):
+        relit = nb.relight_photographs(photographs, options.seed + slide, slides=photographs)
+        predicted_relit = predict(classifier, relit)
+        right.append(predicted_relit == labels)
+        kept.append(predicted_relit == wanted)
+    settings = nb.RelightingSettings(passes=options.passes)
+    result = nb.attack_photographs(classifier, photographs, settings, seed=options.seed)
+    columns = {
+        "unchanged": predicted == labels,
+        "agreement": predicted == wanted,
+        "random slides": torch.stack(right).double().mean(0),
+        "agreement, random slides": torch.stack(kept).double().mean(0),
+    }
+    titles = {"slide": "one slide", "random": "random search", "adversarial": "gradient"}
+    for light, title in titles.items():
+        columns[title] = (result.source == labels) & result.kept(light)
+    return {title: column.double() for title, column in columns.items()}
+
+
+@torch.no_grad()
+def predict(classifier: Classifier, photographs: Tensor) -> Tensor:
+    """Return the classes that a network predicts for photographs, shape (N,)."""
+    parts = [classifier(to_unit(part)).argmax(1) for part in photographs.split(BATCH)]
+    return torch.cat(parts)
+
+
+def cell(column: Tensor, first: Tensor) -> str:
+    """Write a mean, and its difference from the first network with an interval.
+
+    Args:
+        column: Numbers of the photographs, shape (N,).
+        first: Numbers of the first network, shape (N,).
+
+    Returns:
+        Text such as "0.710, +0.050 [0.010, 0.090]".
+    """
+    text = f"{column.mean():.3f}"
+    difference = column - first
+    if not difference.any():
+        return text
+    draws = torch.Generator().manual_seed(0)
+    rows = torch.randint(len(column), (DRAWS, len(column)), generator=draws)
+    means = difference[rows].mean(1)
+    low, high = means.quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    return f"{text}, {difference.mean():+.3f} [{low:.3f}, {high:.3f}]"
+
+
+if __name__ == "__main__":
+    main()

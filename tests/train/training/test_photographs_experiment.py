@@ -1,0 +1,220 @@
+"""experiment=photographs learns from unlabeled photographs in the light of a projector."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torchvision.models import get_model
+
+from augment.random_streams import generator
+from renderer.errors import InputError
+from renderer.image import to_unit
+from tests.runs import completed_run
+from train.__main__ import main as train_command
+from train.runs.checkpoint import BEST, LAST, PREVIOUS, load
+from train.runs.run_log import read_metrics
+from train.runs.saved_networks import load_run
+from train.settings import TrainSettings
+from train.training.interpolation import FACTORS, INTERPOLATION, mix
+from train.training.loss import TrainingLoss
+from train.training.relit_batches import RelitBatches
+
+NAME = "shufflenet_v2_x0_5"
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """Save a network with batch statistics whose predictions differ between images."""
+    torch.manual_seed(0)
+    network = get_model(NAME)
+    with torch.no_grad():
+        for _ in range(20):
+            network(torch.randn(16, 3, SIZE, SIZE))
+        network.fc.weight *= 10
+    path = tmp_path_factory.mktemp("weights") / "network.pt"
+    torch.save(network.state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    """Save 24 photographs without labels."""
+    folder = tmp_path_factory.mktemp("photographs")
+    rng = np.random.default_rng(0)
+    for number in range(24):
+        pixels = rng.integers(0, 100, (40, 36, 3)) + 150 * (number % 2)
+        Image.fromarray(pixels.astype(np.uint8)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def settings_of(weights, photographs):
+    """Return a function that reads the experiment with small sizes and other overrides."""
+
+    def read(folder, *overrides):
+        words = [
+            "experiment=photographs",
+            f"train.init_from=torchvision:{NAME}",
+            f"weights={weights}",
+            f"data.path={photographs}",
+            f"data.size={SIZE}",
+            "data.test_fraction=0.25",
+            "data.validation=0.25",
+            "train.device=cpu",
+            "train.precision=float32",
+            "train.threads=1",
+            "train.batch_size=8",
+            "train.epochs=2",
+            "train.learning_rate=0.0003",
+            f"run={folder}",
+            *overrides,
+        ]
+        return train_command.read(words)
+
+    return read
+
+
+@pytest.fixture(scope="module")
+def finished(settings_of, tmp_path_factory):
+    """Return the folder and the scores of a run."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return folder, completed_run(settings_of(folder), folder)
+
+
+def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished, weights):
+    folder, scores = finished
+    best = load(folder / BEST)
+    factor = best[INTERPOLATION]
+    assert factor in FACTORS
+    assert scores["test/interpolation"] == factor
+    last = load(folder / LAST)["model"]
+    begin = torch.load(weights)
+    for name, start in begin.items():
+        name = f"network.{name}"
+        value = best["model"][name]
+        if value.is_floating_point():
+            expected = start + factor * (last[name] - start)
+            assert name.endswith(("mean", "std", "var")) or not torch.equal(last[name], start)
+            torch.testing.assert_close(value, expected, atol=1e-6, rtol=1e-5)
+
+
+def test_statistics_of_batches_stay_those_of_the_original(finished, weights):
+    folder, _ = finished
+    begin = torch.load(weights)
+    last = load(folder / LAST)["model"]
+    for name, value in begin.items():
+        if "running" in name:
+            assert torch.equal(value, last[f"network.{name}"])
+
+
+def test_the_saved_network_loads_as_others_do(finished, photographs):
+    folder, _ = finished
+    classifier = load_run(folder)
+    exported = get_model(NAME)
+    exported.load_state_dict(torch.load(folder / "weights.pt"))
+    images = torch.rand(2, 3, SIZE, SIZE)
+    mean = torch.tensor([0.485, 0.456, 0.406]).view(3, 1, 1)
+    std = torch.tensor([0.229, 0.224, 0.225]).view(3, 1, 1)
+    with torch.no_grad():
+        expected = exported.eval()((images - mean) / std)
+        torch.testing.assert_close(classifier(images), expected, atol=1e-3, rtol=1e-3)
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(finished, settings_of, tmp_path):
+    folder, scores = finished
+    stopped = tmp_path / "run"
+    shutil.copytree(folder, stopped)
+    # This is the checkpoint after the first of two epochs.
+    (stopped / PREVIOUS).replace(stopped / LAST)
+    again = completed_run(settings_of(stopped, "train.resume=true"), stopped)
+    assert again["test/accuracy"] == scores["test/accuracy"]
+    resumed = load(stopped / BEST)
+    whole = load(folder / BEST)
+    assert resumed[INTERPOLATION] == whole[INTERPOLATION]
+    for name, value in whole["model"].items():
+        assert torch.equal(value, resumed["model"][name])
+
+
+def test_a_finished_run_resumes_with_the_same_scores(finished, settings_of):
+    folder, scores = finished
+    again = completed_run(settings_of(folder, "train.resume=true"), folder)
+    for name in ("test/accuracy", "test/interpolation", "test/relit_agreement_after"):
+        assert again[name] == scores[name]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["train.relight_steps=1"], ["train.augmentation=color_jitter+augmix"]],
+)
+def test_other_arms_run(settings_of, tmp_path, words):
+    folder = tmp_path / "run"
+    scores = completed_run(settings_of(folder, "train.epochs=1", *words), folder)
+    assert 0 <= scores["test/relit_agreement_after"] <= 1
+    assert read_metrics(folder)
+
+
+def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
+    torch.manual_seed(0)
+    flat = torch.nn.Flatten()
+    model = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
+    teacher = torch.nn.Sequential(flat, torch.nn.Linear(12, 3))
+    settings = TrainSettings(init_from="x", distillation_weight=2.0, consistency_weight=0.5)
+    unchanged = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
+    relit = torch.randint(0, 256, (4, 3, 2, 2), dtype=torch.uint8)
+    loss = TrainingLoss(model, settings, (), teacher, labeled=False)
+    no_renders = torch.zeros(4, dtype=torch.bool)
+    value, _ = loss.compute(unchanged, torch.zeros(4, dtype=torch.int64), no_renders, relit)
+
+    def probabilities(network, images):
+        return network(to_unit(images)).detach().softmax(1).double().numpy()
+
+    wanted = probabilities(teacher, unchanged)
+    divergences = []
+    for images in (unchanged, relit):
+        found = probabilities(model, images)
+        divergences.append((wanted * np.log(wanted / found)).sum(1).mean())
+    assert value.item() == pytest.approx(2.0 * divergences[0] + 0.5 * divergences[1], rel=1e-5)
+
+
+def test_gradient_steps_lower_the_confidence_of_relit_batches():
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.AvgPool2d(4), torch.nn.Flatten(), torch.nn.Linear(12, 5))
+    network[2].weight.data *= 10
+    images = torch.randint(0, 256, (16, 3, 8, 8), dtype=torch.uint8, generator=generator(0))
+    labels = torch.zeros(16, dtype=torch.int64)
+    confidence = {}
+    for steps in (0, 3):
+        settings = TrainSettings(init_from="x", consistency_weight=1.0, relight_steps=steps)
+        batches = RelitBatches(settings, network, network, seed=0)
+        relit = batches.apply(images, labels, step=0)
+        assert torch.equal(relit, batches.apply(images, labels, step=0))
+        assert not torch.equal(relit, batches.apply(images, labels, step=1))
+        source = network(to_unit(images)).argmax(1, keepdim=True)
+        confidence[steps] = network(to_unit(relit)).softmax(1).gather(1, source).mean()
+    assert confidence[3] < confidence[0]
+
+
+def test_mixed_weights_are_the_ends_at_0_and_1():
+    begin = {"weight": torch.tensor([0.0, 1.0]), "count": torch.tensor(1)}
+    end = {"weight": torch.tensor([1.0, 5.0]), "count": torch.tensor(7)}
+    assert torch.equal(mix(begin, end, 0.0)["weight"], begin["weight"])
+    assert torch.equal(mix(begin, end, 1.0)["weight"], end["weight"])
+    assert torch.equal(mix(begin, end, 0.25)["weight"], torch.tensor([0.25, 2.0]))
+    assert mix(begin, end, 0.25)["count"] == 7
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"consistency_weight": 1.0},
+        {"interpolate": True},
+        {"init_from": "x", "relight_steps": 1},
+    ],
+)
+def test_settings_that_need_others_are_an_error(values):
+    with pytest.raises(InputError, match=r"need|attack"):
+        TrainSettings(**values)
