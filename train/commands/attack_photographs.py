@@ -13,6 +13,10 @@ from train.runs.saved_networks import load_chosen
 from train.settings import published
 from train.system.device import choose_device
 from train.system.user_errors import keyed, writable_folder
+from train.system.verbosity import shortened
+
+# Lines about files that cannot be read, without --verbose.
+MAX_UNREADABLE = 3
 
 
 def run(settings: AttackExperimentSettings) -> None:
@@ -47,6 +51,7 @@ def run(settings: AttackExperimentSettings) -> None:
         write_config(out, settings, command=command_line("attack"))
     print(f"{scores.summary_table()}\n")
     print(f"{MODELED}\n")
-    for path in scores.unreadable:
-        print(f"warning: {path} cannot be read")
+    unreadable = [f"warning: {path} cannot be read" for path in scores.unreadable]
+    for line in shortened(unreadable, MAX_UNREADABLE):
+        print(line)
     print(f"predictions and pictures: {out / RELIT}")
