@@ -4,15 +4,9 @@ The albedo comes from the mesh as it was loaded, or from a parameter that can be
 differentiated. The parameter is one albedo per face, the texels of the
 textures, or a color that is added to the faces.
 
-Shapes use these letters: a mesh has F faces, a view sees G of them in S
-samples, and a texture has C channels. The two index arrays of `Fragments` have
-longer names in this module:
-
-- `seen_faces` is `fragments.faces`, the index in the mesh of each face that the
-  view sees, shape (G,). It is a NumPy array if it selects from arrays of the
-  mesh, and a tensor otherwise.
-- `sample_to_seen_face` is `fragments.face`, the index in `seen_faces` of the
-  face at each sample, shape (S,).
+Shapes use these letters: a mesh has F faces. A view has S covered samples, and
+these samples show G of the F faces. A texture has C channels. The local name
+`seen_faces` is the index in the mesh of each of the G faces, shape (G,).
 """
 
 import math
@@ -28,22 +22,22 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import clamp, decode
 from renderer.visibility.fragments import BLOCK, Fragments
 
-# Value in `Mesh.texture_ids` for faces without a texture.
+# Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
-# Value in `Mesh.texture_ids` for faces with the first texture of the mesh.
+# Value of `Mesh.texture_ids` for a face with the first texture of the mesh.
 FIRST_TEXTURE = 0
 
 
 @dataclass(frozen=True)
 class Texture:
-    """Texture whose texels are looked up by index.
+    """Texture with C channels, whose texels are looked up by index.
 
     Attributes:
         height: Number of rows. Row 0 is at the top.
         width: Number of columns.
-        look_up: Function that returns the linear values of texels, shape
-            (C, N). Its argument is the row-major index of each texel,
-            row · width + column, shape (N,).
+        look_up: Function that takes the indices of N texels, shape (N,), and
+            returns their linear values, shape (C, N). The index of a texel is
+            row · width + column.
     """
 
     height: int
@@ -52,11 +46,14 @@ class Texture:
 
     @staticmethod
     def from_values(values: Tensor) -> "Texture":
-        """Create a texture from linear values, in which lookups are differentiable.
+        """Create a texture from a tensor of linear values.
+
+        The values that `look_up` returns are differentiable with respect to the
+        tensor.
 
         Args:
             values: Linear values of the texels, floating point,
-                shape (H, W, C).
+                shape (H, W, C) for H rows, W columns and C channels.
 
         Returns:
             Texture with H rows and W columns.
@@ -77,13 +74,15 @@ class Texture:
 def surface_albedo(
     mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
 ) -> Tensor:
-    """Compute the albedo of a mesh: the interpolated corner color times the texture.
+    """Compute the albedo of a mesh at the samples of a view.
 
-    Colors and texels are decoded before they are interpolated.
+    The albedo is the interpolated color of the corners times the interpolated
+    texture. Colors and texels are decoded to linear values before they are
+    interpolated.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Visible samples of the view.
+        fragments: The S covered samples of the view.
         encoding: Encoding of the colors and textures of the mesh, "linear" or
             "srgb".
         textures: Linear albedo that replaces the textures of the mesh, shape
@@ -97,24 +96,24 @@ def surface_albedo(
         InputError: If a color or texture has NaN or infinite values.
     """
     colors = _interpolated_colors(mesh, fragments, encoding)
-    used_textures: list[Texture] = []
+    textures_to_sample: list[Texture] = []
     if textures is not None:
-        used_textures = [Texture.from_values(values) for values in textures]
+        textures_to_sample = [Texture.from_values(values) for values in textures]
     elif mesh.packed_textures:
-        used_textures = mesh_textures(mesh, encoding, fragments.coverage)
-    if not used_textures:
+        textures_to_sample = mesh_textures(mesh, encoding, fragments.coverage)
+    if not textures_to_sample:
         return colors
-    return colors * sample_textures(used_textures, mesh, fragments).T
+    return colors * sample_textures(textures_to_sample, mesh, fragments).T
 
 
 def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragments) -> Tensor:
     """Interpolate the textures of a mesh at the samples of a view.
 
     Args:
-        textures: Textures of the mesh. `mesh.texture_ids` holds the index in
-            this sequence for each face.
+        textures: Textures with C channels. `mesh.texture_ids` holds, for each
+            face, the index of its texture in this sequence.
         mesh: Mesh that the view shows. It provides the texture coordinates.
-        fragments: Visible samples of the view.
+        fragments: The S covered samples of the view.
 
     Returns:
         Linear values at the samples, shape (C, S). Samples of faces without a
@@ -122,12 +121,13 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
     """
     sample_uvs = _interpolated_uvs(mesh, fragments)
     texture_of_face = _texture_of_seen_face(mesh, fragments)
-    # Most meshes have a single texture, which covers all faces. Then no samples
-    # need to be selected.
+    # In most meshes, all faces have the same texture. No samples need to be
+    # selected then.
     if len(textures) == 1 and bool((texture_of_face == FIRST_TEXTURE).all()):
         return interpolate_texture(textures[0], sample_uvs)
     sample_to_seen_face = fragments.face
     texture_of_sample = texture_of_face.index_select(0, sample_to_seen_face)
+    # Interpolate each texture at the samples that show it.
     samples_by_texture = []
     values_by_texture = []
     for texture_id, texture in enumerate(textures):
@@ -138,44 +138,48 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
     textured_samples = torch.cat(samples_by_texture)
     # Shape (C, number of textured samples).
     textured_values = torch.cat(values_by_texture, 1)
-    # Samples with NO_TEXTURE keep the value 1.
-    values = textured_values.new_ones(len(textured_values), len(texture_of_sample))
+    # Samples of faces with NO_TEXTURE keep the value 1.
+    channel_count = len(textured_values)
+    values = textured_values.new_ones(channel_count, len(texture_of_sample))
     return values.index_copy(1, textured_samples, textured_values)
 
 
 def interpolate_texture(texture: Texture, uvs: Tensor) -> Tensor:
-    """Interpolate a texture bilinearly at points.
+    """Interpolate a texture bilinearly at N points.
 
-    The texture repeats beyond [0, 1]. Texel centers are at half-integers of
-    width and height, and v = 0 is the lower edge of the bottom row.
+    The texture repeats outside of [0, 1]. Column i is centered at
+    u = (i + 0.5) / width. v points up, and the texture's lower edge is v = 0.
 
     Args:
-        texture: Texture to interpolate.
-        uvs: Texture coordinates u and v of N points, shape (2, N).
+        texture: Texture with C channels.
+        uvs: Texture coordinates u and v of the points, shape (2, N).
 
     Returns:
         Interpolated linear values, shape (C, N).
     """
-    blocks = []
-    # Blocks of BLOCK points limit the memory.
-    for block in uvs.split(BLOCK, dim=1):
-        weighted = [
-            weight * texture.look_up(texel) for weight, texel in _surrounding_texels(texture, block)
+    values_by_block = []
+    # Processing BLOCK points at a time limits the memory.
+    for block_uvs in uvs.split(BLOCK, dim=1):
+        weighted_texels = [
+            weight * texture.look_up(texel)
+            for weight, texel in _surrounding_texels(texture, block_uvs)
         ]
-        blocks.append(reduce(torch.add, weighted))
-    return torch.cat(blocks, dim=1)
+        # Sum over the four texels, shape (C, points of the block).
+        values_by_block.append(reduce(torch.add, weighted_texels))
+    return torch.cat(values_by_block, dim=1)
 
 
 def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Find the four texels around each of N points, and their weights.
+    """Find the four texels between which each of N points lies, and their bilinear weights.
 
     Args:
-        texture: Texture with the texels.
+        texture: Texture in which the points lie.
         uvs: Texture coordinates u and v of the points, shape (2, N).
 
     Returns:
-        Four pairs of a weight and a row-major texel index, shape (N,) each. The
-        weights of a point add up to 1.
+        Four pairs, one for each texel of a point. A pair has the weights of the
+        texels, shape (N,), and their indices, row · width + column, shape (N,).
+        The four weights of a point add up to 1.
     """
     u, v = uvs
     # v points up, but row 0 is at the top.
@@ -190,41 +194,55 @@ def _surrounding_texels(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Ten
 
 
 def _neighbors(coordinate: Tensor, count: int) -> list[tuple[Tensor, Tensor]]:
-    """Find the two rows, or the two columns, between which each of N points lies.
+    """Find the two lines of texels (rows or columns) between which each of N points lies.
 
     Args:
-        coordinate: Coordinate of the points in a texture that repeats from 0 to
-            1, shape (N,).
-        count: Number of rows or columns of the texture.
+        coordinate: Coordinate of the points across the lines, shape (N,). The
+            texture is [0, 1] and repeats beyond.
+        count: Number of lines.
 
     Returns:
-        Two pairs, for the row or column before the point and the one after it.
-        A pair has an index, a whole floating-point number in [0, count), and a
-        weight, shape (N,) each.
+        Two pairs, the first for the line before each point and the second for
+        the line after it. A pair has the index of the line, a whole
+        floating-point number in [0, count), and its linear weight, shape (N,)
+        each.
     """
+    # Line i is centered at the position i.
     position = coordinate * count - 0.5
-    first = position.floor()
-    fraction = position - first
-    return [(_modulo(first, count), 1 - fraction), (_modulo(first + 1, count), fraction)]
+    line_before = position.floor()
+    fraction = position - line_before
+    return [
+        (_modulo(line_before, count), 1 - fraction),
+        (_modulo(line_before + 1, count), fraction),
+    ]
 
 
 def _modulo(index: Tensor, count: int) -> Tensor:
-    """Compute the remainder of whole floating-point numbers in the division by `count`."""
+    """Compute `index` modulo `count`, a number in [0, count).
+
+    Args:
+        index: Whole floating-point numbers, which may be negative, shape (N,).
+        count: Divisor.
+
+    Returns:
+        Remainders, shape (N,).
+    """
     return index - count * (index / count).floor()
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
-    """Return the textures of a mesh as `Texture` objects with linear values.
+    """Convert the textures of a mesh to `Texture` objects, which return linear values.
 
     Args:
         mesh: Mesh with textures of eight bits per channel.
         encoding: Encoding of the texels, "linear" or "srgb".
-        like: Tensor with the device and dtype of the linear values.
+        like: Tensor whose device and dtype the linear values get.
 
     Returns:
         Textures with three channels of linear albedo.
     """
-    # A channel has only 256 possible values, so they are decoded once.
+    # A channel has only 256 possible values. Each of them is decoded once here,
+    # and texels are looked up in the table of decoded values.
     eight_bit_values = torch.arange(256, dtype=torch.float64) / 255
     linear_values = decode(eight_bit_values, encoding).to(like)
     textures = []
@@ -237,12 +255,12 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
 
 
 def _look_up_packed(packed_texels: Tensor, linear_values: Tensor, texels: Tensor) -> Tensor:
-    """Return the linear values of texels that hold their three channels in one integer.
+    """Look up the linear values of N texels of a texture with one integer per texel.
 
     Args:
-        packed_texels: Texels of one of `Mesh.packed_textures` in row-major
-            order, int32, shape (H · W,). Bits 0 to 7 are red, 8 to 15 green and
-            16 to 23 blue.
+        packed_texels: All texels of a texture with H rows and W columns, row by
+            row, int32, shape (H · W,). Bits 0 to 7 of a texel are red, 8 to 15
+            green and 16 to 23 blue.
         linear_values: Linear value for each of the 256 values of a channel,
             shape (256,).
         texels: Indices of the texels to look up, shape (N,).
@@ -251,19 +269,19 @@ def _look_up_packed(packed_texels: Tensor, linear_values: Tensor, texels: Tensor
         Linear red, green and blue, shape (3, N).
     """
     first_bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=packed_texels.device)
-    # Eight-bit values, shape (3, N).
-    channels = (packed_texels.index_select(0, texels) >> first_bits) & 255
-    return linear_values.index_select(0, channels.long().flatten()).view(3, -1)
+    # Values from 0 to 255 of red, green and blue, shape (3, N).
+    eight_bit_values = (packed_texels.index_select(0, texels) >> first_bits) & 255
+    return linear_values.index_select(0, eight_bit_values.long().flatten()).view(3, -1)
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
-    """Return, for each sample, the albedo of the face that it shows.
+    """Look up the albedo of the face that each sample shows, if each face has one albedo.
 
     The result is differentiable with respect to `albedo`.
 
     Args:
         albedo: Linear albedo of the F faces of the mesh, shape (F, 3).
-        fragments: Visible samples of the view.
+        fragments: The S covered samples of the view.
 
     Returns:
         Linear albedo at the samples, shape (S, 3).
@@ -285,16 +303,16 @@ def paint_faces(
     added: Tensor,
     hue: Tensor | None = None,
 ) -> Tensor:
-    """Compute the albedo of a mesh whose faces have a rotated hue and an added color.
+    """Rotate the hue of the faces of a mesh, add a color to each face, and sample the albedo.
 
-    The scaled albedo of the mesh is changed at corners and texels, as in
-    `changed_albedo`, and interpolated afterwards. Image files can therefore
-    store the changed albedo (see `renderer.surface.texture_bake`). The result is
-    differentiable with respect to `added` and `hue`.
+    The albedo is scaled and changed at corners and texels with
+    `changed_albedo`, and interpolated afterwards. Textures of image files can
+    therefore store the changed albedo (see `renderer.surface.texture_bake`). The
+    result is differentiable with respect to `added` and `hue`.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Visible samples of the view.
+        fragments: The S covered samples of the view.
         encoding: Encoding of the colors and textures of the mesh, "linear" or
             "srgb".
         albedo_scale: Factor for the albedo of the mesh.
@@ -310,16 +328,18 @@ def paint_faces(
             values.
     """
     sample_to_seen_face = fragments.face
+    # Added color at the S samples and of the G seen faces.
     added_at_samples = face_albedo(added, fragments)
     added_to_face = added.index_select(0, fragments.faces)
     hue_of_face = None
     hue_at_samples = None
     if hue is not None:
-        # The gradient of index_select adds up in the same order on any number
-        # of threads. The gradient of indexing with brackets does not.
+        # The gradient of index_select is added up in the same order for any number
+        # of threads. The gradient of `hue[faces]` is not.
         hue_of_face = hue.index_select(0, fragments.faces)
         hue_at_samples = hue_of_face.index_select(0, sample_to_seen_face)
 
+    # First, change the corners and interpolate them, as if no face had a texture.
     seen_faces = fragments.faces.cpu().numpy()
     corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0)).to(added)
     # Shape (G, 3, 3), for three corners and three channels.
@@ -331,7 +351,8 @@ def paint_faces(
     if not mesh.textures:
         return albedo
 
-    # Textured samples interpolate painted texels instead of painted corners.
+    # Then replace the samples of faces with a texture. Their texels are changed
+    # before they are interpolated.
     colors = _interpolated_colors(mesh, fragments, encoding)
     scaled_colors = (colors * albedo_scale).to(added)
     sample_uvs = _interpolated_uvs(mesh, fragments)
@@ -356,34 +377,35 @@ def paint_faces(
 def _interpolate_painted_texels(
     texture: Texture, uvs: Tensor, colors: Tensor, hue: Tensor | None, added: Tensor
 ) -> Tensor:
-    """Rotate the hue of the four texels around each point, add a color, and interpolate them.
+    """Rotate the hue of the four texels around each of N points, add a color, and interpolate.
 
     Args:
         texture: Texture with three channels.
-        uvs: Texture coordinates u and v of N points, shape (2, N).
-        colors: Linear color that multiplies the texels around each point,
+        uvs: Texture coordinates u and v of the points, shape (2, N).
+        colors: Linear color that multiplies the four texels around each point,
             shape (N, 3).
-        hue: Hue rotation at each point in degrees, shape (N,). None leaves the
-            hue unchanged.
-        added: Linear color that is added at each point, shape (N, 3).
+        hue: Hue rotation of these texels in degrees, shape (N,). None leaves
+            the hue unchanged.
+        added: Linear color that is added to these texels, shape (N, 3).
 
     Returns:
         Linear albedo of the points, shape (N, 3).
     """
-    weighted = []
+    weighted_texels = []
     for weight, texel in _surrounding_texels(texture, uvs):
         texel_albedo = colors * texture.look_up(texel).T
-        painted = changed_albedo(texel_albedo, hue, added)
-        weighted.append(weight.to(added)[:, None] * painted)
-    return reduce(torch.add, weighted)
+        painted_texel = changed_albedo(texel_albedo, hue, added)
+        weighted_texels.append(weight.to(added)[:, None] * painted_texel)
+    # Sum over the four texels.
+    return reduce(torch.add, weighted_texels)
 
 
 def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
-    """Return an albedo with rotated hue and an added color, clamped.
+    """Rotate the hue of an albedo, add a color, and clamp the sum.
 
-    The hue is rotated about the gray axis, which preserves the mean of the
-    channels (Haeberli 1993). The sum is clamped to [0, 1], or to [0, albedo]
-    for an albedo above 1.
+    The hue is rotated about the gray axis of RGB space, which preserves the mean
+    of the three channels (Haeberli 1993). A channel is clamped to [0, 1], or to
+    [0, albedo] if its albedo is above 1.
 
     Args:
         albedo: Linear albedo, shape (..., 3).
@@ -398,8 +420,8 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
     if hue is not None:
         angle = torch.deg2rad(hue)[..., None]
         gray = albedo.mean(-1, keepdim=True)
-        # This is Rodrigues' rotation formula. The cross product of the albedo
-        # with the gray axis, (1, 1, 1) / √3, is a difference of permuted
+        # Rodrigues' formula for a rotation about the gray axis (1, 1, 1) / √3. The
+        # cross product of the axis and the albedo is a difference of permuted
         # channels.
         cross_product = (albedo.roll(1, -1) - albedo.roll(-1, -1)) / math.sqrt(3)
         rotated = gray + angle.cos() * (albedo - gray) + angle.sin() * cross_product
@@ -407,16 +429,16 @@ def changed_albedo(albedo: Tensor, hue: Tensor | None, added: Tensor) -> Tensor:
 
 
 def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | None:
-    """Return the albedo that all seen faces share, if they share one.
+    """Return the albedo of the seen faces if all of them have the same albedo.
 
     Args:
         mesh: Mesh that the view shows.
-        fragments: Visible samples of the view.
+        fragments: Covered samples of the view, which show the seen faces.
         encoding: Encoding of the colors of the mesh, "linear" or "srgb".
 
     Returns:
         Linear albedo, float64, shape (3,). None if the mesh has a texture, if
-        two corners of seen faces differ in color, or if the view sees no face.
+        two corners of seen faces differ in color, or if no face is seen.
 
     Raises:
         InputError: If a color has NaN or infinite values.
@@ -434,19 +456,42 @@ def shared_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor | N
 
 
 def _interpolated_colors(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """Interpolate the decoded corner colors at the samples, float64, shape (S, 3)."""
+    """Interpolate the linear corner colors of a mesh at the S covered samples of a view.
+
+    Args:
+        mesh: Mesh that the view shows.
+        fragments: Covered samples of the view.
+        encoding: Encoding of the colors, "linear" or "srgb".
+
+    Returns:
+        Linear colors without textures, float64, shape (S, 3).
+    """
     corner_albedo = _corner_albedo(mesh, fragments, encoding)
     if not mesh.one_color_per_face:
         return fragments.interpolate(corner_albedo)
-    # All corners of a face have the color of its first corner, shape (3, G).
+    # The corners of a face have the same color, so take the first corner. Shape
+    # (3, G) for G seen faces.
     face_colors = corner_albedo[:, 0].T.contiguous()
     sample_to_seen_face = fragments.face
-    # gather takes a third of the time of index_select in float64.
+    # In float64, gather takes a third of the time of index_select.
     return face_colors.gather(1, sample_to_seen_face.expand(3, -1)).T
 
 
 def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """Decode the three corner colors of each seen face, float64, shape (G, 3, 3)."""
+    """Decode the corner colors of the G faces that a view shows.
+
+    Args:
+        mesh: Mesh that the view shows.
+        fragments: Covered samples of the view.
+        encoding: Encoding of the colors, "linear" or "srgb".
+
+    Returns:
+        Linear colors of three corners with three channels, float64,
+        shape (G, 3, 3).
+
+    Raises:
+        InputError: If a color has NaN or infinite values.
+    """
     seen_faces = fragments.faces.cpu().numpy()
     corner_colors = torch.from_numpy(mesh.corner_colors.take(seen_faces, axis=0))
     corner_colors = corner_colors.to(fragments.coverage)
@@ -455,30 +500,48 @@ def _corner_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
 
 
 def _interpolated_uvs(mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Interpolate the texture coordinates u and v at the samples, float64, shape (2, S)."""
+    """Interpolate the texture coordinates of a mesh at the S covered samples of a view.
+
+    Args:
+        mesh: Mesh that the view shows.
+        fragments: Covered samples of the view.
+
+    Returns:
+        Texture coordinates u and v, float64, shape (2, S).
+    """
     seen_faces = fragments.faces.cpu().numpy()
+    # Shape (G, 3, 2) for G seen faces, three corners, u and v.
     corner_uvs = torch.from_numpy(mesh.corner_uvs.take(seen_faces, axis=0))
     return fragments.interpolate(corner_uvs.to(fragments.coverage)).T
 
 
 def _texture_of_seen_face(mesh: Mesh, fragments: Fragments) -> Tensor:
-    """Return the texture index of each seen face, or NO_TEXTURE, shape (G,)."""
+    """Return the index of the texture of each of the G faces that a view shows.
+
+    Args:
+        mesh: Mesh that the view shows.
+        fragments: Covered samples of the view.
+
+    Returns:
+        Index of the texture, or `NO_TEXTURE`, shape (G,).
+    """
     seen_faces = fragments.faces.cpu().numpy()
     texture_ids = torch.from_numpy(mesh.texture_ids.take(seen_faces))
     return texture_ids.to(fragments.face.device)
 
 
-def _at_samples(values: Tensor, fragments: Fragments) -> Tensor:
-    """Return, for each sample, the values of the face that it shows.
+def _at_samples(face_values: Tensor, fragments: Fragments) -> Tensor:
+    """Look up, at each sample, the values of the face that the sample shows.
 
     Args:
-        values: D values for each of the G seen faces, shape (G, D).
-        fragments: Visible samples of the view.
+        face_values: D values for each of the G faces that the view shows,
+            shape (G, D).
+        fragments: The S covered samples of the view.
 
     Returns:
         Values at the samples, shape (S, D).
     """
     sample_to_seen_face = fragments.face
-    # Selecting columns of contiguous rows takes half as long as selecting rows
-    # of D values.
-    return values.T.contiguous().index_select(1, sample_to_seen_face).T
+    # Selecting columns of the transposed matrix takes half the time of selecting
+    # rows of D values.
+    return face_values.T.contiguous().index_select(1, sample_to_seen_face).T

@@ -1,4 +1,4 @@
-"""Reflectance of rough surfaces, modeled with microfacets.
+"""Specular reflectance of rough surfaces (microfacet model of glTF and Mitsuba).
 
 A surface of roughness r and normal n reflects light from direction l toward the
 camera in direction v. With the half vector h = (l + v) / |l + v| and α = r²,
@@ -23,36 +23,41 @@ from torch import Tensor
 
 from renderer.vectors import unit
 
-# Refractive index that `fresnel` uses for dielectrics. It is typical of
-# varnish.
+# Refractive index of dielectrics in `fresnel`. 1.5 is typical of varnish, and the
+# default of glTF.
 REFRACTIVE_INDEX = 1.5
 
-# Indices of the three Fresnel terms along the first axis of tensors. SCHLICK
-# has F0 = 1 and F90 = 0, EDGE has F0 = 0 and F90 = 1, and DIELECTRIC has the
-# exact term for the refractive index REFRACTIVE_INDEX.
+# Indices of the three Fresnel terms along the first axis of the results of
+# `fresnel` and `reflectance`. SCHLICK and EDGE are the two parts of Schlick's
+# approximation F0 + (F90 - F0) (1 - cosine)⁵: SCHLICK has F0 = 1 and F90 = 0, and
+# EDGE has F0 = 0 and F90 = 1. DIELECTRIC is exact for REFRACTIVE_INDEX.
 SCHLICK, EDGE, DIELECTRIC = range(3)
 
 
 def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: Tensor) -> Tensor:
-    """Evaluate π f, the reflectance times π, for light from single directions.
+    """Compute π times the specular reflectance (BRDF) for light from single directions.
 
-    It is the reflected radiance per irradiance, which for a diffuse surface is
-    its albedo. The result is differentiable with respect to all arguments.
+    In the units of this project, a diffuse surface reflects the radiance
+    albedo · irradiance. π times the BRDF takes the place of the albedo. The
+    result is differentiable with respect to all arguments.
 
     Args:
         normals: Unit surface normals n, shape (..., 3). If a normal faces away
-            from the camera or the light, n·v or n·l counts as 0.
+            from the camera or the light, its cosine counts as 0.
         toward: Unit vectors v to the camera, shape (..., 3).
         directions: Unit vectors l to the light, shape (..., 3).
-        roughness: Roughness in (0, 1], shape (...).
+        roughness: Roughness r in (0, 1], shape (...).
 
     Returns:
-        π f with each of the three Fresnel terms SCHLICK, EDGE and DIELECTRIC,
-        shape (3, ...).
+        π times the BRDF for each of the three Fresnel terms SCHLICK, EDGE and
+        DIELECTRIC, shape (3, ...).
     """
-    # `unit` takes the components of vectors along the first axis.
+    # Half vector h between v and l. `unit` takes the three components of the
+    # vectors along the first axis.
     half = unit((toward + directions).movedim(-1, 0)).movedim(0, -1)
+    # α = r² (module docstring).
     alpha_squared = roughness**4
+    # π D G / (4 (n·l) (n·v)), in which the cosines cancel.
     without_fresnel = _distribution((half * normals).sum(-1), alpha_squared)
     for direction in (toward, directions):
         cosine = (direction * normals).sum(-1)
@@ -62,37 +67,55 @@ def reflectance(normals: Tensor, toward: Tensor, directions: Tensor, roughness: 
 
 
 def _distribution(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Evaluate π D, the density of half vectors times π, at the cosine n·h."""
+    """Compute π D, which is π times the GGX distribution of microfacet normals.
+
+    Args:
+        cosine: Cosine n·h between surface normal and half vector, shape (...).
+        alpha_squared: Fourth power α² of the roughness, shape (...).
+
+    Returns:
+        π D, shape (...).
+    """
     return alpha_squared / (cosine**2 * (alpha_squared - 1) + 1) ** 2
 
 
 def _masking_denominator(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
-    """Evaluate the denominator of G₁ at the cosine n·l or n·v.
+    """Compute c + √(α² + (1 - α²) c²), the denominator of Smith's masking term G₁(c).
 
-    The numerators 2 (n·l) and 2 (n·v) of the two factors of G cancel with the
-    denominator 4 (n·l) (n·v) of f. Without them, the reflectance stays finite
-    at grazing angles.
+    The numerator of G₁(c) is 2 c. The numerators for the light and for the
+    camera cancel with the denominator 4 (n·l) (n·v) of the BRDF, so they are not
+    needed. Without them, the BRDF stays finite at grazing angles.
+
+    Args:
+        cosine: Cosine c between the normal and the direction to the light or to
+            the camera, shape (...). Negative cosines count as 0.
+        alpha_squared: Fourth power α² of the roughness, shape (...).
+
+    Returns:
+        Denominator, shape (...).
     """
     facing_cosine = cosine.clamp(min=0)
     return facing_cosine + (alpha_squared + (1 - alpha_squared) * facing_cosine**2).sqrt()
 
 
 def fresnel(cosine: Tensor) -> Tensor:
-    """Evaluate the three Fresnel terms.
+    """Compute the fraction of light that a microfacet reflects, in three models.
 
-    The term of the dielectric is equation 22 of Walter et al. (2007), for
-    unpolarized light.
+    SCHLICK is 1 - (1 - cosine)⁵ and EDGE is (1 - cosine)⁵. DIELECTRIC is equation
+    22 of Walter et al. (2007), for unpolarized light and the refractive index
+    REFRACTIVE_INDEX.
 
     Args:
         cosine: Cosine v·h of the angle of incidence, in [0, 1], shape (...).
 
     Returns:
-        F for SCHLICK, EDGE and DIELECTRIC, in [0, 1], shape (3, ...).
+        Reflected fractions for SCHLICK, EDGE and DIELECTRIC, in [0, 1],
+        shape (3, ...).
     """
-    # Snell's law gives REFRACTIVE_INDEX times the cosine of the refracted ray.
+    # By Snell's law, this is REFRACTIVE_INDEX times the cosine of the refracted ray.
     refracted = (REFRACTIVE_INDEX**2 - 1 + cosine**2).sqrt()
-    # These are the reflected fractions of the amplitude, for light that is
-    # polarized perpendicular and parallel to the plane of incidence.
+    # Reflected fractions of the amplitude, for light that is polarized
+    # perpendicular to the plane of incidence, and parallel to this plane.
     perpendicular = (refracted - cosine) / (refracted + cosine)
     numerator = cosine * (refracted + cosine) - 1
     denominator = cosine * (refracted - cosine) + 1

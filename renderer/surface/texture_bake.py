@@ -1,22 +1,22 @@
-"""Meshes whose colors and textures hold the albedo that an attack changed.
+"""Write an albedo that an attack changed into the colors and textures of a mesh.
 
-Any other renderer can show such a mesh. The renderer scales the albedo ρ of
-corners and texels by s. An attack rotates the hue and adds the color d of the
-face (see `renderer.surface.albedo.changed_albedo`). The colors and textures of the new
-mesh hold
+Any other renderer can then show the attacked mesh. The renderer scales the
+albedo ρ of corners and texels by s. An attack rotates the hue and adds the color
+d of the face (see `renderer.surface.albedo.changed_albedo`). The colors and
+textures of the new mesh hold
 
     ρ' = clamp(rotate_hue(s ρ) + d, 0, max(1, s ρ)) / s'
 
-with a new scale s', which brings the largest possible value to 1. Corners hold
-ρ' with float32 precision.
+with a new scale s', which brings the largest possible value to 1. The colors of
+corners hold ρ' with float32 precision.
 
-In a texture, neighboring faces with different colors d may share texels, and
-interpolation at the border of a face reads texels outside of it. Each face
-therefore gets a chart. A chart is a copy of the rectangle of old texels that
-the interpolation of the face reads, with ρ' for this face alone. Charts are
-packed in rows of falling height on a sheet, which is the new texture. The
-texture coordinates of the face are moved to its chart. Bilinear interpolation
-then has the old weights and the new values.
+In a texture, neighboring faces with different colors d may share texels. Also,
+bilinear interpolation at the border of a face reads texels outside of the face.
+Each face with a texture therefore gets a chart. The chart of a face is a copy of
+the rectangle of old texels that interpolation reads in this face, with ρ' of
+this face. All charts of an old texture are packed on a sheet, which is the new
+texture, in rows of falling height. The texture coordinates of the face are moved
+to its chart. Bilinear interpolation then has the old weights and the new values.
 
 Positions in a texture are pairs of column and row in texels, from the top left
 corner.
@@ -33,14 +33,16 @@ from renderer.geometry.mesh import Mesh
 from renderer.image import decode, encode, to_bytes
 from renderer.surface.albedo import changed_albedo
 
-# Largest number of texels of a new texture. If charts need more, they get a
-# coarser grid.
+# Approximate limit for the number of texels of a new texture. If the charts would
+# need more texels, `_Charts` reduces their resolution.
 MAX_TEXELS = 2**26
-# Number of texels that are painted at once. It limits the memory.
+# Number of texels that `_TextureSheet.paint` computes at once. It limits the
+# memory.
 BLOCK = 2**20
-# Texels that packing may waste, as a factor for the area of the charts.
+# `_pack` chooses the width of the sheet so that a square sheet has this many
+# times the area of the charts, because packing leaves gaps.
 SHEET_MARGIN = 1.05
-# Eight-bit values of a channel.
+# Number of values of a channel with eight bits.
 CHANNEL_VALUES = 256
 
 
@@ -51,9 +53,10 @@ def with_added_albedo(
     albedo_scale: float = 1.0,
     hue: np.ndarray | None = None,
 ) -> tuple[Mesh, float]:
-    """Return a mesh whose own colors and textures hold a changed albedo.
+    """Return a copy of a mesh whose colors and textures hold a changed albedo.
 
-    New textures have 8 bits per channel and contain the corner colors.
+    New textures have 8 bits per channel. They hold the texture times the corner
+    colors, and faces with a texture get white corners.
 
     Args:
         mesh: Mesh with F faces.
@@ -66,9 +69,9 @@ def with_added_albedo(
     Returns:
         A tuple of
         - the mesh with changed colors and textures;
-        - the albedo scale s' with which it must be rendered. It is at least 1,
-          the largest value in files. It is not larger than the colors need,
-          since it multiplies their rounding errors.
+        - the albedo scale s' with which the new mesh must be rendered. It is 1,
+          or the largest albedo if this is above 1, because files store values up
+          to 1. A larger scale would multiply the rounding errors of the colors.
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     eight_bit_values = torch.arange(CHANNEL_VALUES, dtype=torch.float32) / (CHANNEL_VALUES - 1)
@@ -81,12 +84,13 @@ def with_added_albedo(
         hue=None if hue is None else torch.from_numpy(hue).float(),
     )
 
-    # Faces with a texture get white corners.
+    # Faces with a texture keep these white corners.
     colors = np.ones_like(mesh.corner_colors)
-    untextured = np.flatnonzero(mesh.texture_ids < 0)
-    untextured_albedo = corner_albedo[untextured].flatten(0, 1)
-    painted = painter.paint(untextured_albedo, untextured.repeat(3))
-    colors[untextured] = painted.view(-1, 3, 3).numpy()
+    untextured_faces = np.flatnonzero(mesh.texture_ids < 0)
+    # All corners of these faces, shape (3 · number of faces, 3).
+    untextured_albedo = corner_albedo[untextured_faces].flatten(0, 1)
+    painted = painter.paint(untextured_albedo, untextured_faces.repeat(3))
+    colors[untextured_faces] = painted.view(-1, 3, 3).numpy()
 
     uvs = mesh.corner_uvs.copy()
     textures = []
@@ -109,7 +113,19 @@ def with_added_albedo(
 
 
 def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) -> float:
-    """Return an upper limit of the linear albedo of a mesh."""
+    """Compute an upper bound of the linear albedo of a mesh.
+
+    Args:
+        mesh: Mesh with F faces.
+        corner_albedo: Linear color of the three corners of each face,
+            shape (F, 3, 3).
+        linear_values: Linear value of each 8-bit value of a texture,
+            shape (256,).
+
+    Returns:
+        The largest channel of a corner, times the largest channel of a texel if
+        all faces have a texture.
+    """
     largest_corner = float(corner_albedo.max())
     if not (mesh.texture_ids >= 0).all():
         # A face without a texture has the full corner color.
@@ -122,12 +138,12 @@ def _largest_albedo(mesh: Mesh, corner_albedo: Tensor, linear_values: Tensor) ->
 
 @dataclass(frozen=True)
 class _Painter:
-    """Change of the albedo of F faces.
+    """Change of the albedo of F faces: rotation of the hue, and an added color.
 
     Attributes:
-        encoding: Encoding of the result.
+        encoding: Encoding of the changed albedo, "linear" or "srgb".
         scale: Factor s for the original albedo.
-        new_scale: Scale s' by which the result is divided.
+        new_scale: Number s' by which the changed albedo is divided.
         added: Linear color that is added to each face, float32, shape (F, 3).
         hue: Hue rotation of each face in degrees, float32, shape (F,). None
             leaves the hues unchanged.
@@ -140,45 +156,50 @@ class _Painter:
     hue: Tensor | None
 
     def paint(self, albedo: Tensor, faces: np.ndarray) -> Tensor:
-        """Change albedos and encode them.
+        """Change the albedo at N points, divide it by `new_scale` and encode it.
 
         Args:
-            albedo: Linear albedo of N points, shape (N, 3).
-            faces: Index of the face of each point, shape (N,).
+            albedo: Linear albedo at the points, shape (N, 3).
+            faces: Index of the face on which each point lies, shape (N,).
 
         Returns:
-            Encoded albedo, shape (N, 3).
+            Encoded albedo at the points, shape (N, 3).
         """
-        hue = None if self.hue is None else self.hue[faces]
-        changed = changed_albedo(albedo * self.scale, hue, self.added[faces])
+        hue_at_points = None if self.hue is None else self.hue[faces]
+        changed = changed_albedo(albedo * self.scale, hue_at_points, self.added[faces])
         return encode(changed / self.new_scale, self.encoding)
 
 
 class _TextureSheet:
-    """New texture with one chart for each of the N faces that have an old texture.
+    """New texture that replaces one texture of a mesh, with a chart for each face.
+
+    A chart is the rectangle of the new texture that belongs to one face. N faces
+    of the mesh have the old texture. The new texture has H rows and W columns.
 
     Attributes:
-        charts: Charts of the faces.
-        texture: New texture, uint8, shape (H, W, 3).
-        gloss_texture: New gloss texture, uint8, shape (H, W, 2), or (H, W, 0)
-            if the mesh has none.
+        charts: Charts of the N faces.
+        texture: New texture, uint8, shape (H, W, 3). It is black before `paint`.
+        gloss_texture: New gloss texture, uint8, shape (H, W, 2), or (H, W, 0) if
+            the mesh has no gloss textures. It is 0 before `paint`.
     """
 
     def __init__(self, mesh: Mesh, texture_id: int, faces: np.ndarray) -> None:
-        """Place the charts.
+        """Place the charts of N faces on the new texture.
 
         Args:
             mesh: Mesh with the old texture.
-            texture_id: Index of the old texture.
-            faces: Indices of the faces with this texture, shape (N,).
+            texture_id: Index of the old texture in `mesh.textures`.
+            faces: Indices of the N faces with the old texture, shape (N,).
         """
         self._mesh = mesh
         self._faces = faces
         self._old_texture = mesh.textures[texture_id]
+        # A gloss texture without channels stands for a mesh without gloss textures.
         self._old_gloss_texture = np.zeros((1, 1, 0), dtype=np.uint8)
         if mesh.gloss_textures:
             self._old_gloss_texture = mesh.gloss_textures[texture_id]
-        self._old_size = self._old_texture.shape[1::-1]
+        old_height, old_width, _ = self._old_texture.shape
+        self._old_size = (old_width, old_height)
         self.charts = _Charts(mesh.corner_uvs[faces], self._old_size)
         columns, rows = self.charts.sheet_size
         self.texture = np.zeros((rows, columns, 3), dtype=np.uint8)
@@ -186,49 +207,64 @@ class _TextureSheet:
         self.gloss_texture = np.zeros((rows, columns, gloss_channels), dtype=np.uint8)
 
     def paint(self, painter: _Painter, corner_albedo: Tensor, linear_values: Tensor) -> None:
-        """Fill the new textures.
+        """Fill `texture` with the changed albedo, and `gloss_texture` with the old gloss.
 
         Args:
             painter: Change of the albedo.
-            corner_albedo: Linear albedo of the corners of the N faces,
-                shape (N, 3, 3).
-            linear_values: Linear value of each 8-bit value, shape (256,).
+            corner_albedo: Linear color of the three corners of each of the N
+                faces, shape (N, 3, 3).
+            linear_values: Linear value of each 8-bit value of the old texture,
+                shape (256,).
         """
         block_count = 1 + self.charts.texel_count // BLOCK
         for charts in np.array_split(np.arange(len(self._faces)), block_count):
             texels = self.charts.texels(charts)
             old_position = texels.position / self.charts.scale
-            # The old texture repeats.
+            # The modulo is needed because the old texture repeats.
             old_texel = np.floor(old_position).astype(np.int64) % self._old_size
             old_column, old_row = old_texel.T
             albedo = linear_values[torch.from_numpy(self._old_texture[old_row, old_column]).int()]
             self._multiply_by_colors(albedo, texels, corner_albedo)
-            painted = painter.paint(albedo, self._faces[texels.chart])
+            face_of_texel = self._faces[texels.chart]
+            painted = painter.paint(albedo, face_of_texel)
             column, row = texels.sheet_position.T
             self.texture[row, column] = to_bytes(painted).numpy()
-            # The gloss texture may have another size. The nearest texel is used.
-            gloss_size = self._old_gloss_texture.shape[1::-1]
-            gloss_position = old_position / self._old_size % 1 * gloss_size
+            # The old gloss texture may have another size than the old texture, so
+            # find the gloss texel in which the position lies.
+            gloss_height, gloss_width, _ = self._old_gloss_texture.shape
+            gloss_position = old_position / self._old_size % 1 * (gloss_width, gloss_height)
             gloss_column, gloss_row = gloss_position.astype(np.int64).T
             self.gloss_texture[row, column] = self._old_gloss_texture[gloss_row, gloss_column]
 
     def _multiply_by_colors(self, albedo: Tensor, texels: "_Texels", corner_albedo: Tensor) -> None:
-        """Multiply the albedo of texels (S, 3) by the interpolated corner colors, in place."""
+        """Multiply the albedo of texels by the interpolated corner colors of their faces, in place.
+
+        Args:
+            albedo: Linear albedo of T texels, changed in place, shape (T, 3).
+            texels: The T texels.
+            corner_albedo: Linear color of the three corners of each of the N
+                faces, shape (N, 3, 3).
+        """
         if not self._mesh.one_color_per_face:
+            # Sum over the three corners k, for texels n and channels c.
             weights = torch.from_numpy(self.charts.weights(texels)).float()
             albedo *= torch.einsum("nk,nkc->nc", weights, corner_albedo[texels.chart])
         elif not (self._mesh.corner_colors[self._faces] == 1).all():
+            # The corners of a face have the same color, so take the first corner.
             albedo *= corner_albedo[texels.chart, 0]
 
 
 class _Texels(NamedTuple):
-    """S texels of charts.
+    """T texels of a new texture, and the faces to whose charts they belong.
 
     Attributes:
-        chart: Index of the chart of each texel, shape (S,).
-        sheet_position: Column and row of each texel on the sheet, shape (S, 2).
-        position: Position of the center of each texel in the old texture, in
-            units of new texels, shape (S, 2).
+        chart: Index of the chart of each texel, shape (T,). Chart i belongs to
+            face i of the faces with the texture.
+        sheet_position: Column and row of each texel in the new texture,
+            shape (T, 2).
+        position: Position of the center of each texel in the old texture,
+            shape (T, 2). The unit is a texel of the new texture, which may be
+            larger than a texel of the old texture.
     """
 
     chart: np.ndarray
@@ -237,84 +273,104 @@ class _Texels(NamedTuple):
 
 
 class _Charts:
-    """Charts of N faces on a sheet.
+    """Rectangles (charts) for N faces on a new texture (the sheet).
 
     Attributes:
-        scale: Number of new texels per old texel, along each axis.
+        scale: Number of new texels per old texel along each axis, at most 1.
         sheet_size: Number of columns and rows of the sheet.
-        texel_count: Number of texels of all charts.
-        uvs: Texture coordinates of the corners on the sheet, shape (N, 3, 2).
+        texel_count: Total number of texels of all charts.
+        uvs: Texture coordinates on the sheet of the three corners of each face,
+            shape (N, 3, 2).
     """
 
     def __init__(self, uvs: np.ndarray, old_size: tuple[int, int]) -> None:
-        """Place the charts.
+        """Compute the size of each chart, and place the charts on the sheet.
 
         Args:
-            uvs: Texture coordinates of the corners in the old texture,
-                shape (N, 3, 2).
+            uvs: Texture coordinates in the old texture of the three corners of
+                each face, shape (N, 3, 2).
             old_size: Number of columns and rows of the old texture.
         """
         # v points up, and rows are counted from the top.
         old_positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * old_size
+        # Sum of the areas of the charts, in old texels. Each chart is up to two
+        # texels wider and higher than its face.
         area = (np.ptp(old_positions, axis=1) + 2).prod(axis=1).sum()
         self.scale = min(1.0, np.sqrt(MAX_TEXELS / max(area, 1)))
         # Positions of the corners in units of new texels, shape (N, 3, 2).
         self._positions = old_positions * self.scale
-        # Interpolation reads the texels whose centers surround a position.
-        self._first = np.floor(self._positions.min(axis=1) - 0.5).astype(np.int64)
-        last = np.floor(self._positions.max(axis=1) - 0.5).astype(np.int64) + 1
+        # First and last column and row of each chart, shape (N, 2). Bilinear
+        # interpolation at a position reads the texels whose centers surround it.
+        self._first_texel = np.floor(self._positions.min(axis=1) - 0.5).astype(np.int64)
+        last_texel = np.floor(self._positions.max(axis=1) - 0.5).astype(np.int64) + 1
         # Number of columns and rows of each chart, shape (N, 2).
-        self._size = last + 1 - self._first
-        self._corner, self.sheet_size = _pack(self._size)
+        self._size = last_texel + 1 - self._first_texel
+        # Column and row of the top left texel of each chart on the sheet.
+        self._sheet_corner, self.sheet_size = _pack(self._size)
         self.texel_count = int(self._size.prod(axis=1).sum())
-        on_sheet = self._positions + (self._corner - self._first)[:, None]
-        self.uvs = on_sheet / self.sheet_size * [1, -1] + [0, 1]
+        # Each face moves with its chart.
+        sheet_positions = self._positions + (self._sheet_corner - self._first_texel)[:, None]
+        self.uvs = sheet_positions / self.sheet_size * [1, -1] + [0, 1]
 
     def texels(self, charts: np.ndarray) -> _Texels:
         """List all texels of some charts.
 
         Args:
-            charts: Indices of the charts.
+            charts: Indices of the charts, shape (M,).
 
         Returns:
-            Texels in row-major order, chart by chart.
+            Texels of the first chart in row-major order, then those of the
+            second chart, and so on.
         """
-        counts = self._size[charts].prod(axis=1)
-        chart = np.repeat(charts, counts)
-        texels_before_chart = counts.cumsum() - counts
-        number = np.arange(len(chart)) - np.repeat(texels_before_chart, counts)
-        row, column = np.divmod(number, self._size[chart, 0])
-        in_chart = np.stack([column, row], axis=1)
+        texels_per_chart = self._size[charts].prod(axis=1)
+        chart_of_texel = np.repeat(charts, texels_per_chart)
+        texels_before_chart = texels_per_chart.cumsum() - texels_per_chart
+        # Row-major number of each texel in its chart.
+        all_numbers = np.arange(len(chart_of_texel))
+        number_in_chart = all_numbers - np.repeat(texels_before_chart, texels_per_chart)
+        columns_of_chart = self._size[chart_of_texel, 0]
+        row, column = np.divmod(number_in_chart, columns_of_chart)
+        position_in_chart = np.stack([column, row], axis=1)
         return _Texels(
-            chart=chart,
-            sheet_position=self._corner[chart] + in_chart,
-            position=self._first[chart] + in_chart + 0.5,
+            chart=chart_of_texel,
+            sheet_position=self._sheet_corner[chart_of_texel] + position_in_chart,
+            # The center of a texel is half a texel from its corner.
+            position=self._first_texel[chart_of_texel] + position_in_chart + 0.5,
         )
 
     def weights(self, texels: _Texels) -> np.ndarray:
-        """Compute the barycentric weights of texels in the faces of their charts.
+        """Compute the barycentric weights of T texels in the faces of their charts.
+
+        A texel beside its face gets weights of the border of the face.
 
         Args:
-            texels: S texels.
+            texels: The T texels.
 
         Returns:
-            Weights of the three corners, clipped to the face, shape (S, 3).
+            Weights of the three corners of the face, at least 0, with the sum 1,
+            shape (T, 3).
         """
+        # Vectors from the first corner to the second and the third corner,
+        # shape (N, 2, 2).
         edges = self._positions[:, 1:] - self._positions[:, :1]
-        # A face without area in the texture has only a pseudoinverse.
-        inverse = np.linalg.pinv(edges)
+        # The pseudoinverse also exists if a face has no area in the texture.
+        inverse_edges = np.linalg.pinv(edges)
         from_first_corner = texels.position - self._positions[texels.chart, 0]
-        last_two = np.einsum("ni,nij->nj", from_first_corner, inverse[texels.chart])
-        first = 1 - last_two.sum(axis=1, keepdims=True)
-        weights = np.concatenate([first, last_two], axis=1).clip(min=0)
+        # Weights of the second and the third corner, shape (T, 2).
+        last_weights = np.einsum("ni,nij->nj", from_first_corner, inverse_edges[texels.chart])
+        first_weight = 1 - last_weights.sum(axis=1, keepdims=True)
+        weights = np.concatenate([first_weight, last_weights], axis=1).clip(min=0)
         return weights / weights.sum(axis=1, keepdims=True)
 
 
 def _pack(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """Pack rectangles on a sheet, in rows of falling height.
+    """Pack N rectangles on a sheet that is about square.
+
+    The rectangles are placed from left to right in rows, the highest rectangle
+    first.
 
     Args:
-        sizes: Number of columns and rows of N rectangles, shape (N, 2).
+        sizes: Number of columns and rows of each rectangle, shape (N, 2).
 
     Returns:
         A tuple of
@@ -326,17 +382,18 @@ def _pack(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     widest = int(sizes[:, 0].max(initial=1))
     sheet_width = max(int(np.sqrt(area * SHEET_MARGIN)), widest)
     corners = np.empty_like(sizes)
+    # Position of the next rectangle.
     column = 0
     row = 0
-    # First row below the rectangles so far.
-    next_row = 0
+    # First row below all rectangles that have been placed.
+    free_row = 0
     by_falling_height = np.argsort(-sizes[:, 1], kind="stable")
     for index in by_falling_height:
         width, height = sizes[index]
         if column + width > sheet_width:
             column = 0
-            row = next_row
+            row = free_row
         corners[index] = (column, row)
         column += width
-        next_row = max(next_row, row + height)
-    return corners, (sheet_width, max(next_row, 1))
+        free_row = max(free_row, row + height)
+    return corners, (sheet_width, max(free_row, 1))

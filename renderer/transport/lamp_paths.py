@@ -1,7 +1,12 @@
-"""Light from local sources: which basis function reaches which pixel, and where it is blocked.
+"""Light from lamps and projectors: which samples of a view it reaches, and how bright they are.
 
-A basis function of local light is a lamp or a pixel of a projector's pattern.
-Each sample of a view casts a ray to the sources, which finds shadows.
+A local light is a lamp or a projector. Each lamp, and each pixel of a
+projector's pattern, is one basis function of local light. Its coefficient is
+its RGB power. Each sample of a view casts a ray to each source. A ray that hits
+a face means that the sample is in shadow.
+
+Shapes use these letters: a view has S covered samples in P pixels of a mesh
+with V vertices. A basis has K functions.
 """
 
 from __future__ import annotations
@@ -20,119 +25,147 @@ from renderer.transport.rays import NO_FACE, Rays, Surface
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
 
-# Below this fraction of nonzero entries, multiplying them one by one takes less
-# time than multiplying a dense matrix.
-SPARSE = 1 / 16
-# A dense matrix with at most as many entries is always faster.
-SMALL = 2**16
+# `SparseTransfer.few`: A matrix with a smaller fraction of nonzero entries is
+# faster to multiply entry by entry than as a dense matrix.
+SPARSE_FRACTION = 1 / 16
+# `SparseTransfer.few`: A matrix with at most this many entries is always
+# faster to multiply as a dense matrix.
+SMALL_MATRIX_SIZE = 2**16
 
 
 class SparseTransfer(NamedTuple):
-    """The N nonzero entries of a transfer matrix.
+    """The N nonzero entries of a matrix from light coefficients to pixel radiance.
 
     Attributes:
         function: Index of the basis function of each entry, int64, shape (N,).
-        pixel: Index of the pixel of each entry, int64, shape (N,).
-        weight: Radiance per unit of the function's coefficient, in C = 1 or 3
-            channels, shape (N, C).
+        pixel: Index of the covered pixel of each entry, int64, shape (N,).
+        weight: Radiance of the pixel per unit of the function's coefficient, in
+            C = 1 or 3 color channels, shape (N, C).
     """
 
     function: Tensor
     pixel: Tensor
     weight: Tensor
 
-    def dense(self, pixels: int) -> tuple[Tensor, Tensor]:
-        """Write the entries as a dense matrix.
+    def dense(self, pixel_count: int) -> tuple[Tensor, Tensor]:
+        """Write the entries into a dense matrix.
 
         Args:
-            pixels: Number of pixels, P.
+            pixel_count: Number P of covered pixels.
 
         Returns:
-            The matrix of the K functions that reach a pixel, shape (C, K, P),
-            and the indices of these functions, shape (K,).
+            A tuple of
+            - the matrix of the L functions that have an entry, shape (C, L, P);
+            - the indices of these functions, ascending, shape (L,).
         """
-        functions, row = self.function.unique(return_inverse=True)
-        zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixels)
-        flat = zeros.index_copy_(1, row * pixels + self.pixel, self.weight.T)
-        return flat.unflatten(1, (len(functions), pixels)), functions
+        functions, row_of_entry = self.function.unique(return_inverse=True)
+        # Matrix with both axes flattened into one, shape (C, L · P).
+        zeros = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixel_count)
+        flat_position = row_of_entry * pixel_count + self.pixel
+        flat_matrix = zeros.index_copy_(1, flat_position, self.weight.T)
+        return flat_matrix.unflatten(1, (len(functions), pixel_count)), functions
 
-    def few(self, pixels: int) -> bool:
-        """Return whether multiplying single entries is faster than multiplying `dense`.
+    def few(self, pixel_count: int) -> bool:
+        """Tell whether multiplying entry by entry is faster than multiplying `dense`.
 
         Args:
-            pixels: Number of pixels.
+            pixel_count: Number P of covered pixels.
+
+        Returns:
+            True if entry by entry is faster.
         """
-        dense_size = len(self.function.unique()) * pixels
-        return dense_size > SMALL and len(self.function) < SPARSE * dense_size
+        dense_size = len(self.function.unique()) * pixel_count
+        if dense_size <= SMALL_MATRIX_SIZE:
+            return False
+        return len(self.function) < SPARSE_FRACTION * dense_size
 
     def to(self, device: torch.device | str) -> SparseTransfer:
-        """Return the same entries on another device.
+        """Return a copy of the entries on another device.
 
         Args:
-            device: The device, such as "cuda".
+            device: Device of the copy, such as "cuda".
         """
         return SparseTransfer(*(field.to(device) for field in self))
 
-    def radiance(self, lights: Tensor, image: Tensor, pixels: int) -> Tensor:
-        """Compute the radiance of B images in a light each, differentiable in the lights.
+    def radiance(self, lights: Tensor, image: Tensor, pixel_count: int) -> Tensor:
+        """Compute the radiance of B images, each under a light of its own.
 
-        The entries have three channels.
+        The entries must have three channels. They may belong to several views.
+        The result is differentiable with respect to the lights.
 
         Args:
-            lights: Coefficients, shape (B, size, 3).
-            image: Index of the image of each entry, shape (N,).
-            pixels: Number of pixels of an image, P.
+            lights: Light coefficients of each image, shape (B, K, 3).
+            image: Index of the image to which each entry belongs, shape (N,).
+            pixel_count: Number P of covered pixels of an image.
 
         Returns:
             Radiance, shape (B, 3, P).
         """
-        function_row = image * lights.shape[1] + self.function
-        arriving = lights.flatten(0, 1).index_select(0, function_row) * self.weight
-        pixel_row = image * pixels + self.pixel
-        summed = arriving.new_zeros(len(lights) * pixels, 3).index_add(0, pixel_row, arriving)
-        return summed.unflatten(0, (len(lights), pixels)).mT
+        # Axes are flattened, because selecting along one axis is fastest.
+        light_row = image * lights.shape[1] + self.function
+        contributions = lights.flatten(0, 1).index_select(0, light_row) * self.weight
+        radiance_row = image * pixel_count + self.pixel
+        # Shape (B · P, 3).
+        zeros = contributions.new_zeros(len(lights) * pixel_count, 3)
+        radiance = zeros.index_add(0, radiance_row, contributions)
+        return radiance.unflatten(0, (len(lights), pixel_count)).mT
 
 
 def joined(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
-    """Return the entries of all parts in order, or None without parts."""
+    """Concatenate the entries of several transfer matrices in order.
+
+    Args:
+        parts: Nonzero entries of each matrix.
+
+    Returns:
+        All entries, or None if there is no matrix.
+    """
     if not parts:
         return None
-    return SparseTransfer(*map(torch.cat, zip(*parts, strict=True)))
+    return SparseTransfer(
+        function=torch.cat([part.function for part in parts]),
+        pixel=torch.cat([part.pixel for part in parts]),
+        weight=torch.cat([part.weight for part in parts]),
+    )
 
 
 def local_transfer(
     rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis
 ) -> SparseTransfer:
-    """Compute the transfer matrix of local light in a view.
+    """Compute the matrix from coefficients of local light to the radiance of a view.
 
-    Each sample casts a ray to each source, so shadows are as sharp as the
-    samples of the image.
+    Each sample casts a ray to each source, so the edges of shadows are as sharp
+    as those of the mesh.
 
     Args:
         rays: Rays among the faces of the mesh.
-        surface: Samples of the view.
-        albedo: Linear albedo at the samples, shape (S, C).
-        basis: Basis of the light.
+        surface: Points, normals and gloss at the S samples of the view.
+        albedo: Linear albedo at the samples, shape (S, C), with C = 1 or 3
+            channels.
+        basis: Basis of the local light.
 
     Returns:
-        The nonzero entries, float64.
+        Nonzero entries of the matrix, float64.
 
     Raises:
         InputError: If Embree is not installed.
     """
     fragments = surface.fragments
     paths = unoccluded(rays, basis, surface.points, surface.normals, surface.planes)
+    # Radiance of the sample at the end of each path per unit coefficient, divided
+    # by the number of samples in a pixel.
     weights = _reflectance(surface, albedo, paths) * paths.irradiance[:, None]
     weights = weights / fragments.samples**2
-    # All paths with the same pixel and the same function belong to one entry. The
-    # pair of both is written as one number, which is sorted faster.
-    pair_of_path = fragments.pixel[paths.point] * basis.size + paths.function
-    pairs, entry_of_path = pair_of_path.unique(return_inverse=True)
-    zeros = weights.new_zeros(len(pairs), albedo.shape[1])
+    # Paths with the same pixel and the same basis function are added up into one
+    # entry. Sorting one number for both is faster than sorting pairs.
+    pixel_of_path = fragments.pixel[paths.point]
+    key_of_path = pixel_of_path * basis.size + paths.function
+    keys, path_to_entry = key_of_path.unique(return_inverse=True)
+    zeros = weights.new_zeros(len(keys), albedo.shape[1])
     return SparseTransfer(
-        function=pairs % basis.size,
-        pixel=pairs // basis.size,
-        weight=zeros.index_add_(0, entry_of_path, weights),
+        function=keys % basis.size,
+        pixel=keys // basis.size,
+        weight=zeros.index_add_(0, path_to_entry, weights),
     )
 
 
@@ -143,44 +176,56 @@ def local_radiance(
     light: Tensor,
     fragments: Fragments | None = None,
 ) -> Tensor:
-    """Compute the radiance of a view in local light.
+    """Compute the radiance of a view under local light.
 
-    The result is differentiable in the light, the albedo, the irradiance of the
-    paths and the gloss.
+    The result is differentiable with respect to the light, the albedo, the
+    irradiance of the paths and the gloss.
 
     Args:
-        surface: Samples of the view.
+        surface: Points, normals and gloss at the S samples of the view.
         albedo: Linear albedo at the samples, shape (S, 3).
-        paths: Unoccluded paths from the light to the samples.
-        light: Coefficients, shape (size, 3).
-        fragments: The same samples in other pixels. None for those of the
-            surface.
+        paths: Paths from the sources to the samples that no face blocks.
+        light: Coefficients of the K basis functions, shape (K, 3).
+        fragments: The same samples, grouped into other pixels. None uses
+            `surface.fragments`.
 
     Returns:
-        Radiance of P pixels, weighted with coverage, float64, shape (3, P).
+        Radiance of the P pixels, times their coverage, float64, shape (3, P).
     """
     fragments = fragments or surface.fragments
-    arriving = paths.irradiance[:, None] * light[paths.function]
-    weights = _reflectance(surface, albedo, paths) / fragments.samples**2 * arriving
-    pixel = fragments.pixel[paths.point]
-    return weights.new_zeros(len(fragments.pixels), 3).index_add(0, pixel, weights).T
+    # Irradiance in three channels at the end of each of E paths, shape (E, 3).
+    irradiance = paths.irradiance[:, None] * light[paths.function]
+    radiance = _reflectance(surface, albedo, paths) / fragments.samples**2 * irradiance
+    pixel_of_path = fragments.pixel[paths.point]
+    zeros = radiance.new_zeros(len(fragments.pixels), 3)
+    return zeros.index_add(0, pixel_of_path, radiance).T
 
 
 def _reflectance(surface: Surface, albedo: Tensor, paths: LightPaths) -> Tensor:
-    """Return the reflected radiance per irradiance along E paths, shape (E, C).
+    """Compute the reflected radiance per irradiance at the end of each of E light paths.
 
-    `albedo` (S, C) is given at the samples.
+    Args:
+        surface: Points, normals and gloss at the S samples of the view.
+        albedo: Linear albedo at the samples, shape (S, C).
+        paths: Paths from local lights to samples.
+
+    Returns:
+        Reflected radiance per irradiance, shape (E, C). A matte sample reflects
+        its albedo.
     """
-    point = paths.point
-    path_albedo = albedo[point]
+    sample = paths.point
+    path_albedo = albedo[sample]
     gloss = surface.gloss
     if gloss is None:
         return path_albedo
-    to_light = unit((paths.source - surface.points[point]).T).T
-    normals = surface.normals[point]
-    path_gloss = gloss.at(point)
-    colored, white = path_gloss.along(normals, at_samples(surface.toward, point), to_light)
-    leaving = gloss.diffuse(surface.normals, surface.toward)[point]
+    # `unit` takes the three components along the first axis.
+    to_light = unit((paths.source - surface.points[sample]).T).T
+    normals = surface.normals[sample]
+    path_gloss = gloss.at(sample)
+    # Metals tint the `colored` part of the specular reflection with their albedo.
+    colored, white = path_gloss.along(normals, at_samples(surface.toward, sample), to_light)
+    leaving = gloss.diffuse(surface.normals, surface.toward)[sample]
+    # Light enters the diffuse layer below the coat, and leaves it again.
     diffuse = leaving * path_gloss.entering((normals * to_light).sum(1))
     return path_albedo * (diffuse + colored)[:, None] + white[:, None]
 
@@ -193,46 +238,56 @@ def unoccluded(
     planes: Tensor,
     positions: Tensor | None = None,
 ) -> LightPaths:
-    """Find the paths from a local light to points that no surface blocks.
+    """Find the paths from local lights to surface points that no face blocks.
 
-    A path must also arrive above the plane of the point's face.
+    A path must also arrive above the plane of the face on which the point lies.
 
     Args:
         rays: Rays among the faces of the mesh.
-        basis: Basis of the light.
-        points: Positions, shape (S, 3).
-        normals: Unit normals that the points are shaded with, shape (S, 3).
-        planes: Unit normals of the faces of the points, shape (S, 3).
-        positions: Positions of the lamps, shape (L, 3). None for those of the
-            basis.
+        basis: Basis of the local light.
+        points: Surface points in world axes, shape (S, 3).
+        normals: Unit shading normals at the points, shape (S, 3).
+        planes: Unit normals of the faces on which the points lie, shape (S, 3).
+        positions: Positions to which the L lamps have moved, shape (L, 3). None
+            uses the positions of the basis.
 
     Returns:
-        The paths.
+        Unblocked paths.
     """
     paths = basis.connect(points, normals, positions)
+    # The test whether a path is blocked has no gradient.
     with torch.no_grad():
-        plane = planes[paths.point]
-        origins = points[paths.point] + rays.offset * plane
+        plane_of_path = planes[paths.point]
+        origins = points[paths.point] + rays.offset * plane_of_path
         directions, lengths = unit_vectors((paths.source - origins).T)
-        is_above = (directions.T * plane).sum(1) > 0
-        is_free = is_above & (rays.first_hit(origins, directions.T, lengths) == NO_FACE)
-    return LightPaths(*(field[is_free] for field in paths))
+        is_above_plane = (directions.T * plane_of_path).sum(1) > 0
+        hits_nothing = rays.first_hit(origins, directions.T, lengths) == NO_FACE
+        is_unblocked = is_above_plane & hits_nothing
+    return LightPaths(
+        point=paths.point[is_unblocked],
+        function=paths.function[is_unblocked],
+        source=paths.source[is_unblocked],
+        irradiance=paths.irradiance[is_unblocked],
+    )
 
 
 class LocalLightView:
-    """A view of one shape in local light, for lights that change.
+    """A view of one mesh whose local lights and albedo change between renders.
 
-    It is computed on the CPU, where rays are cast. Rays are cast once for lights
-    that stay in place, and again for lamps that moved. Derivatives hold fixed
-    which lamps, and which pixel of a pattern, reach a sample.
+    All computations run on the CPU, because rays are cast there. For lights that
+    stay in place, rays are cast once. For lamps that move, rays are cast in every
+    render. Derivatives hold fixed which lamps, and which pixels of a projected
+    pattern, light a sample.
 
     Args:
-        rays: Rays among the faces of the shape.
-        mesh: The mesh.
-        fragments: Samples of the view.
+        rays: Rays among the faces of the mesh.
+        mesh: Mesh that the view shows, with V vertices.
+        fragments: Covered samples of the view.
         settings: Settings of the image.
-        vertices: Vertices of the shape, (V, 3). None for those of the mesh.
-        gloss: Gloss of the shape. None for that of the mesh.
+        vertices: Vertex positions to use instead of those of the mesh,
+            shape (V, 3). None uses those of the mesh.
+        gloss: Gloss to use instead of that of the mesh. None uses that of the
+            mesh.
     """
 
     def __init__(
@@ -247,10 +302,12 @@ class LocalLightView:
         self._rays = rays
         vertices = None if vertices is None else vertices.cpu()
         self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)
-        # Rays are cast from these. Derivatives by the vertices pass through them.
+        # Reading these properties computes the points and normals now. They are
+        # differentiable with respect to `vertices`.
         self._points = self._surface.points
         self._normals = self._surface.normals
         self._planes = self._surface.planes
+        # Unblocked paths of lights that stay in place.
         self._fixed_paths: dict[LocalBasis, LightPaths] = {}
 
     def radiance(
@@ -261,20 +318,23 @@ class LocalLightView:
         positions: Tensor | None = None,
         fragments: Fragments | None = None,
     ) -> Tensor:
-        """Compute the radiance, differentiable in all tensors and in the vertices.
+        """Compute the radiance of the view under local light.
+
+        The result is differentiable with respect to all tensors and to the
+        vertices of the view.
 
         Args:
-            basis: Basis of the light.
-            albedo: Linear albedo at the samples, shape (S, 3).
-            light: Coefficients, shape (size, 3).
-            positions: Positions of the lamps, shape (L, 3). None for those of
-                the basis.
-            fragments: The same samples in other pixels. None for those of the
-                view.
+            basis: Basis of the local light.
+            albedo: Linear albedo at the S samples, shape (S, 3).
+            light: Coefficients of the K basis functions, shape (K, 3).
+            positions: Positions to which the L lamps have moved, shape (L, 3).
+                None uses the positions of the basis.
+            fragments: The same samples, grouped into other pixels. None uses
+                those of the view.
 
         Returns:
-            Radiance of P pixels, weighted with coverage, shape (3, P), in the
-            dtype and on the device of the light.
+            Radiance of the P pixels, times their coverage, in the dtype and on
+            the device of the light, shape (3, P).
         """
         fragments = None if fragments is None else fragments.to("cpu")
         if basis.is_movable and positions is not None:
@@ -289,5 +349,14 @@ class LocalLightView:
         return radiance.to(light)
 
     def _find_paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
-        """Return the unoccluded paths for lamps at given positions (L, 3)."""
+        """Find the unblocked paths from local lights to the samples of the view.
+
+        Args:
+            basis: Basis of the local light.
+            positions: Positions of the L lamps, float64, shape (L, 3). None uses
+                the positions of the basis.
+
+        Returns:
+            Unblocked paths.
+        """
         return unoccluded(self._rays, basis, self._points, self._normals, self._planes, positions)

@@ -20,21 +20,24 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Total number of pixels of the images in one stack. Larger stacks are not faster.
+# `TransferOperators` puts operators into one stack until their images have this
+# many pixels in total. Larger stacks are not faster.
 STACKED = 2**16
-# `TransferOperators` uses a loop over operators if a stack would hold fewer,
-# which is faster then.
+# `TransferOperators` renders view by view if a stack would hold fewer operators
+# than this. A loop over the operators is then faster than a batched product.
 FEWEST = 8
-# Rows of a canvas, as a slice or as indices.
+# Type of the first index of `canvas[rows]`, which selects images of a canvas.
 Rows = slice | Tensor
+# Number of color channels.
 COLORS = 3
 
 
 class TransferOperators(Sequence[TransferOperator]):
-    """The transfer operators of V views, which also renders all views in one call.
+    """Sequence of the transfer operators of V views, which can render all views in one call.
 
-    The first call of `image` copies the operators of small images into stacks,
-    which take about as much memory again.
+    For small images, the first call of `image` copies the operators into
+    common tensors, called stacks. The stacks take about as much memory as the
+    operators.
 
     Example:
         >>> import torch
@@ -55,21 +58,23 @@ class TransferOperators(Sequence[TransferOperator]):
         """Collect operators.
 
         Args:
-            operators: At least one operator. All need the same image settings,
-                basis of light and dtype.
+            operators: One or more operators. All operators must have the same
+                image settings, basis of light and dtype.
 
         Raises:
-            InputError: If there is no operator, or one differs from the first.
+            InputError: If there is no operator, or if an operator differs from
+                the first one in settings, basis or dtype.
         """
         self._operators = list(operators)
         if not self._operators:
-            raise InputError("operators is empty: give one operator or several")
+            raise InputError("operators is empty: give at least one TransferOperator")
         first = self._operators[0]
         for operator in self._operators:
             is_same = operator.settings == first.settings and operator.basis == first.basis
             if not is_same or operator.transfer.dtype != first.transfer.dtype:
                 raise InputError(
-                    "operators differ in image settings, basis of light or dtype: give equal ones"
+                    "operators differ in image settings, basis of light or dtype: compute all "
+                    "operators with the same settings, basis and dtype"
                 )
 
     @overload
@@ -79,23 +84,27 @@ class TransferOperators(Sequence[TransferOperator]):
     def __getitem__(self, index: slice) -> TransferOperators: ...
 
     def __getitem__(self, index: int | slice) -> TransferOperator | TransferOperators:
-        """Return the operator of one view, or the operators of several views."""
-        chosen = self._operators[index]
-        return TransferOperators(chosen) if isinstance(chosen, list) else chosen
+        """Return the operator of one view for an integer, or a `TransferOperators` for a slice."""
+        selected = self._operators[index]
+        return TransferOperators(selected) if isinstance(selected, list) else selected
 
     def __len__(self) -> int:
         """Return the number of views, V."""
         return len(self._operators)
 
     def __add__(self, others: Iterable[TransferOperator]) -> list[TransferOperator]:
-        """Return a list of these operators and of others, which may have other settings."""
+        """Concatenate these operators and other operators to a list.
+
+        The result is a list, because the other operators may have other
+        settings.
+        """
         return [*self, *others]
 
     def to(self, device: torch.device | str) -> TransferOperators:
-        """Return the same operators on another device.
+        """Return a copy of the operators on another device.
 
         Args:
-            device: The device, such as "cuda".
+            device: Device of the copy, such as "cuda".
         """
         return TransferOperators(operator.to(device) for operator in self)
 
@@ -106,43 +115,49 @@ class TransferOperators(Sequence[TransferOperator]):
         *,
         light_per_view: bool = False,
     ) -> Float[Tensor, "V *lights 3 size size"]:
-        """Render all views under B lights, differentiable in the lights and in the background.
+        """Render all V views under one or more lights.
 
-        The images equal those of the single operators up to rounding.
+        The result is differentiable with respect to the lights and the
+        background. The images equal those of `TransferOperator.image` up to
+        rounding.
 
         Args:
-            lights: Coefficients, shape (..., coefficients, 3). Every view is
-                rendered under every light.
+            lights: Coefficients of the lights, shape (..., coefficients, 3).
+                Every view is rendered under every light.
             background: Gray value, color, or images in [0, 1] that broadcast to
                 (V, ..., 3, size, size).
-            light_per_view: Whether each view has its own lights. Their shape is
-                then (V, ..., coefficients, 3).
+            light_per_view: True if each view has its own lights. The lights then
+                have the shape (V, ..., coefficients, 3).
 
         Returns:
             Images in [0, 1], shape (V, ..., 3, size, size).
 
         Raises:
-            InputError: If the lights hold NaN, have another basis or are not one
-                per view, or if the background has another shape.
+            InputError: If `lights` has NaN, or another number of coefficients
+                than the basis. If `light_per_view` is true and the first axis of
+                `lights` is not V. If `background` does not broadcast to the
+                images.
         """
         first = self._operators[0]
         lights = as_tensor("lights", lights)
         first.require_lights(lights)
         if light_per_view and (lights.ndim < 3 or len(lights) != len(self)):
             raise InputError(
-                f"lights of shape {tuple(lights.shape)} are not one per view: "
-                f"give ({len(self)}, ..., {first.basis.size}, 3)"
+                f"lights has shape {tuple(lights.shape)}, but light_per_view=True needs the shape "
+                f"({len(self)}, ..., {first.basis.size}, 3) for {len(self)} views"
             )
-        of_views = lights if light_per_view else lights.expand(len(self), *lights.shape)
+        # Shape (V, ..., coefficients, 3).
+        view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
         size = first.settings.size
-        image_shape = (*of_views.shape[:-2], COLORS, size, size)
+        image_shape = (*view_lights.shape[:-2], COLORS, size, size)
         background_images = as_background(background, size, lights)
         if background_images.ndim > 3:
             background_images = _broadcast_background(background_images, image_shape)
-        stack_size = min(len(self), self._per_stack)
-        if stack_size < FEWEST or background_images.requires_grad:
-            return self._image_by_image(of_views, background_images)
-        return self._stacked_images(of_views, background_images, image_shape)
+        operators_in_stack = min(len(self), self._operators_per_stack)
+        # The gradient by the background is only available image by image.
+        if operators_in_stack < FEWEST or background_images.requires_grad:
+            return self._image_by_image(view_lights, background_images)
+        return self._stacked_images(view_lights, background_images, image_shape)
 
     def image_and_gradient(
         self,
@@ -152,156 +167,215 @@ class TransferOperators(Sequence[TransferOperator]):
         *,
         light_per_view: bool = False,
     ) -> tuple[Float[Tensor, "V *lights 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
-        """Render all views under B lights and compute the gradient of a loss by the lights.
+        """Render all V views, and compute the gradient of a loss with respect to the lights.
 
         Args:
-            lights: Coefficients, as for `image`.
-            loss_gradient: Function of the images, shape (V, ..., 3, size, size).
-                It returns the gradient of the loss by the images, of the same
-                shape. `torch.func.grad(loss)` makes such a function from a loss.
-            background: Background, as for `image`.
-            light_per_view: Whether each view has its own lights, as for `image`.
+            lights: Coefficients of the lights, see `image`.
+            loss_gradient: Function that takes the images, shape
+                (V, ..., 3, size, size), and returns the gradient of the loss
+                with respect to the images, in the same shape.
+                `torch.func.grad(loss)` makes such a function from a loss.
+            background: Background of the images, see `image`.
+            light_per_view: True if each view has its own lights, see `image`.
 
         Returns:
-            The images, and the gradient of the loss by the lights, with the
-            shape of the lights.
+            A tuple of
+            - the images in [0, 1], shape (V, ..., 3, size, size);
+            - the gradient of the loss with respect to the lights, in the shape
+              of `lights`.
 
         Raises:
-            InputError: See `image`. Also if the gradient of the loss has
-                another shape than the images.
+            InputError: If `image` raises it, or if the result of
+                `loss_gradient` has another shape than the images.
         """
         lights = as_tensor("lights", lights)
         self._operators[0].require_lights(lights)
-        variable = lights.detach().requires_grad_()
+        variable_lights = lights.detach().requires_grad_()
         with torch.enable_grad():
-            images = self.image(variable, background, light_per_view=light_per_view)
-        shown = images.detach()
-        image_gradient = loss_gradient(shown)
-        require_image_gradient(image_gradient, shown)
-        [gradient] = torch.autograd.grad(images, variable, image_gradient.detach())
-        return shown, gradient
+            images = self.image(variable_lights, background, light_per_view=light_per_view)
+        detached_images = images.detach()
+        image_gradient = loss_gradient(detached_images)
+        require_image_gradient(image_gradient, detached_images)
+        [gradient] = torch.autograd.grad(images, variable_lights, image_gradient.detach())
+        return detached_images, gradient
 
     @property
-    def _per_stack(self) -> int:
-        """Return how many operators one stack holds."""
-        return max(1, STACKED // self._operators[0].settings.size ** 2)
+    def _operators_per_stack(self) -> int:
+        """Number of operators in a full stack. The last stack may hold fewer."""
+        pixels_per_image = self._operators[0].settings.size ** 2
+        return max(1, STACKED // pixels_per_image)
 
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
-        """Return all operators in stacks, on the device of the operators."""
+        """All operators in stacks of at most `_operators_per_stack`, on their device."""
         device = self._operators[0].transfer.device
         stacks = []
-        for start in range(0, len(self), self._per_stack):
-            operators = self._operators[start : start + self._per_stack]
-            stacks.append(OperatorStack(operators, torch.arange(len(operators)), device))
+        for start in range(0, len(self), self._operators_per_stack):
+            operators = self._operators[start : start + self._operators_per_stack]
+            # In this stack, image i shows operator i.
+            operator_of_image = torch.arange(len(operators))
+            stacks.append(OperatorStack(operators, operator_of_image, device))
         return stacks
 
     def _image_by_image(self, lights: Tensor, background: Tensor) -> Tensor:
-        """Render lights (V, ..., coefficients, 3), one operator after the other.
+        """Render all V views in a loop over the operators.
 
-        The background has the shape (3, size, size) or that of the images.
+        Args:
+            lights: Lights of each view, shape (V, ..., coefficients, 3).
+            background: One background image, shape (3, size, size), or one for
+                each image, shape (V, ..., 3, size, size).
+
+        Returns:
+            Images in [0, 1], shape (V, ..., 3, size, size).
         """
         size = self._operators[0].settings.size
         if background.ndim == 3:
             background = background.expand(len(self), COLORS, size, size)
-        views = zip(self, lights, background, strict=True)
-        return torch.stack([operator.image(light, behind) for operator, light, behind in views])
+        images_by_view = []
+        for operator, view_lights, view_background in zip(self, lights, background, strict=True):
+            images_by_view.append(operator.image(view_lights, view_background))
+        return torch.stack(images_by_view)
 
     def _stacked_images(
-        self, of_views: Tensor, background: Tensor, image_shape: Sequence[int]
+        self, view_lights: Tensor, background: Tensor, image_shape: Sequence[int]
     ) -> Tensor:
-        """Render lights (V, ..., coefficients, 3), one stack of operators after the other.
+        """Render all V views, with one batched matrix product for each stack of operators.
 
-        The background has the shape (3, size, size) or that of the images.
+        Args:
+            view_lights: Lights of each view, shape (V, ..., coefficients, 3).
+            background: One background image, shape (3, size, size), or one for
+                each image, shape (V, ..., 3, size, size).
+            image_shape: Shape of the result, (V, ..., 3, size, size).
+
+        Returns:
+            Images in [0, 1], shape (V, ..., 3, size, size).
         """
         encoding = self._operators[0].settings.encoding
-        lights = of_views.flatten(0, -3).to(self._operators[0].transfer.dtype)
+        # One light for each of N images, all images of the first view first,
+        # shape (N, coefficients, 3).
+        lights = view_lights.flatten(0, -3).to(self._operators[0].transfer.dtype)
         lights_per_view = len(lights) // len(self)
-        # One background, or one for each image: shape (1 or N, 3, size²).
+        # Shape (1, 3, size²) for one background, or (N, 3, size²).
         backgrounds = background.reshape(-1, COLORS, image_shape[-1] ** 2)
-        first_row = 0
+        first_image = 0
         targets = []
-        covered = []
+        covered_values = []
         for stack in self._stacks:
-            # This is the index in the stack of the operator that each image shows.
-            shown = torch.arange(len(stack.shown)).repeat_interleave(lights_per_view)
-            rows = slice(first_row, first_row + len(shown))
-            first_row = rows.stop
-            of_stack = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
-            # torch selects ten times as fast from two axes as from three.
-            at_pixels = of_stack.flatten(0, 1).index_select(1, stack.pixels)
-            coverage = stack.coverage[shown.to(background.device)].to(background)
-            term = background_term(coverage, at_pixels.unflatten(0, (-1, COLORS)), encoding)
-            radiance = stack.radiance(lights[rows], shown).to(background.dtype)
+            # Index in the stack of the operator that each image of the stack shows.
+            operator_count = len(stack.shown)
+            operator_of_image = torch.arange(operator_count).repeat_interleave(lights_per_view)
+            rows = slice(first_image, first_image + len(operator_of_image))
+            first_image = rows.stop
+            stack_backgrounds = backgrounds if len(backgrounds) == 1 else backgrounds[rows]
+            # torch selects from a 2-D tensor ten times as fast as from a 3-D tensor.
+            at_pixels = stack_backgrounds.flatten(0, 1).index_select(1, stack.pixels)
+            at_pixels = at_pixels.unflatten(0, (-1, COLORS))
+            coverage = stack.coverage[operator_of_image.to(background.device)].to(background)
+            # Linear background, times the part of each pixel that shows no mesh.
+            behind = background_term(coverage, at_pixels, encoding)
+            radiance = stack.radiance(lights[rows], operator_of_image).to(background.dtype)
             targets.append((rows, stack.pixels))
-            covered.append(encode(clamp(radiance + term), encoding))
+            covered_values.append(encode(clamp(radiance + behind), encoding))
         canvas = backgrounds.expand(len(lights), -1, -1)
         canvas = canvas.clone(memory_format=torch.contiguous_format)
-        return ScatterLayers.apply(canvas, targets, *covered).view(image_shape)
+        # The background stays in the pixels that no operator of a stack covers.
+        return ScatterLayers.apply(canvas, targets, *covered_values).view(image_shape)
 
 
 def _broadcast_background(images: Tensor, shape: Sequence[int]) -> Tensor:
-    """Broadcast background images to (V, ..., 3, size, size), or raise `InputError`."""
+    """Broadcast background images to the shape of the rendered images.
+
+    Args:
+        images: Background images, shape (..., 3, size, size).
+        shape: Shape of the rendered images, (V, ..., 3, size, size).
+
+    Returns:
+        View of `images` with the given shape.
+
+    Raises:
+        InputError: If `images` does not broadcast to the shape.
+    """
     try:
         return images.expand(shape)
     except RuntimeError as error:
         given = tuple(images.shape)
         raise InputError(
-            f"background of shape {given} does not broadcast to {tuple(shape)}: "
-            "give one image, or one per view and light"
+            f"background of shape {given} does not broadcast to the images {tuple(shape)}: "
+            "give one background image, or one per view and light"
         ) from error
 
 
 class ScatterLayers(torch.autograd.Function):
-    """Write layers of pixel values into images, in place.
+    """Overwrite pixels of a batch of images in place, differentiable in the new values.
 
-    Its arguments are a canvas (N, 3, size²), and for each layer its target and
-    its values. A target is a pair of the rows of the canvas (B,) and the pixels
-    (P,). The values have the shape (B, 3, P). The result is the canvas, and is
-    differentiable in the values alone.
+    A layer is a set of new pixel values for some of the N images. Its target is
+    a pair of the images (rows of the batch) and the pixels that are overwritten.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor
+        ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *layers: Tensor
     ) -> Tensor:
+        """Write the values of all layers into the images.
+
+        Args:
+            ctx: Context of autograd.
+            canvas: Images, changed in place, shape (N, 3, size²).
+            targets: For each layer, a slice or indices of the B images, shape
+                (B,), and the row-major indices of the P pixels, shape (P,).
+            layers: For each layer, the new values, shape (B, 3, P).
+
+        Returns:
+            The changed `canvas`.
+        """
         ctx.targets = targets
-        for (rows, pixels), values in zip(targets, covered, strict=True):
-            # index_copy_ takes twice as long as scatter_ on a CPU.
+        for (rows, pixels), values in zip(targets, layers, strict=True):
+            # On a CPU, scatter_ takes half the time of index_copy_.
             images = canvas[rows].scatter_(2, pixels.expand(values.shape), values)
             if isinstance(rows, Tensor):
-                # Indexing with a tensor copies the rows, so write them back.
+                # Indexing with a tensor copies the images, so write them back.
                 canvas.index_copy_(0, rows, images)
         return canvas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Select the gradients of the overwritten pixels.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the images, shape (N, 3, size²).
+
+        Returns:
+            None for the canvas and for the targets, and the gradient by the
+            values of each layer, shape (B, 3, P).
+        """
         gradients = []
         for rows, pixels in ctx.targets:
-            # torch selects ten times as fast from two axes as from three.
-            values = upstream[rows].flatten(0, 1).index_select(1, pixels)
-            gradients.append(values.unflatten(0, (-1, COLORS)))
+            # torch selects from a 2-D tensor ten times as fast as from a 3-D tensor.
+            layer_gradient = upstream[rows].flatten(0, 1).index_select(1, pixels)
+            gradients.append(layer_gradient.unflatten(0, (-1, COLORS)))
         return None, None, *gradients
 
 
 class OperatorStack:
-    """O transfer operators over a common set of P pixels and K coefficients.
+    """Copies of O transfer operators in common tensors, for products in one batch.
 
-    N images show one of the operators each, under their own light.
+    The tensors have the P pixels that any of the operators covers, and the K
+    coefficients that any of the operators uses. N images are rendered with the
+    stack. Each image shows one of the operators under a light of its own.
 
     Attributes:
         shown: Index of the operator that each image shows, int64, shape (N,), on
             the CPU.
-        pixels: Ascending indices of the pixels that any of the operators covers,
-            int64, shape (P,).
-        transfer: Dense transfer of the coefficients that are nonzero in any of
-            the operators, shape (O, 1 to 3, K, P). If their number is odd, a row
-            of zeros follows. With 32 rows instead of 31, the product of the
-            gradient takes half the time.
+        pixels: Row-major indices of the P pixels, ascending, int64, shape (P,).
+        transfer: Radiance per unit of each coefficient, in C = 1 to 3 channels,
+            shape (O, C, K, P). A row of zeros is appended if K would be odd,
+            because the gradient is computed in half the time with K = 32 instead
+            of 31.
         albedo: Albedo of each operator, shape (O, 3, P). It is 1 in pixels that
             the operator does not cover.
-        coverage: Coverage of each operator, shape (O, 1, P).
+        coverage: Fraction of each pixel that the mesh covers, shape (O, 1, P).
     """
 
     def __init__(
@@ -313,14 +387,16 @@ class OperatorStack:
         """Copy operators into common tensors.
 
         Args:
-            operators: The O operators, on the CPU. All need the same dtype and
-                basis.
-            shown: Index of the operator of each image, int64, shape (N,).
+            operators: The O operators, on the CPU. All operators must have the
+                same dtype and basis of light.
+            shown: Index of the operator that each image shows, int64,
+                shape (N,).
             device: Device of the stack.
         """
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
-        # The appended row of zeros multiplies an arbitrary coefficient.
+        # Padding appends the coefficient 0 if their number is odd. The row of this
+        # coefficient in `transfer` stays zero.
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
         channel_count = max(len(operator.transfer) for operator in operators)
         like = operators[0].transfer
@@ -331,6 +407,7 @@ class OperatorStack:
         sparse_parts: list[SparseTransfer] = []
         entry_counts = []
         for index, operator in enumerate(operators):
+            # Where the operator's coefficients and pixels are in the common tensors.
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
             if channel_count < COLORS:
@@ -338,16 +415,17 @@ class OperatorStack:
                 channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:
+                # Operators with fewer channels are written with three channels,
+                # which contain the albedo.
                 transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             if operator.sparse is not None:
-                in_stack = columns[operator.sparse.pixel]
-                sparse_parts.append(operator.sparse._replace(pixel=in_stack))
+                stack_pixel = columns[operator.sparse.pixel]
+                sparse_parts.append(operator.sparse._replace(pixel=stack_pixel))
             entry_counts.append(0 if operator.sparse is None else len(operator.sparse.function))
         sparse = joined(sparse_parts)
         self._sparse = sparse and sparse.to(device)
-        # The sparse entries of operator i are those from _first_entry[i] to
-        # _first_entry[i + 1].
+        # The sparse entries of operator i are _first_entry[i] to _first_entry[i + 1] - 1.
         self._first_entry = F.pad(torch.tensor(entry_counts).cumsum(0), (1, 0))
         self.shown = shown
         self.pixels = pixels.to(device)
@@ -357,66 +435,96 @@ class OperatorStack:
         self._coefficients = coefficients.to(device)
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Compute the linear radiance of some images, differentiable in their lights.
+        """Compute the linear radiance of A of the N images, differentiable in their lights.
 
         Args:
-            lights: Light of each image, shape (A, size, 3).
-            images: Indices of the images, int64, shape (A,), on the CPU.
+            lights: All light coefficients of each of the A images,
+                shape (A, coefficients, 3).
+            images: Indices of the A images, int64, shape (A,), on the CPU.
 
         Returns:
-            Radiance, shape (A, 3, P).
+            Radiance of the P pixels, shape (A, 3, P).
         """
-        # The lights are laid out on a grid with a row for each operator and a
-        # slot for each of its images. Some slots stay empty if one operator is
-        # shown by fewer images than another.
-        shown = self.shown[images]
-        operators, row, counts = torch.unique(shown, return_inverse=True, return_counts=True)
-        slot_count = max(counts.tolist(), default=0)
-        cell = row * slot_count + _rank_in_row(row, counts)
+        # A batched product needs the same number of lights for each operator. The
+        # lights are therefore put on a grid with one row for each operator and one
+        # slot for each of its images. Slots stay empty if an operator is shown by
+        # fewer images than another operator.
+        operator_of_image = self.shown[images]
+        operators, image_to_row, images_per_row = torch.unique(
+            operator_of_image, return_inverse=True, return_counts=True
+        )
+        slot_count = max(images_per_row.tolist(), default=0)
+        slot_of_image = _rank_in_row(image_to_row, images_per_row)
+        # Row-major position of each image on the grid, shape (A,).
+        cell = image_to_row * slot_count + slot_of_image
         has_gaps = len(cell) != len(operators) * slot_count
         is_ordered = not has_gaps and bool((cell.diff() == 1).all())
         operators = operators.to(lights.device, non_blocking=True)
         cell = cell.to(lights.device, non_blocking=True)
-        nonzero = lights.index_select(1, self._coefficients)
-        grid = nonzero.new_zeros(len(operators) * slot_count, *nonzero.shape[1:])
-        grid = grid.index_copy(0, cell, nonzero).unflatten(0, (len(operators), slot_count))
-        is_complete = len(operators) == len(self.transfer)
-        transfer = self.transfer if is_complete else self.transfer[operators]
-        albedo = self.albedo if is_complete else self.albedo[operators]
-        radiance = apply_transfer(grid, transfer, albedo).flatten(0, 1)
+        # Coefficients that the stack uses, shape (A, K, 3).
+        used_lights = lights.index_select(1, self._coefficients)
+        light_grid = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
+        light_grid = light_grid.index_copy(0, cell, used_lights)
+        # Shape (shown operators, slots, K, 3).
+        light_grid = light_grid.unflatten(0, (len(operators), slot_count))
+        shows_all_operators = len(operators) == len(self.transfer)
+        transfer = self.transfer if shows_all_operators else self.transfer[operators]
+        albedo = self.albedo if shows_all_operators else self.albedo[operators]
+        # Shape (shown operators · slots, 3, P).
+        radiance = apply_transfer(light_grid, transfer, albedo).flatten(0, 1)
         if not is_ordered:
             radiance = radiance.index_select(0, cell)
         if self._sparse is None:
             return radiance
-        entries, image = self._entries(self._sparse, shown)
-        return radiance + entries.radiance(lights, image, len(self.pixels))
+        entries, image_of_entry = self._select_entries(self._sparse, operator_of_image)
+        return radiance + entries.radiance(lights, image_of_entry, len(self.pixels))
 
-    def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
-        """Return the sparse entries of operators (A,), one after the other.
+    def _select_entries(
+        self, sparse: SparseTransfer, operator_of_image: Tensor
+    ) -> tuple[SparseTransfer, Tensor]:
+        """Select the sparse entries of the operators that A images show.
 
-        The second result is the position in `shown` of each entry.
+        Args:
+            sparse: Sparse entries of all operators of the stack.
+            operator_of_image: Index of the operator of each image, int64,
+                shape (A,), on the CPU.
+
+        Returns:
+            A tuple of
+            - E entries, those of the first image first. The entries of an
+              operator are repeated for each image that shows it;
+            - the index of the image of each entry, from 0 to A - 1, int64,
+              shape (E,).
         """
-        first = self._first_entry[shown]
-        count = self._first_entry[shown + 1] - first
-        image = torch.arange(len(shown)).repeat_interleave(count)
-        # The entries of an image are consecutive in the result and in the stack.
-        # The offset leads from their positions in the result to those in the stack.
-        first_in_result = count.cumsum(0) - count
-        offset = first - first_in_result
-        entry = torch.arange(len(image)) + offset[image]
-        entry = entry.to(self.pixels.device, non_blocking=True)
-        image = image.to(self.pixels.device, non_blocking=True)
-        return SparseTransfer(*(field[entry] for field in sparse)), image
+        first_in_stack = self._first_entry[operator_of_image]
+        entry_count = self._first_entry[operator_of_image + 1] - first_in_stack
+        image_of_entry = torch.arange(len(operator_of_image)).repeat_interleave(entry_count)
+        # The entries of an image are consecutive in `sparse` and in the result, so
+        # the two positions of an entry differ by the same number for all of them.
+        first_in_result = entry_count.cumsum(0) - entry_count
+        offset_of_image = first_in_stack - first_in_result
+        position_in_stack = torch.arange(len(image_of_entry)) + offset_of_image[image_of_entry]
+        position_in_stack = position_in_stack.to(self.pixels.device, non_blocking=True)
+        image_of_entry = image_of_entry.to(self.pixels.device, non_blocking=True)
+        selected = SparseTransfer(*(field[position_in_stack] for field in sparse))
+        return selected, image_of_entry
 
 
-def _rank_in_row(row: Tensor, counts: Tensor) -> Tensor:
-    """Return for each item how many earlier items have the same row, shape (A,).
+def _rank_in_row(item_to_row: Tensor, items_per_row: Tensor) -> Tensor:
+    """Count, for each of A items, the earlier items in the same row.
 
-    `row` (A,) is the row of each item, and `counts` the number of items of each
-    row. For example, the rows 1, 0, 1 give 0, 0, 1.
+    For example, items in the rows 1, 0, 1 have the ranks 0, 0, 1.
+
+    Args:
+        item_to_row: Row of each item, int64, shape (A,).
+        items_per_row: Number of items of each row, int64, shape (rows,).
+
+    Returns:
+        Rank of each item in its row, from 0, int64, shape (A,).
     """
-    # The items of a row are neighbors in this order, earlier items first.
-    order = row.argsort(stable=True)
-    first_in_order = counts.cumsum(0) - counts
-    rank_in_order = torch.arange(len(row)) - first_in_order[row[order]]
-    return torch.empty_like(row).index_copy_(0, order, rank_in_order)
+    # Sorted by row, the items of a row are next to each other, in their old order.
+    sorted_items = item_to_row.argsort(stable=True)
+    first_of_row = items_per_row.cumsum(0) - items_per_row
+    sorted_ranks = torch.arange(len(item_to_row)) - first_of_row[item_to_row[sorted_items]]
+    # Write the ranks back in the original order of the items.
+    return torch.empty_like(item_to_row).index_copy_(0, sorted_items, sorted_ranks)

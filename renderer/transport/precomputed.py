@@ -1,26 +1,29 @@
 """Shadows and bounces of environment light, by precomputed radiance transfer.
 
 The source is Sloan, Kautz and Snyder 2002. The transfer of a pixel is its
-radiance per unit of each SH coefficient of the light. It has three parts: the
-transfer under an open sky, which has a closed form; minus the light from
-directions that the mesh blocks; plus the light that the surface in these
-directions reflects.
+radiance per unit of each SH coefficient of the light. The transfer has three
+parts:
+
+- the transfer under an open sky, which has a closed form;
+- minus the light from the directions that the mesh blocks;
+- plus the light that the surfaces in these directions reflect.
 
 The reflected light is found by radiosity (Goral et al. 1984), for each
 coefficient of the light. The surface is divided into N patches. Patch i with
-albedo ρ_i sends the radiance B_i (size,) per unit of each coefficient:
+albedo ρ_i sends the radiance B_i per unit of each of the K coefficients:
 
     B_i = ρ_i / π (S_i + Σ_j F_ij B_j).
 
-S_i (size,) is the irradiance from the part of the sky that the patch sees. F_ij
-is the irradiance of patch i per unit radiance of patch j: the solid angle of j
-times the cosine, found by rays. Both depend on the shape alone, so B is linear
-in the light. One bounce is B = ρ S / π, and each further bounce substitutes B
-on the right. A pixel receives Σ_j F_pixel,j B_j.
+S_i is the irradiance of patch i from the part of the sky that the patch sees.
+F_ij is the irradiance of patch i per unit radiance of patch j: the solid angle
+of patch j times the cosine, found by rays. S and F depend on the shape alone,
+so B is linear in the light. One bounce is B = ρ S / π. Each further bounce
+inserts B on the right-hand side. A pixel receives Σ_j F_pixel,j B_j.
 
-A patch is one side of several small faces that lie in one cell of a grid and
-face the same way, or of a piece of a large face. Its S and F are those of a
-pixel that shows the patch alone, so `rays` computes both.
+A patch consists of sides of faces. Small faces share a patch if they lie in one
+cell of a grid and face the same way. Large faces are first divided into pieces.
+S and F of a patch are computed like those of a pixel that shows only this
+patch, with the rays of `renderer.transport.rays`.
 """
 
 import math
@@ -42,144 +45,195 @@ from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
 from renderer.visibility.fragments import Fragments
 
-# Directions of rays from a patch, over the whole sphere.
+# Number of ray directions from each patch. They cover the whole sphere.
 PATCH_DIRECTIONS = 2**9
-# The area of a patch is about the area of the mesh divided by this number.
+# `Patches` divides a mesh into patches of about 1 / PATCHES of its area.
 PATCHES = 2**11
-# Projected corners of a triangle around the center of an image, in which each
-# piece of a patch is seen.
+# Corners (x, y) of a triangle that surrounds the center of an image. `Patches`
+# pretends that each piece of the mesh covers this triangle in the image, so that
+# the sample at the image center shows the center of the piece.
 AROUND_CENTER = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]
+# Values of `Fragments.facing` for the front and the back of a face.
 FRONT = 1.0
 BACK = -1.0
 
 
 @dataclass(frozen=True)
 class Patches:
-    """The N patches of a mesh, which are made of the sides of its F pieces.
+    """Division of the surface of a mesh into N patches.
 
-    A closed mesh has S = F sides, since its backs are never seen. Any other mesh
-    has S = 2 F sides.
+    The large faces of the mesh are first divided, which gives a mesh of F small
+    faces, called pieces. A patch is a group of sides of pieces. A closed mesh
+    has S = F sides, because only the fronts of its faces can be seen. Any other
+    mesh has S = 2 F sides, the fronts and the backs.
 
     Attributes:
-        pieces: The mesh after large faces were divided into pieces.
-        view: A view with a pixel for each patch, and a sample at the center of
-            each side of a piece in it.
-        fractions: Area of the piece of each sample, divided by the area of its
-            patch, shape (S, 1).
-        of_side: Patches of the front and of the back of each piece, shape (2, F).
+        pieces: Mesh of the F pieces.
+        view: Artificial view that has one pixel for each patch, and one sample
+            for each side of a piece. The sample shows the center of the piece
+            and belongs to the pixel of its patch.
+        fractions: Area of the piece that each sample shows, divided by the area
+            of its patch, shape (S, 1).
+        patch_of_side: Index of the patch of the front (row 0) and of the back
+            (row 1) of each piece, int64, shape (2, F). Both rows are equal for
+            a closed mesh.
     """
 
     pieces: Mesh
     view: Fragments
     fractions: Tensor
-    of_side: Tensor
+    patch_of_side: Tensor
 
     @staticmethod
-    def of(mesh: Mesh) -> "Patches":
-        """Divide a mesh into patches."""
-        largest_area = float(mesh.face_areas().sum()) / PATCHES
-        pieces = refine(mesh, largest_area)
+    def from_mesh(mesh: Mesh) -> "Patches":
+        """Divide a mesh into patches.
+
+        Args:
+            mesh: Mesh to divide.
+
+        Returns:
+            The patches of the mesh.
+        """
+        patch_area = float(mesh.face_areas().sum()) / PATCHES
+        pieces = refine(mesh, patch_area)
         piece_count = len(pieces.faces)
         sides = [FRONT] if pieces.closed else [FRONT, BACK]
-        # All fronts, and then all backs, if there are any.
+        # The fronts of all pieces come first, and then the backs of all pieces.
         facing = np.repeat(sides, piece_count)[:, None]
         piece_of_side = np.tile(np.arange(piece_count), len(sides))
-        patch_of_side = _group_sides(pieces, piece_of_side, facing, math.sqrt(largest_area))
-        # A view needs its samples in the order of its pixels.
-        order = np.argsort(patch_of_side, kind="stable")
-        pixel = torch.from_numpy(patch_of_side[order])
-        piece = torch.from_numpy(piece_of_side[order])
-        areas = torch.from_numpy(pieces.face_areas())[piece]
-        patch_areas = areas.new_zeros(int(pixel[-1]) + 1).index_add_(0, pixel, areas)
+        cell_width = math.sqrt(patch_area)
+        patch_of_side = _group_sides(pieces, piece_of_side, facing, cell_width)
+        # `Fragments` needs the samples of a pixel next to each other.
+        sample_to_side = np.argsort(patch_of_side, kind="stable")
+        sample_to_patch = torch.from_numpy(patch_of_side[sample_to_side])
+        sample_to_piece = torch.from_numpy(piece_of_side[sample_to_side])
+        areas = torch.from_numpy(pieces.face_areas())[sample_to_piece]
+        patch_count = int(sample_to_patch[-1]) + 1
+        patch_areas = areas.new_zeros(patch_count).index_add_(0, sample_to_patch, areas)
         view = Fragments(
             size=1,
             samples=1,
-            pixels=torch.arange(len(patch_areas)),
+            pixels=torch.arange(patch_count),
             coverage=torch.ones_like(patch_areas),
-            faces=piece,
-            corners=torch.from_numpy(pieces.faces)[piece],
-            facing=torch.from_numpy(facing[order]),
-            outlines=areas.new_tensor(AROUND_CENTER).expand(len(piece), 3, 2),
-            pixel=pixel,
-            face=torch.arange(len(piece)),
-            sample=torch.zeros_like(piece),
+            faces=sample_to_piece,
+            corners=torch.from_numpy(pieces.faces)[sample_to_piece],
+            facing=torch.from_numpy(facing[sample_to_side]),
+            outlines=areas.new_tensor(AROUND_CENTER).expand(len(sample_to_piece), 3, 2),
+            pixel=sample_to_patch,
+            # `faces` has one entry per sample, so sample i shows entry i.
+            face=torch.arange(len(sample_to_piece)),
+            # All samples lie at the only sample position of the image.
+            sample=torch.zeros_like(sample_to_piece),
         )
         smallest = torch.finfo(areas.dtype).tiny
-        fractions = areas / patch_areas.clamp(min=smallest)[pixel]
-        # A closed mesh has no backs. Their patches are then those of the fronts.
-        of_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
-        return Patches(pieces, view, fractions[:, None], of_side)
+        fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
+        # `expand` gives the backs of a closed mesh, which rays never hit, the
+        # patches of the fronts. Otherwise there are two rows already.
+        patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
+        return Patches(
+            pieces=pieces, view=view, fractions=fractions[:, None], patch_of_side=patch_by_side
+        )
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean (N, D) over each patch, weighted with area, of values (S, D)."""
-        summed = values.new_zeros(len(self.view.pixels), values.shape[1])
-        return summed.index_add_(0, self.view.pixel, values * self.fractions)
-
-    def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
-        """Sum the weights of directions over the patch that is hit there.
+        """Average values of the S samples of `view` over each of the N patches.
 
         Args:
-            hits: Hits of B pixels.
-            directions: The directions, shape (D, 3).
-            weights: Weight of each pixel and direction, shape (B, D).
+            values: D values for each sample, shape (S, D).
 
         Returns:
-            Sums, sparse, shape (B, N).
+            Means that are weighted with the areas of the pieces, shape (N, D).
         """
-        pixel, direction = torch.nonzero(weights * (hits.face >= 0), as_tuple=True)
-        face = hits.face[pixel, direction]
-        is_back = (self._normals[face] * directions[direction]).sum(1) > 0
-        patch = self.of_side[is_back.long(), face]
+        patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
+        return patch_sums.index_add_(0, self.view.pixel, values * self.fractions)
+
+    def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
+        """Add up the weights of the rays of each pixel that hit the same patch.
+
+        Args:
+            hits: Faces that rays from B pixels hit in D directions. The faces
+                are indices into `pieces`.
+            directions: Unit directions of the rays, shape (D, 3).
+            weights: Weight of each ray, shape (B, D).
+
+        Returns:
+            Sum of the weights for each pixel and each of the N patches, sparse,
+            shape (B, N).
+        """
+        is_hit = hits.face_of_ray != rays.NO_FACE
+        # Pixel and direction of each ray that hits a piece and has a weight.
+        pixel, direction = torch.nonzero(weights * is_hit, as_tuple=True)
+        piece = hits.face_of_ray[pixel, direction]
+        # A ray hits the back of a piece if it runs along the outer normal.
+        is_back = (self._normals[piece] * directions[direction]).sum(1) > 0
+        patch = self.patch_of_side[is_back.long(), piece]
+        # csr_matrix adds up entries that have the same pixel and patch.
         entries = (weights[pixel, direction].numpy(), (pixel.numpy(), patch.numpy()))
         return csr_matrix(entries, (len(weights), len(self.view.pixels)))
 
     @cached_property
     def _normals(self) -> Tensor:
-        """Return the unit normals of the pieces, shape (F, 3)."""
+        """Unit normals of the F pieces, shape (F, 3)."""
         return torch.from_numpy(self.pieces.face_normals())
 
 
 def _group_sides(
-    pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell: float
+    pieces: Mesh, piece_of_side: np.ndarray, facing: np.ndarray, cell_width: float
 ) -> np.ndarray:
-    """Return the patch (S,) of each side, given its piece (S,) and its facing (S, 1).
+    """Group the S sides of pieces of a mesh into patches.
 
-    Sides share a patch if their centers lie in one cell of a grid with cells of
-    the given width, and if they face the same way.
+    Two sides share a patch if the centers of their pieces lie in the same cell
+    of a cubic grid, if the piece normals are equal after each component is
+    rounded to -1, 0 or 1, and if both sides are fronts or both are backs.
+
+    Args:
+        pieces: Mesh of the pieces.
+        piece_of_side: Index of the piece of each side, shape (S,).
+        facing: `FRONT` or `BACK` for each side, shape (S, 1).
+        cell_width: Width of a cell of the grid in world units.
+
+    Returns:
+        Index of the patch of each side, shape (S,).
     """
     centers = pieces.vertices[pieces.faces].mean(axis=1)[piece_of_side]
     normals = pieces.face_normals()[piece_of_side]
-    keys = np.hstack([np.floor(centers / cell), np.rint(normals), facing])
+    # Sides with equal rows share a patch: cell (3), rounded normal (3), facing (1).
+    keys = np.hstack([np.floor(centers / cell_width), np.rint(normals), facing])
     _, patch_of_side = np.unique(keys, axis=0, return_inverse=True)
-    # NumPy 2.0.0 gives the inverse a second axis.
+    # NumPy 2.0.0 returns the inverse with shape (S, 1).
     return patch_of_side.ravel()
 
 
 class Transport:
-    """The shadows that a mesh casts on itself, and the light that bounces within it.
+    """Change of a mesh's images by the shadows on it and by light that bounces within it.
 
-    Both are stored per unit of the coefficients of an SH basis.
+    The change is linear in the light. It is stored for each of the K
+    coefficients of an SH basis.
 
     Attributes:
-        colors: Whether bounced light has another color than the light of the sky.
+        colors: True if bounced light is colored. The change of the transfer
+            then differs between the three color channels.
         rays: Rays among the faces of the mesh.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh that casts shadows on itself.
         settings: Settings of the image, with the number of bounces.
-        albedo_scale: Factor of the albedo of the surfaces that light bounces off.
-        basis: Basis of the light.
+        albedo_scale: Factor for the albedo of the surfaces that light bounces
+            off.
+        basis: SH basis of the environment light.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
-        # Patches are only needed for bounces. Rays then hit the pieces of patches.
-        self._patches = Patches.of(mesh) if settings.bounces else None
+        # Only bounces need patches. With patches, rays hit the pieces of the mesh.
+        self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
         self._directions = sphere(rays.DIRECTIONS)
+        # Radiance from each of D directions per unit of each of K coefficients,
+        # shape (D, K).
         self._sky = basis.radiance(self._directions)
         self.colors = False
         if self._patches:
-            # The radiance that patches send, shape (N, size, 3), or (N, size, 1) if gray.
+            # Radiance that the N patches send, shape (N, K, 3), or (N, K, 1) if
+            # the three channels are equal.
             self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
             self.colors = self._sent.shape[2] > 1
 
@@ -187,92 +241,140 @@ class Transport:
         """Compute how shadows and bounces change the transfer of a view.
 
         Args:
-            surface: Samples of the view.
+            surface: Points, normals and gloss at the S samples of the view.
             albedo: Linear albedo at the samples, shape (S, C). C is 3 if
-                `colors` is true.
+                `colors` is true, and 1 or 3 otherwise.
 
         Returns:
-            Change of the radiance of P pixels per unit coefficient, weighted
-            with coverage, float64, shape (C, size, P). None if nothing changes.
+            Change of the radiance of the P pixels per unit of each of the K
+            coefficients, times the coverage of the pixel, float64,
+            shape (C, K, P). None if no surface blocks light.
         """
         change = None
         fragments = surface.fragments
         gloss = surface.gloss
-        weights = albedo.T / fragments.samples**2
-        diffuse = weights
+        # A pixel averages over the square of `samples`. Shape (C, S).
+        albedo_by_channel = albedo.T / fragments.samples**2
+        diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            diffuse = weights * gloss.diffuse(surface.normals, surface.toward)
+            diffuse_albedo = albedo_by_channel * gloss.diffuse(surface.normals, surface.toward)
         for hits in self.rays.hits(surface, self._directions):
             if not hits.weight.any():
                 continue
             if change is None:
-                shape = (len(weights), self._sky.shape[1], len(fragments.pixels))
+                shape = (len(albedo_by_channel), self._sky.shape[1], len(fragments.pixels))
                 change = self._sky.new_zeros(shape)
+            sample_of_ray = hits.sample_of_ray
             if gloss is not None:
-                colored, white = self._lobes(gloss, surface, hits.sample)
-                entering = gloss.at(hits.sample).entering(self._cosines(surface, hits.sample))
-            for channel, added in enumerate(change):
-                reflected = diffuse[channel][hits.sample]
+                # Specular reflection of each ray, and the fraction of its light
+                # that enters the diffuse layer below the coat, shape (B, D).
+                colored, white = self._lobes(gloss, surface, sample_of_ray)
+                cosine = self._cosines(surface, sample_of_ray)
+                entering = gloss.at(sample_of_ray).entering(cosine)
+            for channel, channel_change in enumerate(change):
+                # Reflected radiance per irradiance along each ray, shape (B, D).
+                reflectance = diffuse_albedo[channel][sample_of_ray]
                 if gloss is not None:
-                    tinted = weights[channel][hits.sample] * colored
-                    reflected = reflected * entering + (tinted + white / fragments.samples**2)
-                blocked = hits.weight * reflected
-                added[:, hits.pixels] = -(blocked @ self._sky).T
+                    tinted = albedo_by_channel[channel][sample_of_ray] * colored
+                    specular = tinted + white / fragments.samples**2
+                    reflectance = reflectance * entering + specular
+                blocked = hits.weight * reflectance
+                # Shape (K, B).
+                channel_change[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
-                    added[:, hits.pixels] += self._received(self._patches, hits, blocked, channel)
+                    received = self._received(self._patches, hits, blocked, channel)
+                    channel_change[:, hits.pixels] += received
         return change
 
     def _received(self, patches: Patches, hits: RayHits, blocked: Tensor, channel: int) -> Tensor:
-        """Return the light (size, B) that B pixels receive from patches in one channel.
+        """Compute the radiance of B pixels that is due to light from patches, in one channel.
 
-        `blocked` (B, D) is the radiance of the pixel per radiance from each
-        direction.
+        Args:
+            patches: The N patches.
+            hits: Faces that rays from the pixels hit in D directions.
+            blocked: Radiance of each pixel per unit radiance that arrives from
+                each direction, shape (B, D).
+            channel: Index of the color channel.
+
+        Returns:
+            Radiance of the pixels per unit of each of the K coefficients of the
+            light, shape (K, B).
         """
+        # Radiance that the patches send, shape (N, K).
         sent = self._sent[..., channel if self.colors else 0].numpy()
         received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
         return torch.from_numpy(received).T
 
-    def _cosines(self, surface: Surface, sample: Tensor) -> Tensor:
-        """Return the cosines (B, D) between the normals at samples (B, D) and the directions."""
-        return torch.einsum("bdi,di->bd", surface.normals[sample], self._directions)
+    def _cosines(self, surface: Surface, sample_of_ray: Tensor) -> Tensor:
+        """Compute the cosine between each ray and the shading normal at its start.
 
-    def _lobes(self, gloss: SampleGloss, surface: Surface, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the colored and the white reflection (B, D) at samples (B, D).
+        Args:
+            surface: Normals at the samples of the view.
+            sample_of_ray: Sample from which the ray of each of B pixels starts
+                in each of D directions, shape (B, D).
 
-        This is the radiance per irradiance from each direction. Lobes may be
-        narrower than the directions are apart. They are therefore scaled such
-        that their sum over the directions, under uniform light, is exact.
+        Returns:
+            Cosines, shape (B, D).
         """
-        to_camera = at_samples(surface.toward, sample)
-        normals = surface.normals[sample]
-        colored, white = gloss.at(sample).along(normals, to_camera, self._directions)
-        cosine = self._cosines(surface, sample).clamp(min=0)
+        normals = surface.normals[sample_of_ray]
+        return torch.einsum("bdi,di->bd", normals, self._directions)
+
+    def _lobes(
+        self, gloss: SampleGloss, surface: Surface, sample_of_ray: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute the specular reflectance for light along the rays of B pixels.
+
+        A specular lobe may be narrower than the angle between two of the D
+        directions. The reflectances of a pixel are therefore scaled so that
+        their sum over the directions is exact for uniform light.
+
+        Args:
+            gloss: Gloss at the samples of the view.
+            surface: Normals at the samples of the view.
+            sample_of_ray: Sample from which each ray starts, shape (B, D).
+
+        Returns:
+            A tuple of
+            - the reflected radiance per irradiance that is multiplied by the
+              albedo, because metals color reflections, shape (B, D);
+            - the reflected radiance per irradiance that has the color of the
+              light, shape (B, D).
+        """
+        to_camera = at_samples(surface.toward, sample_of_ray)
+        normals = surface.normals[sample_of_ray]
+        colored, white = gloss.at(sample_of_ray).along(normals, to_camera, self._directions)
+        cosine = self._cosines(surface, sample_of_ray).clamp(min=0)
+        # Uniform light of irradiance 1 has the radiance 1/π. Each of D directions
+        # has the solid angle 4π / D. The sum over the directions is therefore
+        # 4 times the mean.
         sampled = ((colored + white) * cosine).mean(1, keepdim=True) * 4
-        colored_exact, exact = gloss.even(surface.normals, surface.toward)
-        if colored_exact is not None:
-            exact = exact + colored_exact
+        exact_colored, exact = gloss.even(surface.normals, surface.toward)
+        if exact_colored is not None:
+            exact = exact + exact_colored
         smallest = torch.finfo(sampled.dtype).tiny
-        scale = exact[sample].mean(1, keepdim=True) / sampled.clamp(min=smallest)
+        scale = exact[sample_of_ray].mean(1, keepdim=True) / sampled.clamp(min=smallest)
         return colored * scale, white * scale
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
         """Compute how shadows and bounces change the radiance of a view in one light.
 
-        The result is differentiable in the light, but not in the albedo.
+        The result is differentiable with respect to the light, but not to the
+        albedo.
 
         Args:
-            surface: Samples of the view.
+            surface: Points, normals and gloss at the S samples of the view.
             albedo: Linear albedo at the samples, shape (S, 3).
-            light: Coefficients, shape (size, 3).
+            light: SH coefficients, shape (K, 3).
 
         Returns:
-            Change of the radiance of P pixels, weighted with coverage, shape
-            (3, P), in the dtype of the light.
+            Change of the radiance of the P pixels, times their coverage, in the
+            dtype of the light, shape (3, P).
         """
         with torch.no_grad():
             change = self.change(surface, albedo.detach().cpu().double())
         if change is None:
             return light.new_zeros(3, len(surface.fragments.pixels))
+        # The change has the shape (3, K, P), or channels c, coefficients k, pixels p.
         return torch.einsum("ckp,kc->cp", change.to(light), light)
 
 
@@ -281,25 +383,28 @@ def build_transport(
 ) -> Transport | None:
     """Compute the shadows and bounces of environment light.
 
-    Local lights are left out here, because they cast their shadows by
-    themselves.
+    Local lights, which are lamps and projectors, are not included. Their
+    shadows are computed in `renderer.transport.lamp_paths`.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh that casts shadows on itself.
         settings: Settings of the image.
-        albedo_scale: Factor of the albedo of the surfaces that light bounces off.
+        albedo_scale: Factor for the albedo of the surfaces that light bounces
+            off.
         basis: Basis of the light.
 
     Returns:
-        Shadows and bounces, or None if the settings turn both off or the basis
-        has no environment light.
+        Shadows and bounces. None if the settings turn off shadows and bounces,
+        or if the basis has no environment light.
 
     Raises:
-        InputError: If the basis has local lights and light is to bounce.
+        InputError: If the basis has local lights and `settings.bounces` is not
+            0.
     """
     if basis.local_lights and settings.bounces:
         raise InputError(
-            f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows"
+            f"bounces={settings.bounces} is not possible with {basis}, because only environment "
+            "light can bounce: set bounces=0, and shadows=true if you want shadows"
         )
     environment = basis.environment
     if environment is None or not settings.global_illumination:
@@ -310,31 +415,49 @@ def build_transport(
 def _radiosity(
     patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics
 ) -> Tensor:
-    """Return the radiance B (N, size, 3) that patches send, or (N, size, 1) if all are gray."""
+    """Compute the radiance that N patches send after `settings.bounces` bounces.
+
+    This is B in the docstring of the module.
+
+    Args:
+        patches: Patches of the mesh.
+        rays: Rays among the pieces of the patches.
+        settings: Settings of the image, with the number of bounces.
+        albedo_scale: Factor for the albedo of the mesh.
+        basis: SH basis of the environment light, with K coefficients.
+
+    Returns:
+        Radiance per unit of each coefficient, shape (N, K, 3), or (N, K, 1) if
+        all patches are gray.
+    """
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
-    albedo = patches.mean(sample_albedo) * albedo_scale
-    has_colors = bool((albedo != albedo[:, :1]).any())
-    reflected = albedo[:, None, : 3 if has_colors else 1] / math.pi
-    links = _PatchLinks.of(patches, rays, basis)
-    sent = links.from_sky * reflected
+    # Mean albedo of each patch, shape (N, 3).
+    patch_albedo = patches.mean(sample_albedo) * albedo_scale
+    has_colors = bool((patch_albedo != patch_albedo[:, :1]).any())
+    channel_count = 3 if has_colors else 1
+    # Sent radiance per irradiance, shape (N, 1, channels).
+    reflectance = patch_albedo[:, None, :channel_count] / math.pi
+    links = _PatchLinks.trace(patches, rays, basis)
+    sent = links.from_sky * reflectance
     for _ in range(settings.bounces - 1):
-        arriving = torch.from_numpy(links.factors @ sent.flatten(1).numpy())
-        arriving = arriving.view(-1, *sent.shape[1:])
+        # Irradiance of the M patches that see other patches, shape (M, K, channels).
+        from_patches = torch.from_numpy(links.factors @ sent.flatten(1).numpy())
+        from_patches = from_patches.view(-1, *sent.shape[1:])
         from_sky = links.from_sky.expand_as(sent)
-        sent = from_sky.index_add(0, links.receiving, arriving) * reflected
+        sent = from_sky.index_add(0, links.receiving, from_patches) * reflectance
     return sent
 
 
 @dataclass(frozen=True)
 class _PatchLinks:
-    """Irradiance of N patches from the sky and from each other.
+    """Irradiance that N patches receive from the sky and from each other.
 
     Attributes:
-        from_sky: S, the irradiance from the sky per unit of each coefficient,
-            shape (N, size, 1).
+        from_sky: Irradiance S from the visible part of the sky, per unit of each
+            of the K SH coefficients, shape (N, K, 1).
         receiving: Indices of the M patches that see other patches, shape (M,).
-        factors: F, the irradiance of these patches per unit radiance of every
-            patch, sparse, shape (M, N).
+        factors: Irradiance F of each of these M patches per unit radiance of
+            each of the N patches, sparse, shape (M, N).
     """
 
     from_sky: Tensor
@@ -342,21 +465,42 @@ class _PatchLinks:
     factors: csr_matrix
 
     @staticmethod
-    def of(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
-        """Trace rays from all patches to find the sky and the patches that they see."""
+    def trace(patches: Patches, rays: Rays, basis: Harmonics) -> "_PatchLinks":
+        """Cast rays from all patches to find which sky and which patches they see.
+
+        Args:
+            patches: The N patches.
+            rays: Rays among the pieces of the patches.
+            basis: SH basis of the environment light.
+
+        Returns:
+            Irradiance of the patches from the sky and from each other.
+        """
         surface = Surface(patches.pieces, patches.view, ImageSettings(1, 1, normals="flat"))
+        # First the irradiance from the whole sky, shape (N, K). Blocked
+        # directions are subtracted in the loop.
         from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
         from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
         directions = sphere(PATCH_DIRECTIONS)
-        radiance = basis.radiance(directions)
+        sky_radiance = basis.radiance(directions)
         receiving = []
         factors = []
         for hits in rays.hits(surface, directions):
-            weights = hits.weight * patches.fractions[hits.sample, 0]
-            from_sky[hits.pixels] -= weights @ radiance
+            # `hits.weight` makes the few rays of each sample stand for all
+            # directions. The samples of a patch are averaged with the areas of
+            # their pieces as weights.
+            weights = hits.weight * patches.fractions[hits.sample_of_ray, 0]
+            from_sky[hits.pixels] -= weights @ sky_radiance
             receiving.append(hits.pixels)
             factors.append(patches.weights_by_patch(hits, directions, weights))
         if not factors:
-            nothing = csr_matrix((0, len(from_sky)))
-            return _PatchLinks(from_sky[..., None], torch.arange(0), nothing)
-        return _PatchLinks(from_sky[..., None], torch.cat(receiving), vstack(factors, format="csr"))
+            return _PatchLinks(
+                from_sky=from_sky[..., None],
+                receiving=torch.arange(0),
+                factors=csr_matrix((0, len(from_sky))),
+            )
+        return _PatchLinks(
+            from_sky=from_sky[..., None],
+            receiving=torch.cat(receiving),
+            factors=vstack(factors, format="csr"),
+        )

@@ -24,18 +24,19 @@ from renderer.errors import require_finite
 from renderer.settings import ImageSettings
 from renderer.visibility.rasterizers import Rasterizer
 
-# Number of samples that loops process at once, so that their values stay in
-# the cache of the processor.
+# Number of samples that `_blocks` and `interpolate_texture` process at once. The
+# values of so many samples stay in the cache of the processor.
 BLOCK = 2**14
 
-# Name of the cached property `Fragments.barycentric`.
+# Key under which `cached_property` stores `Fragments.barycentric` in the
+# attributes of an object.
 _WEIGHTS = "barycentric"
 
 
 class Runs(NamedTuple):
-    """R runs of neighboring samples that show one face in one pixel.
+    """R runs of neighboring samples that show the same face in the same pixel.
 
-    The runs have the order of the samples.
+    The runs are in the order of their samples.
 
     Attributes:
         pixel: Index into `Fragments.pixels` of each run, ascending, int64,
@@ -68,13 +69,16 @@ class Fragments:
             shape (G, 3).
         facing: -1 for seen faces that the camera sees from behind, and 1 for
             the others, float64, shape (G, 1).
-        outlines: Projected corners of each seen face, x to the right and y up,
-            with the image in [-1, 1], float64, shape (G, 3, 2).
-        pixel: Index into `pixels` of each sample, int64, shape (S,).
-        face: Index into `faces` of each sample, int64, shape (S,).
-        sample: Position of each sample among all samples of the image, int64,
-            shape (S,). Positions count pixel by pixel, and row by row within a
-            pixel.
+        outlines: Positions (x, y) of the three corners of each seen face in the
+            image, float64, shape (G, 3, 2). x points to the right and y up, and
+            the image is [-1, 1] in x and y.
+        pixel: Index into `pixels` of the pixel of each sample, int64,
+            shape (S,).
+        face: Index into `faces` of the face that each sample shows, int64,
+            shape (S,).
+        sample: Number of each sample among all samples of the image, covered or
+            not, int64, shape (S,). The samples are numbered pixel by pixel, and
+            row by row within a pixel.
         depths: Depths of the corners of seen faces (see `Camera.depths`),
             float64, shape (G, 3). None without perspective.
         camera: Camera of the view. None if the samples come from no camera.
@@ -96,94 +100,114 @@ class Fragments:
 
     @property
     def eye(self) -> Tensor:
-        """Position of the camera or direction to it, see `Camera.eye`. Zeros without a camera."""
+        """Homogeneous position of the camera (x, y, z, w), shape (4,).
+
+        w is 1 for the position of a perspective camera, and 0 for the direction
+        to an orthographic camera. Without a camera, all four numbers are 0.
+        """
         if self.camera is None:
             return torch.zeros(4)
         return torch.from_numpy(self.camera.eye())
 
     @cached_property
     def barycentric(self) -> Tensor:
-        """Barycentric weights of the three corners at each sample, float64, shape (S, 3).
+        """Barycentric weights of the three corners at each of the S samples, shape (S, 3).
 
-        They are computed from unrounded corners, but the rasterizer rounds
-        corners. A sample may therefore lie slightly outside its face, and its
-        weights are clipped at 0.
+        The weights are float64 and add up to 1. They are computed from unrounded
+        corners, but the rasterizer rounds corners. A sample may therefore lie
+        slightly outside its face. Its weights are then clipped at 0.
 
         In a perspective image, a function that is linear on a face is a
         quotient of two linear functions of the image position (Heckbert and
         Moreton 1991). The weights are therefore divided by the depths of the
         corners and normalized.
         """
-        # Shape (2, 3, G), for x and y, and three corners.
+        # Shape (2, 3, G), for x and y, three corners and G seen faces.
         outlines = self.outlines.permute(2, 1, 0)
-        # The edges b and c lead from the first corner to the other two corners.
+        # The edges b and c lead from the first corner to the second and the third
+        # corner, shape (2, 2, G).
         edges = outlines[:, 1:] - outlines[:, :1]
         (bx, cx), (by, cy) = edges
-        area = bx * cy - cx * by
-        edges_by_area = edges / area.masked_fill(area == 0, 1)
-        # Rows x₀ and y₀ of the first corner, and bx, cx, by and cy over the
-        # area, shape (6, G).
+        doubled_area = bx * cy - cx * by
+        # The divisor 1 avoids a division by 0. A face without area covers samples
+        # only because the rasterizer rounds, so its weights do not matter.
+        edges_by_area = edges / doubled_area.masked_fill(doubled_area == 0, 1)
+        # The six rows x₀, y₀, bx / area, cx / area, by / area and cy / area. The
+        # first corner is (x₀, y₀). Shape (6, G).
         face_values = torch.cat([outlines[:, 0], edges_by_area.flatten(0, 1)])
-        nearness = None if self.depths is None else self.depths.T.reciprocal()
+        reciprocal_depths = None if self.depths is None else self.depths.T.reciprocal()
         weights = face_values.new_empty(3, len(self.face))
-        for weight, face, position in _blocks(weights, self.face, self.positions().T):
+        # Each block holds up to BLOCK samples. Writing to `weight` fills `weights`.
+        for weight, sample_to_seen_face, position in _blocks(
+            weights, self.face, self.positions().T
+        ):
             # gather takes a third of the time of index_select.
-            x0, y0, bx, cx, by, cy = face_values.gather(1, face.expand(len(face_values), -1))
+            values_at_samples = face_values.gather(
+                1, sample_to_seen_face.expand(len(face_values), -1)
+            )
+            x0, y0, bx, cx, by, cy = values_at_samples
+            # Position of the sample relative to the first corner.
             x = position[0] - x0
             y = position[1] - y0
             weight[1] = x * cy - y * cx
             weight[2] = y * bx - x * by
             weight[0] = 1 - weight[1] - weight[2]
             weight.clamp_(0, 1)
-            if nearness is not None:
-                weight.mul_(nearness.gather(1, face.expand(3, -1)))
+            if reciprocal_depths is not None:
+                weight.mul_(reciprocal_depths.gather(1, sample_to_seen_face.expand(3, -1)))
             weight.div_(weight.sum(0))
         return weights.T
 
     def positions(self) -> Tensor:
-        """Compute the positions of the samples in the image.
+        """Compute the positions of the S covered samples in the image.
 
         Returns:
-            x to the right and y up, with the image in [-1, 1], float64,
-            shape (S, 2).
+            Positions (x, y), float64, shape (S, 2). x points to the right and y
+            up, and the image is [-1, 1] in x and y.
         """
-        # Floating-point numbers are divided in a tenth of the time of integers.
-        pixel, within_pixel = _divide(self.sample.double(), self.samples**2)
-        pixel_row, pixel_column = _divide(pixel, self.size)
-        row_within, column_within = _divide(within_pixel, self.samples)
+        # Integers are divided as floating-point numbers, which takes a tenth of the
+        # time.
+        pixel_index, number_in_pixel = _divide(self.sample.double(), self.samples**2)
+        pixel_row, pixel_column = _divide(pixel_index, self.size)
+        row_in_pixel, column_in_pixel = _divide(number_in_pixel, self.samples)
+        # Row and column among all samples of the image.
         resolution = self.size * self.samples
-        column = pixel_column * self.samples + column_within
-        row = pixel_row * self.samples + row_within
-        # Samples are the centers of cells of width 2 / resolution.
+        column = pixel_column * self.samples + column_in_pixel
+        row = pixel_row * self.samples + row_in_pixel
+        # A sample is the center of a square cell of width 2 / resolution.
         return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
 
     def by_sample(self) -> "Fragments":
-        """Return the same samples as pixels of a finer image.
+        """Return a copy for a finer image, in which each sample is a pixel.
 
         Returns:
-            Samples in the same order, for an image with size · s pixels per
-            side and one sample per pixel.
+            The same S samples in the same order, for an image with size · s
+            pixels per side and one sample per pixel. s is `samples`.
         """
         resolution = self.size * self.samples
-        # Row-major position of each sample among all samples of the image,
-        # shape (size, s, size, s), for the row and column of a pixel and of a
-        # sample in it.
+        # Row-major index in the finer image of each cell. The axes are the row of a
+        # pixel, the row in the pixel, the column of a pixel and the column in the
+        # pixel, shape (size, s, size, s).
         cells = torch.arange(resolution**2, device=self.sample.device)
         cells = cells.view(self.size, self.samples, self.size, -1)
-        position = cells.transpose(1, 2).flatten().index_select(0, self.sample)
+        # `sample` numbers the cells pixel by pixel, so both pixel axes come first.
+        cells_by_pixel = cells.transpose(1, 2).flatten()
+        finer_pixels = cells_by_pixel.index_select(0, self.sample)
         finer = replace(
             self,
             size=resolution,
             samples=1,
-            pixels=position,
-            coverage=self.coverage.new_ones(len(position)),
-            pixel=torch.arange(len(position), device=position.device),
-            sample=position,
+            pixels=finer_pixels,
+            coverage=self.coverage.new_ones(len(finer_pixels)),
+            pixel=torch.arange(len(finer_pixels), device=finer_pixels.device),
+            sample=finer_pixels,
         )
         return self._share_weights(finer, slice(None))
 
     def select(self, samples: Tensor) -> "Fragments":
-        """Return some of the samples, in the same pixels.
+        """Return a copy that keeps only some of the S samples.
+
+        `pixels` and `coverage` stay the same.
 
         Args:
             samples: Indices of the N samples to keep, shape (N,).
@@ -199,11 +223,23 @@ class Fragments:
         )
         return self._share_weights(selected, samples)
 
-    def _share_weights(self, view: "Fragments", samples: Tensor | slice) -> "Fragments":
-        """Give a view of some of these samples their barycentric weights if they are known."""
-        if _WEIGHTS in vars(self):
-            vars(view)[_WEIGHTS] = self.barycentric[samples]
-        return view
+    def _share_weights(self, copied: "Fragments", samples: Tensor | slice) -> "Fragments":
+        """Copy the cached barycentric weights to a copy that has some of these samples.
+
+        The copy then does not compute the weights again. Nothing is copied if
+        the weights have not been computed yet.
+
+        Args:
+            copied: Copy of these fragments. Its cache is changed in place.
+            samples: Samples that the copy has, as indices or as a slice.
+
+        Returns:
+            The argument `copied`.
+        """
+        is_computed = _WEIGHTS in vars(self)
+        if is_computed:
+            vars(copied)[_WEIGHTS] = self.barycentric[samples]
+        return copied
 
     def image_of_samples(self, values: Tensor, empty: float) -> Tensor:
         """Arrange values at samples as an image with one pixel per sample.
@@ -213,98 +249,109 @@ class Fragments:
             empty: Value of samples that show no mesh.
 
         Returns:
-            Image of samples, shape (size · s, size · s). Row 0 is at the top.
+            Image with one pixel per sample, shape (size · s, size · s), for
+            s = `samples`. Row 0 is at the top.
         """
         image = values.new_full((self.size**2 * self.samples**2,), empty)
         image.index_copy_(0, self.sample, values)
-        # Rows of pixels and columns of pixels, then rows and columns of samples.
+        # The axes are the row and column of a pixel, and the row and column in the
+        # pixel. They become (row, row in pixel, column, column in pixel).
         by_pixel = image.view(self.size, self.size, self.samples, self.samples)
         return by_pixel.transpose(1, 2).reshape(self.size * self.samples, -1)
 
     def of_image(self, image: Tensor) -> Tensor:
-        """Read an image with one pixel per sample at the covered samples.
+        """Read the values of the covered samples from an image with one pixel per sample.
 
         This is the inverse of `image_of_samples`.
 
         Args:
-            image: Image of samples, shape (size · s, size · s).
+            image: Image with one pixel per sample, shape (size · s, size · s),
+                for s = `samples`.
 
         Returns:
             Values of the covered samples, shape (S,).
         """
+        # The axes (row, row in pixel, column, column in pixel) become the row and
+        # column of a pixel, and the row and column in the pixel.
         by_row = image.view(self.size, self.samples, self.size, self.samples)
         return by_row.transpose(1, 2).flatten().index_select(0, self.sample)
 
     def interpolate(self, corners: Tensor) -> Tensor:
-        """Interpolate values of face corners at the samples.
+        """Interpolate values of face corners at the S samples.
 
         The result is differentiable with respect to `corners`.
 
         Args:
-            corners: D values for each of the three corners of the seen faces,
+            corners: D values for each of the three corners of the G seen faces,
                 shape (G, 3, D).
 
         Returns:
             Values at the samples, shape (S, D).
         """
-        rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
-        return _Interpolation.apply(rows, self.face, self.barycentric.T).T
+        # Shape (3 · D, G), with the D values of the first corner first.
+        corner_rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
+        return _Interpolation.apply(corner_rows, self.face, self.barycentric.T).T
 
     def distribute(self, values: Tensor) -> Tensor:
-        """Add values at samples to the corners of their faces.
+        """Add values at samples to the three corners of the faces that the samples show.
 
-        Each value is weighted with the barycentric weight of the corner. This
+        Each value is multiplied by the barycentric weight of the corner. This
         is the transpose of `interpolate`.
 
         Args:
-            values: D values for each sample, shape (S, D).
+            values: D values for each of the S samples, shape (S, D).
 
         Returns:
-            Weighted sums for the three corners of the seen faces,
+            Weighted sums for the three corners of the G seen faces,
             shape (G, 3, D).
         """
-        shape = (3 * values.shape[1], len(self.faces))
-        rows = _distribute(values.T, self.face, self.barycentric.T, shape)
-        return rows.unflatten(0, (3, -1)).permute(2, 0, 1)
+        corner_rows_shape = (3 * values.shape[1], len(self.faces))
+        corner_rows = _distribute(values.T, self.face, self.barycentric.T, corner_rows_shape)
+        # Shape (3 · D, G), then (3, D, G), then (G, 3, D).
+        return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Join neighboring samples that show one face in one pixel into runs.
+        """Add up the albedo of neighboring samples that show the same face in the same pixel.
 
-        The samples of a run share a normal if normals are flat. Shading one run
-        then replaces shading its samples.
+        Such a group of samples is called a run. With flat normals, the samples
+        of a run share a normal, so they can be shaded together.
 
         Args:
-            albedo: C values of albedo for each sample, shape (S, C). The result
-                is differentiable with respect to it.
+            albedo: C channels of albedo at each of the S samples, shape (S, C).
 
         Returns:
             A tuple of
             - the index into `pixels` of each of R runs, shape (R,);
             - the index into `faces` of each run, shape (R,);
             - the albedo summed over the samples of each run and divided by the
-              number of samples in a pixel, shape (R, C).
+              number of samples in a pixel, shape (R, C). It is differentiable
+              with respect to `albedo`.
         """
         if self.samples == 1 or len(self.pixel) == 0:
+            # Each sample is a run of its own.
             return self.pixel, self.face, albedo
         runs = self.runs
-        sample_count = runs.sample_count.cpu().numpy()
-        # NumPy repeats in a quarter of the time of torch.
-        run_of_sample = np.repeat(np.arange(len(sample_count)), sample_count)
-        scaled = albedo.T / self.samples**2
-        zeros = albedo.new_zeros(albedo.shape[1], len(sample_count))
-        summed = zeros.index_add(1, torch.from_numpy(run_of_sample).to(albedo.device), scaled)
-        return runs.pixel, runs.face, summed.T
+        samples_per_run = runs.sample_count.cpu().numpy()
+        # NumPy's repeat takes a quarter of the time of torch's.
+        sample_to_run = np.repeat(np.arange(len(samples_per_run)), samples_per_run)
+        scaled_albedo = albedo.T / self.samples**2
+        zeros = albedo.new_zeros(albedo.shape[1], len(samples_per_run))
+        albedo_of_runs = zeros.index_add(
+            1, torch.from_numpy(sample_to_run).to(albedo.device), scaled_albedo
+        )
+        return runs.pixel, runs.face, albedo_of_runs.T
 
     @cached_property
     def runs(self) -> Runs:
-        """Runs of neighboring samples that show one face in one pixel."""
-        # The additional last entry marks the end of all samples.
+        """Runs of neighboring samples that show the same face in the same pixel."""
+        # A run starts where the pixel or the face differs from that of the sample
+        # before. The additional last entry marks the end of the last run.
         is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
         torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
         is_start[1:-1] |= self.face[1:] != self.face[:-1]
-        # NumPy finds the starts in a quarter of the time of torch.
-        found = np.flatnonzero(is_start.cpu().numpy())
-        starts = torch.from_numpy(found).to(self.pixel.device)
+        # NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
+        start_indices = np.flatnonzero(is_start.cpu().numpy())
+        starts = torch.from_numpy(start_indices).to(self.pixel.device)
         return Runs(
             pixel=self.pixel.index_select(0, starts[:-1]),
             face=self.face.index_select(0, starts[:-1]),
@@ -318,90 +365,122 @@ class Fragments:
             device: Device for the tensors.
 
         Returns:
-            The same samples with tensors on `device`.
+            Copy with tensors on `device`.
         """
-        moved: dict[str, Any] = {}
+        tensors_on_device: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
-                moved[field.name] = value.to(device)
-        return replace(self, **moved)
+                tensors_on_device[field.name] = value.to(device)
+        return replace(self, **tensors_on_device)
 
 
 class _Interpolation(torch.autograd.Function):
-    """Interpolation of corner values at samples, in blocks of samples.
+    """Interpolation of the corner values of faces at samples, as a function of autograd.
 
-    Corner values have shape (3 D, G) with all values of the first corner first.
-    Values at samples have shape (D, S).
+    The S samples are processed in blocks. G faces have D values at each of their
+    three corners. The 3 · D values of a face are a column of a matrix, with the D
+    values of the first corner first.
     """
 
     @staticmethod
-    def forward(ctx: Any, corners: Tensor, face: Tensor, weights: Tensor) -> Tensor:
-        """Interpolate the values of the corners at each sample.
+    def forward(
+        ctx: Any, corner_rows: Tensor, sample_to_seen_face: Tensor, weights: Tensor
+    ) -> Tensor:
+        """Interpolate the D values of three corners at each of S samples.
 
         Args:
             ctx: Context of autograd.
-            corners: Values of the corners of the seen faces, shape (3 D, G).
-            face: Index of the seen face at each sample, shape (S,).
-            weights: Barycentric weights of each sample, shape (3, S).
+            corner_rows: D values at the first corners of G faces, then D values
+                at the second and at the third corners, shape (3 · D, G).
+            sample_to_seen_face: Index in [0, G) of the face that each sample
+                shows, shape (S,).
+            weights: Barycentric weights of the three corners at each sample,
+                shape (3, S).
 
         Returns:
             Values at the samples, shape (D, S).
         """
-        ctx.save_for_backward(face, weights)
-        ctx.corners_shape = corners.shape
-        values = corners.new_empty(len(corners) // 3, len(face))
-        for value, index, weight in _blocks(values, face, weights):
+        ctx.save_for_backward(sample_to_seen_face, weights)
+        ctx.corner_rows_shape = corner_rows.shape
+        values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
+        # Writing to `value` fills `values`, block by block.
+        for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
             # Shape (3, D, samples of the block).
-            at_corners = corners.gather(1, index.expand(len(corners), -1)).unflatten(0, (3, -1))
+            at_corners = corner_rows.gather(1, seen_face.expand(len(corner_rows), -1))
+            at_corners = at_corners.unflatten(0, (3, -1))
             torch.sum(at_corners.mul_(weight[:, None]), 0, out=value)
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Distribute the gradient by the values to the corners.
+        """Compute the gradient by the D values of the three corners of G faces.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the values at the samples, shape (D, S).
+            upstream: Gradient by the D values at each of S samples,
+                shape (D, S).
 
         Returns:
-            Gradient by the values of the corners, shape (3 D, G), and None for
-            the other arguments of `forward`.
+            Gradient by the corner values, D rows for each of the three corners,
+            shape (3 · D, G), and None for the other two arguments of `forward`.
         """
-        face, weights = ctx.saved_tensors
-        return _distribute(upstream, face, weights, ctx.corners_shape), None, None
+        sample_to_seen_face, weights = ctx.saved_tensors
+        gradient = _distribute(upstream, sample_to_seen_face, weights, ctx.corner_rows_shape)
+        return gradient, None, None
 
 
 def _distribute(
-    values: Tensor, face: Tensor, weights: Tensor, corners_shape: Sequence[int]
+    values: Tensor,
+    sample_to_seen_face: Tensor,
+    weights: Tensor,
+    corner_rows_shape: Sequence[int],
 ) -> Tensor:
-    """Add weighted values of samples to the corners of their faces.
+    """Add the values of S samples to the three corners of the faces that the samples show.
 
     Args:
         values: D values for each sample, shape (D, S).
-        face: Index of the seen face at each sample, shape (S,).
-        weights: Barycentric weights of each sample, shape (3, S).
-        corners_shape: Shape (3 D, G) of the result.
+        sample_to_seen_face: Index in [0, G) of the face that each sample shows,
+            shape (S,).
+        weights: Barycentric weights of the three corners at each sample,
+            shape (3, S).
+        corner_rows_shape: Shape of the result, (3 · D, G).
 
     Returns:
-        Sums for the corners of the seen faces, with all values of the first
-        corner first, shape (3 D, G).
+        Weighted sums of D values at the first corners of G faces, then at the
+        second and at the third corners, shape (3 · D, G).
     """
-    at_corners = values.new_zeros(corners_shape)
-    for value, index, weight in _blocks(values, face, weights.to(values)):
-        at_corners.index_add_(1, index, (weight[:, None] * value).flatten(0, 1))
-    return at_corners
+    corner_rows = values.new_zeros(corner_rows_shape)
+    for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights.to(values)):
+        # Shape (3, D, samples of the block), then (3 · D, samples of the block).
+        weighted = (weight[:, None] * value).flatten(0, 1)
+        corner_rows.index_add_(1, seen_face, weighted)
+    return corner_rows
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Split tensors along their last axis into views of BLOCK samples."""
+    """Split tensors along their last axis, whose length S they share, into blocks.
+
+    Args:
+        tensors: Tensors of shape (..., S).
+
+    Yields:
+        Views of all tensors, shape (..., BLOCK). The last block may be shorter.
+    """
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 
 def _divide(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
-    """Divide whole floating-point numbers, and return the quotients and the remainders."""
+    """Divide whole numbers that are stored as floating-point numbers.
+
+    Args:
+        numbers: Whole numbers, float64, shape (S,).
+        divisor: Whole number.
+
+    Returns:
+        The whole quotients and the remainders, shape (S,) each.
+    """
     quotient = (numbers / divisor).floor()
     return quotient, numbers - quotient * divisor
 
@@ -414,150 +493,170 @@ def build_fragments(
     rasterizer: Rasterizer,
     closed: bool = False,
 ) -> list[Fragments]:
-    """Rasterize a mesh once for each camera.
+    """Rasterize a mesh once for each camera to find the samples that show the mesh.
 
     Args:
         vertices: Vertex positions in world axes, float64, shape (V, 3).
         faces: Indices of the three vertices of each face, shape (F, 3).
         cameras: Cameras of the N views.
         settings: Size of the images and number of samples per pixel side.
-        rasterizer: Rasterizer to use.
+        rasterizer: Rasterizer that finds the nearest face at each sample.
         closed: True promises that the mesh is watertight and that its faces are
             counter-clockwise seen from outside (see `Mesh.closed`). Faces that
-            are seen from behind are then not drawn, unless the near plane cuts
-            the mesh open.
+            are seen from behind are then not drawn. They are drawn if the near
+            plane cuts the mesh open.
 
     Returns:
-        Samples that show the mesh, for each camera. A mesh outside the image
-        has no samples.
+        Covered samples of each view, in the order of the cameras. A view without
+        the mesh has no covered samples.
 
     Raises:
         InputError: If `vertices` holds NaN or infinite values, or if the mesh
             reaches a perspective camera.
     """
     require_finite(vertices=torch.from_numpy(vertices))
-    # Each coordinate is contiguous in memory, shape (N, 3, V).
+    # Shape (N, 3, V), so that each coordinate is contiguous in memory.
     coordinates = np.stack([camera.project(vertices).T for camera in cameras])
+    # View of the same memory with shape (N, V, 3).
     projected = coordinates.swapaxes(1, 2)
-    # The third coordinate is -1 at the near plane.
+    # The third coordinate is the depth, which is -1 at the near plane.
     is_uncut = bool((projected[..., 2] >= -1).all())
     face_ids = rasterizer.rasterize(
         projected, faces, settings.size * settings.samples, closed=closed and is_uncut
     )
     views = []
-    for camera, points, ids in zip(cameras, projected, face_ids, strict=True):
+    for camera, points, ids_of_view in zip(cameras, projected, face_ids, strict=True):
         depths = camera.depths(vertices)
-        views.append(_fragments(camera, points, depths, ids, faces, settings))
+        views.append(_fragments_of_view(camera, points, depths, ids_of_view, faces, settings))
     return views
 
 
 class _CoveredSamples(NamedTuple):
-    """Covered samples of one view, and their pixels.
+    """Pixels of the S covered samples of one view.
 
     Attributes:
-        pixels: Row-major indices of the pixels with covered samples, shape (P,).
-        counts: Number of covered samples in each of these pixels, shape (P,).
-        pixel: Index into `pixels` of each sample, shape (S,).
+        pixels: Row-major indices of the P pixels with covered samples,
+            shape (P,).
+        sample_count: Number of covered samples in each of these pixels,
+            shape (P,).
+        sample_to_pixel: Index into `pixels` of the pixel of each sample,
+            shape (S,).
     """
 
     pixels: np.ndarray
-    counts: np.ndarray
-    pixel: np.ndarray
+    sample_count: np.ndarray
+    sample_to_pixel: np.ndarray
 
 
-def _fragments(
+def _fragments_of_view(
     camera: Camera,
     projected: np.ndarray,
     depths: np.ndarray | None,
-    ids: np.ndarray,
+    face_ids: np.ndarray,
     faces: np.ndarray,
     settings: ImageSettings,
 ) -> Fragments:
-    """Gather the covered samples of one rasterized view.
+    """Gather the covered samples of one view that has been rasterized.
 
     Args:
         camera: Camera of the view.
         projected: Vertices as `Camera.project` returns them, shape (V, 3).
         depths: Depths of the vertices, shape (V,). None without perspective.
-        ids: Face of each sample of the image or -1, shape (size · s, size · s).
-        faces: Vertex indices of all faces, shape (F, 3).
+        face_ids: Index of the face at each sample of the image, or -1,
+            shape (size · s, size · s), with s = `settings.samples`.
+        faces: Vertex indices of the F faces of the mesh, shape (F, 3).
         settings: Size of the image and number of samples per pixel side.
 
     Returns:
-        Samples that show the mesh.
+        Covered samples of the view.
     """
     size = settings.size
     samples = settings.samples
-    # The s samples of a pixel in one row are moved as one item.
-    row_of_pixel = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)
-    ids_by_pixel = row_of_pixel.swapaxes(1, 2).reshape(-1).view(ids.dtype)
-    sample = np.flatnonzero(ids_by_pixel >= 0)
-    seen_faces, sample_to_seen_face = _compact(ids_by_pixel[sample], len(faces))
-    covered = _pixels_of_samples(sample, size, samples)
-    # All first corners are contiguous in memory, since they are read together,
-    # shape (3, G).
+    # Bring the ids from the order of image rows into the order of pixels. The s
+    # neighboring ids that lie in the same row and pixel are moved together, as one
+    # item of the byte type "V". The axes are the row of a pixel, the row in the
+    # pixel and the column of a pixel.
+    row_parts = face_ids.view(f"V{samples * face_ids.itemsize}").reshape(size, samples, size)
+    ids_by_pixel = row_parts.swapaxes(1, 2).reshape(-1).view(face_ids.dtype)
+    covered_samples = np.flatnonzero(ids_by_pixel >= 0)
+    seen_faces, sample_to_seen_face = _compact(ids_by_pixel[covered_samples], len(faces))
+    covered = _group_by_pixel(covered_samples, size, samples)
+    # Shape (3, G). All first corners are contiguous in memory, because later code
+    # reads them together.
     corners = np.ascontiguousarray(faces.take(seen_faces, axis=0).T)
-    # Shape (2, 3, G).
+    # Shape (2, 3, G), for x and y, three corners and G seen faces.
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
-    # The projected corners of a face that is seen from behind are clockwise.
-    is_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
+    # In the image, the corners of a face that is seen from behind are clockwise.
+    is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         size=size,
         samples=samples,
         pixels=torch.from_numpy(covered.pixels),
-        coverage=torch.from_numpy(covered.counts / samples**2),
+        coverage=torch.from_numpy(covered.sample_count / samples**2),
         faces=torch.from_numpy(seen_faces),
         corners=torch.from_numpy(corners).T,
-        facing=torch.from_numpy(np.where(is_behind, -1.0, 1.0))[:, None],
+        facing=torch.from_numpy(np.where(is_seen_from_behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        pixel=torch.from_numpy(covered.pixel),
+        pixel=torch.from_numpy(covered.sample_to_pixel),
         face=torch.from_numpy(sample_to_seen_face),
-        sample=torch.from_numpy(sample),
+        sample=torch.from_numpy(covered_samples),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
         camera=camera,
     )
 
 
-def _pixels_of_samples(sample: np.ndarray, size: int, samples: int) -> _CoveredSamples:
-    """Find the pixels with covered samples, from the positions of these samples (S,)."""
+def _group_by_pixel(covered_samples: np.ndarray, size: int, samples: int) -> _CoveredSamples:
+    """Find the pixels to which the S covered samples of an image belong.
+
+    Args:
+        covered_samples: Numbers of the covered samples, ascending, shape (S,).
+            All samples of the image are numbered pixel by pixel.
+        size: Width and height of the image in pixels.
+        samples: Number of samples along one side of a pixel.
+
+    Returns:
+        Pixels of the samples.
+    """
     if samples == 1:
-        # A sample is a pixel.
+        # Each sample is a pixel of its own.
         return _CoveredSamples(
-            pixels=sample,
-            counts=np.ones(len(sample), dtype=np.int64),
-            pixel=np.arange(len(sample)),
+            pixels=covered_samples,
+            sample_count=np.ones(len(covered_samples), dtype=np.int64),
+            sample_to_pixel=np.arange(len(covered_samples)),
         )
-    counts_of_all = np.bincount(sample // samples**2, minlength=size**2)
-    pixels = np.flatnonzero(counts_of_all > 0)
-    counts = counts_of_all[pixels]
+    samples_per_pixel = samples**2
+    counts_of_all_pixels = np.bincount(covered_samples // samples_per_pixel, minlength=size**2)
+    pixels = np.flatnonzero(counts_of_all_pixels > 0)
+    sample_count = counts_of_all_pixels[pixels]
     return _CoveredSamples(
         pixels=pixels,
-        counts=counts,
-        pixel=np.repeat(np.arange(len(pixels)), counts),
+        sample_count=sample_count,
+        sample_to_pixel=np.repeat(np.arange(len(pixels)), sample_count),
     )
 
 
 def _compact(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the distinct values, and the index of each value among them, as np.unique does.
+    """Find the distinct values of an array, and the index of each entry among them.
 
-    This takes less time than np.unique because it does not sort.
+    The result equals that of np.unique with return_inverse=True. This function
+    is faster, because it does not sort.
 
     Args:
         values: Whole numbers in [0, limit), shape (S,).
-        limit: Upper limit of the values.
+        limit: Number that is larger than all values.
 
     Returns:
         A tuple of
         - the G distinct values, ascending, shape (G,);
         - the index of each value among the distinct values, shape (S,).
     """
-    # One conversion here replaces one in each of the two lookups below.
+    # Both lookups below would convert the values, so convert them once.
     values = values.astype(np.intp)
     is_present = np.zeros(limit, dtype=bool)
     is_present[values] = True
-    distinct = np.flatnonzero(is_present)
-    # Entries of absent values stay undefined and are never read.
-    index_of_value = np.empty(limit, dtype=np.intp)
-    index_of_value[distinct] = np.arange(len(distinct))
-    return distinct, index_of_value.take(values)
+    distinct_values = np.flatnonzero(is_present)
+    # Entries of values that do not occur stay undefined and are never read.
+    value_to_index = np.empty(limit, dtype=np.intp)
+    value_to_index[distinct_values] = np.arange(len(distinct_values))
+    return distinct_values, value_to_index.take(values)

@@ -330,9 +330,9 @@ def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
-    monkeypatch.setattr(lamp_paths, "SMALL", 0)
+    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(mesh, basis, samples=2)
-    monkeypatch.setattr(lamp_paths, "SPARSE", 0)
+    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
     dense = operator_of(mesh, basis, samples=2)
     assert sparse.sparse is not None
     assert dense.sparse is None
@@ -350,7 +350,7 @@ def test_sparse_transfer_holds_only_the_lit_entries_of_local_lights(
     monkeypatch,
 ):
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
-    monkeypatch.setattr(lamp_paths, "SMALL", 0)
+    monkeypatch.setattr(lamp_paths, "SMALL_MATRIX_SIZE", 0)
     sparse = operator_of(ball(), basis, samples=2)
     assert len(sparse.nonzero) == len(HARMONICS.nonzero)
     dense_count = Projector(16).size * len(sparse.pixels)
