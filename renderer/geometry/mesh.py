@@ -1,7 +1,9 @@
-"""Triangle meshes with colors, and operations on them: normalize, subdivide, concatenate.
+"""Triangle meshes with colors, and functions that normalize, divide and join meshes.
 
 World axes are right-handed with z up. Colors are stored as they are displayed
-(sRGB-encoded). Computing with light needs them decoded.
+(sRGB-encoded). Shading first decodes them to linear values.
+
+Shapes use these letters: a mesh has V vertices and F faces.
 """
 
 from __future__ import annotations
@@ -22,11 +24,13 @@ from renderer.geometry.skin import Skin
 from renderer.settings import MAX_VERTICES
 from renderer.validation import as_array, require_whole
 
-# Affine matrix that turns the y axis to the z axis.
+# Affine matrix, shape (4, 4), that rotates the y-axis to the z-axis. Loaders use it
+# for files in which y points up.
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Value of `Mesh.texture_ids` for a face without a texture.
 NO_TEXTURE = -1
-# Kinds of NumPy types (f: floating, i: signed, u: unsigned) of the arrays of a mesh.
+# Allowed values of `dtype.kind` for each array of a mesh (f: floating-point, i:
+# signed integer, u: unsigned integer).
 _KINDS = {
     "vertices": "fiu",
     "faces": "iu",
@@ -35,48 +39,56 @@ _KINDS = {
     "texture_ids": "iu",
     "gloss": "fiu",
 }
-# Attributes of a mesh that have a row for each face.
+# Names of the attributes of a mesh that have a row for each face.
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids", "gloss")
-# Corners of a face at the two ends of each of its edges.
+# For each of the three edges of a face, the numbers (0 to 2) of the two corners at
+# its ends.
 EDGES = ((0, 1), (1, 2), (2, 0))
-# Corners of the quarters of a face. Points 0 to 2 are the corners of the face,
-# and points 3 to 5 are the midpoints of its `EDGES`.
+# `_quartered` divides a face into these four triangles. Points 0 to 2 are the
+# corners of the face, and points 3 to 5 are the midpoints of its `EDGES`.
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-# Gloss of a face of a matte mesh, when it is joined with a glossy mesh.
+# Row of `Mesh.gloss` (roughness, metallic, specular factor) for a face without
+# specular reflection. `concatenate` uses the row for matte meshes if another mesh
+# has gloss.
 _MATTE = np.array([[1, 0, 0]], dtype=np.float32)
-# Gloss texture that changes nothing, for a texture without one.
+# Gloss texture with one texel, whose factors are 1. `concatenate` uses it for
+# textures of meshes that have no gloss textures.
 _NEUTRAL_GLOSS = np.full((1, 1, 2), 255, dtype=np.uint8)
-# Factors that put red, green and blue in the bits from 0, 8 and 16.
+# Factors for red, green and blue in [0, 255] that pack a texel into one integer:
+# red in bits 0 to 7, green in bits 8 to 15, and blue in bits 16 to 23.
 _PACKING = np.array([1, 2**8, 2**16], dtype=np.int32)
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """F triangles over V vertices, with colors at the corners of each triangle.
+    """Triangle mesh with F faces, V vertices, and a color at each corner of a face.
 
-    Corners at one vertex may have different colors, so a seam between colors
-    needs no second vertex.
+    Two faces with a common vertex may have different colors at this vertex.
 
     Attributes:
-        vertices: Positions in world coordinates, shape (V, 3), float64.
-        faces: Indices of the vertices of each face, shape (F, 3), int64,
-            counter-clockwise from outside.
-        corner_colors: sRGB-encoded colors in [0, 1], shape (F, 3, 3), float32.
-        corner_uvs: Texture coordinates, with the origin at the bottom left of
-            the texture, shape (F, 3, 2), float32. Zeros without a texture.
-        texture_ids: Index of the texture of each face, shape (F,), int32, or
-            `NO_TEXTURE`.
-        textures: sRGB-encoded textures, shape (H, W, 3) each, uint8. Row 0 is
-            the top.
-        gloss: Roughness, metallic and specular factor of each face in [0, 1]
-            (`nb.Gloss`), shape (F, 3), float32. None for a matte mesh.
-        gloss_textures: For each of the textures, factors of roughness and
-            metallic, shape (H, W, 2) each, uint8. Empty without such textures.
-        skin: Joints that carry the vertices. None without joints.
+        vertices: Positions in world axes, float64, shape (V, 3).
+        faces: Vertex indices of the three corners of each face, counter-clockwise
+            seen from outside, int64, shape (F, 3).
+        corner_colors: sRGB-encoded colors in [0, 1] of the three corners of each
+            face, float32, shape (F, 3, 3).
+        corner_uvs: Texture coordinates of the three corners of each face,
+            float32, shape (F, 3, 2). The origin is the bottom left corner of the
+            texture. Zeros for faces without a texture.
+        texture_ids: Index in `textures` of the texture of each face, or
+            `NO_TEXTURE`, int32, shape (F,).
+        textures: sRGB-encoded textures, uint8, shape (H, W, 3) each, for H rows
+            and W columns of texels. Row 0 is at the top.
+        gloss: Roughness, metallic and specular factor of each face, in [0, 1]
+            (see `nb.Gloss`), float32, shape (F, 3). None for a matte mesh.
+        gloss_textures: For each texture, a texture with factors for roughness
+            and metallic, uint8, shape (H, W, 2) each, with 255 for the factor 1.
+            Empty if the mesh has no gloss textures.
+        skin: Joints that move the vertices (linear blend skinning). None without
+            joints.
 
     Raises:
-        InputError: If an array has another shape or type, there are no faces, or
-            an index is out of range.
+        InputError: If an array has a wrong shape or type, if there are no faces,
+            or if an index is out of range.
 
     Example:
         >>> import norm_balls as nb
@@ -102,24 +114,27 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Convert lists to arrays, and check shapes, types and indices."""
+        # object.__setattr__ is needed to set attributes of a frozen dataclass.
         for name, kinds in _KINDS.items():
             value = getattr(self, name)
-            is_no_gloss = name == "gloss" and value is None
-            if not isinstance(value, np.ndarray) and not is_no_gloss:
+            is_matte = name == "gloss" and value is None
+            if not isinstance(value, np.ndarray) and not is_matte:
                 object.__setattr__(self, name, as_array(name, value, kinds))
         self._require_shapes()
         self._require_indices()
-        object.__setattr__(self, "textures", _as_textures("textures", self.textures, 3))
-        factors = _as_textures("gloss_textures", self.gloss_textures, 2)
-        object.__setattr__(self, "gloss_textures", factors)
+        textures = _as_textures("textures", self.textures, 3)
+        object.__setattr__(self, "textures", textures)
+        gloss_textures = _as_textures("gloss_textures", self.gloss_textures, 2)
+        object.__setattr__(self, "gloss_textures", gloss_textures)
         if self.texture_ids.max() >= len(self.textures):
             raise InputError(
-                "texture_ids name textures that are not there: "
-                f"give indices below {len(self.textures)}"
+                f"texture_ids has the index {self.texture_ids.max()}, but the mesh has "
+                f"{len(self.textures)} textures: give indices below {len(self.textures)}, "
+                f"or {NO_TEXTURE} for faces without a texture"
             )
 
     def _require_shapes(self) -> None:
-        """Raise `InputError` if an array has another shape or type."""
+        """Raise `InputError` if an array of the mesh has a wrong shape or type."""
         vertex_count = len(self.vertices) if self.vertices.ndim else 0
         face_count = len(self.faces) if self.faces.ndim else 0
         shapes = {
@@ -135,53 +150,60 @@ class Mesh:
             values = getattr(self, name)
             if values.shape != shape or values.dtype.kind not in _KINDS[name]:
                 raise InputError(
-                    f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}"
+                    f"{name} has the type {values.dtype} and the shape {values.shape}: "
+                    f"give numbers in the shape {shape}"
                 )
 
     def _require_indices(self) -> None:
-        """Raise `InputError` if there are no faces, or they have vertices that are not there."""
+        """Raise `InputError` if there are no faces, or if a vertex index is out of range."""
         require_range("the number of faces", len(self.faces), 1, np.inf)
         vertex_count = len(self.vertices)
-        if not 0 <= self.faces.min() <= self.faces.max() < vertex_count:
+        lowest = self.faces.min()
+        highest = self.faces.max()
+        if not 0 <= lowest <= highest < vertex_count:
             raise InputError(
-                f"faces name vertices that are not there: give indices from 0 to {vertex_count - 1}"
+                f"faces has vertex indices from {lowest} to {highest}, but the mesh has "
+                f"{vertex_count} vertices: give indices from 0 to {vertex_count - 1}"
             )
 
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
-        """Make a mesh without textures.
+        """Create a mesh without textures.
 
         Args:
-            vertices: Positions in world coordinates, shape (V, 3).
-            faces: Indices of vertices, shape (F, 3), counter-clockwise from
-                outside.
-            color: sRGB-encoded color in [0, 1], shape (3,), or one per vertex,
-                shape (V, 3).
+            vertices: Positions in world axes, shape (V, 3).
+            faces: Vertex indices of the three corners of each face,
+                counter-clockwise seen from outside, shape (F, 3).
+            color: sRGB-encoded color in [0, 1], shape (3,), or one color per
+                vertex, shape (V, 3).
 
         Returns:
-            The mesh.
+            Matte mesh with float64 vertices.
 
         Raises:
-            InputError: If an argument has another shape or is out of range.
+            InputError: If an argument has a wrong shape or is out of range.
         """
         vertices = np.array(as_array("vertices", vertices), dtype=np.float64)
         given_faces = as_array("faces", faces)
-        # NaN becomes an arbitrary integer here, and is refused below.
+        # The conversion turns NaN into an arbitrary integer. The comparison below
+        # then raises the error.
         with np.errstate(invalid="ignore"):
             faces = given_faces.astype(np.int64)
         if not np.array_equal(faces, given_faces):
-            raise InputError("faces holds numbers that are not whole: give indices of vertices")
+            raise InputError("faces has numbers that are not whole: give the indices of vertices")
         color = as_array("color", color).astype(np.float32)
         if not color.size or not (color.min() >= 0 and color.max() <= 1):
             given = reprlib.repr(color.tolist())
-            raise InputError(f"color={given}: give red, green and blue from 0 to 1")
+            raise InputError(f"color={given} is not a color: give red, green and blue from 0 to 1")
         try:
             vertex_colors = np.broadcast_to(color, vertices.shape)
-            # The constructor refuses indices out of range, which are clipped here.
+            # Indices out of range are clipped here. `Mesh(...)` below raises an error
+            # that names them.
             corner_colors = vertex_colors.take(faces, axis=0, mode="clip")
         except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(
-                f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)"
+                f"vertices, faces and color do not fit together ({error}): give the shapes "
+                "(V, 3), (F, 3) and (3,)"
             ) from error
         return Mesh(
             vertices=vertices,
@@ -192,121 +214,152 @@ class Mesh:
         )
 
     def face_normals(self) -> np.ndarray:
-        """Return the outward unit normals of the faces, shape (F, 3).
+        """Compute the outward unit normals of the F faces, shape (F, 3).
 
-        A face without area has the zero vector.
+        The normal of a face without area is zero.
         """
         return plain_face_normals(self.vertices, self.faces)
 
     def face_areas(self) -> np.ndarray:
-        """Return the areas of the faces in squared world units, shape (F,)."""
-        doubled = doubled_area_vectors(self.vertices, self.faces)
-        return np.linalg.norm(doubled, axis=1) / 2
+        """Compute the areas of the F faces in squared world units, shape (F,)."""
+        # The length of such a vector is twice the area of its face.
+        doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
+        return np.linalg.norm(doubled_vectors, axis=1) / 2
 
     @cached_property
     def vertex_normals(self) -> np.ndarray:
-        """Return `renderer.geometry.normals.vertex_normals` of the mesh, shape (V, 3)."""
+        """Outward unit normals of the V vertices, shape (V, 3).
+
+        The normal of a vertex is the mean of the normals of the faces around it,
+        weighted with their areas (see `renderer.geometry.normals`).
+        """
         return vertex_normals(torch.from_numpy(self.vertices), torch.from_numpy(self.faces)).numpy()
 
     @cached_property
     def displayable(self) -> bool:
-        """Return whether all colors are in [0, 1]. NaN is not."""
+        """True if all corner colors are in [0, 1], and none of them is NaN."""
         return bool(self.corner_colors.min() >= 0 and self.corner_colors.max() <= 1)
 
     @cached_property
     def one_color_per_face(self) -> bool:
-        """Return whether the corners of each face have the same color."""
+        """True if the three corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     def moved(self, vertices: np.ndarray) -> Mesh:
-        """Return a copy with other vertex positions, without a skin.
+        """Return a copy with other vertex positions and without a skin.
 
         Args:
-            vertices: Positions, shape (V, 3).
+            vertices: Vertex positions of the copy, shape (V, 3).
         """
-        mesh = replace(self, vertices=vertices, skin=None)
-        # Packing textures takes long, so the copy shares the packed ones.
-        mesh.__dict__["packed_textures"] = self.packed_textures
-        return mesh
+        moved_mesh = replace(self, vertices=vertices, skin=None)
+        # Packing textures takes long, so the copy gets the cached packed textures.
+        moved_mesh.__dict__["packed_textures"] = self.packed_textures
+        return moved_mesh
 
     @cached_property
     def packed_textures(self) -> tuple[np.ndarray, ...]:
-        """Return the textures with one number per texel, shape (H, W) each, int32.
+        """Textures with one integer per texel, int32, shape (H, W) each.
 
-        Red, green and blue are in the bits from 0, 8 and 16. One number is
-        looked up faster than three.
+        Bits 0 to 7 of a texel are red, 8 to 15 green, and 16 to 23 blue. Looking
+        up one integer is faster than looking up three.
         """
         return tuple(texture.astype(np.int32) @ _PACKING for texture in self.textures)
 
     @cached_property
     def closed(self) -> bool:
-        """Return whether no face is ever seen from behind.
+        """True if no camera outside of the mesh can see a face from behind.
 
-        Every connected part of the mesh is then watertight, with faces that are
-        counter-clockwise from outside. This is so if each edge occurs once in
-        either direction, and if the faces of a part enclose a positive volume.
+        Each connected part of the mesh must be watertight, and its faces must be
+        counter-clockwise seen from outside. A part fulfills this if each of its
+        edges occurs once in both directions, and if its faces enclose a positive
+        volume.
         """
         part_of_face = _closed_parts(self.faces.astype(np.int64).tobytes())
         if part_of_face is None:
             return False
-        corners = (self.vertices - self.vertices.mean(axis=0))[self.faces[:, 0]]
-        # Six times the volume of the tetrahedron of each face and the center.
-        volumes = np.einsum("fi,fi->f", corners, doubled_area_vectors(self.vertices, self.faces))
-        return bool((np.bincount(part_of_face, volumes) > 0).all())
+        centered_vertices = self.vertices - self.vertices.mean(axis=0)
+        first_corners = centered_vertices[self.faces[:, 0]]
+        # A face and the center form a tetrahedron. This is six times its volume,
+        # negative if the face points to the center, shape (F,).
+        volumes = np.einsum(
+            "fi,fi->f", first_corners, doubled_area_vectors(self.vertices, self.faces)
+        )
+        volume_of_part = np.bincount(part_of_face, volumes)
+        return bool((volume_of_part > 0).all())
 
 
-# The last result is kept, because the instances of a solid have the same faces.
+# The cache keeps the last result, because all instances of a procedural solid have
+# the same faces.
 @lru_cache(maxsize=1)
-def _closed_parts(faces: bytes) -> np.ndarray | None:
-    """Return the connected part (F,) of each face, or None for an open mesh.
+def _closed_parts(face_bytes: bytes) -> np.ndarray | None:
+    """Find the connected parts of a mesh if each edge occurs once in both directions.
 
-    The argument holds faces (F, 3) of int64. In a closed mesh, each edge occurs
-    once in either direction.
+    Args:
+        face_bytes: Bytes of the int64 array `Mesh.faces`, shape (F, 3). Bytes can
+            be hashed, so that the result can be cached.
+
+    Returns:
+        Index of the connected part of each face, shape (F,). None if an edge has
+        only one face, or more than two faces.
     """
-    # Importing trimesh takes half a second.
+    # trimesh is imported here because the import takes half a second.
     from trimesh.graph import connected_component_labels
 
-    corners = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
-    edges = corners[:, EDGES].reshape(-1, 2)
-    vertex_count = corners.max(initial=0) + 1
-    # Each edge from vertex a to vertex b gets the number a · V + b, and in the
-    # opposite direction b · V + a. In a closed mesh, both sets of numbers are equal.
-    forward = edges @ [vertex_count, 1]
-    backward = edges @ [1, vertex_count]
-    by_forward = np.argsort(forward)
-    by_backward = np.argsort(backward)
-    is_repeated = (np.diff(forward[by_forward]) == 0).any()
-    if is_repeated or not np.array_equal(forward[by_forward], backward[by_backward]):
+    faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
+    # Vertices at both ends of the three edges of each face, shape (3 F, 2). The
+    # edges 3 f, 3 f + 1 and 3 f + 2 belong to face f.
+    edge_ends = faces[:, EDGES].reshape(-1, 2)
+    vertex_count = faces.max(initial=0) + 1
+    # An edge from vertex a to vertex b gets the key a · V + b, and the reversed edge
+    # b · V + a. If each edge occurs in both directions, both sets of keys are equal.
+    keys = edge_ends @ [vertex_count, 1]
+    reversed_keys = edge_ends @ [1, vertex_count]
+    key_order = np.argsort(keys)
+    reversed_key_order = np.argsort(reversed_keys)
+    is_repeated = (np.diff(keys[key_order]) == 0).any()
+    if is_repeated or not np.array_equal(keys[key_order], reversed_keys[reversed_key_order]):
         return None
-    # Row i of the sorted lists is one edge of two faces. The edges 3 f to 3 f + 2
-    # are those of face f.
-    neighbors = np.stack([by_forward, by_backward], axis=1) // 3
-    return connected_component_labels(neighbors, node_count=len(corners))
+    # Entry i of both orders is the same edge, in two faces. Dividing by 3 gives
+    # these two faces, shape (3 F, 2).
+    neighboring_faces = np.stack([key_order, reversed_key_order], axis=1) // 3
+    return connected_component_labels(neighboring_faces, node_count=len(faces))
 
 
 def _as_textures(name: str, textures: object, channels: int) -> tuple[np.ndarray, ...]:
-    """Convert textures to arrays (height, width, channels) of uint8, or raise `InputError`."""
+    """Check textures, and convert them to a tuple of arrays.
+
+    Args:
+        name: Name of the argument in the error.
+        textures: List or tuple of textures.
+        channels: Number of channels that each texture must have.
+
+    Returns:
+        Textures, uint8, shape (H, W, channels) each. A tuple of arrays is
+        returned as it is.
+
+    Raises:
+        InputError: If a texture has a wrong shape or type.
+    """
     expected = f"a list of arrays (height, width, {channels}) of uint8"
     if not isinstance(textures, list | tuple):
         raise InputError(f"{name} is {describe(textures)}: give {expected}")
     arrays = [as_array(name, texture) for texture in textures]
     for array in arrays:
         if array.ndim != 3 or array.shape[2] != channels or array.dtype != np.uint8:
-            raise InputError(f"{name} holds {describe(array)}: give {expected}")
+            raise InputError(f"{name} has a texture that is {describe(array)}: give {expected}")
     is_unchanged = all(array is texture for array, texture in zip(arrays, textures, strict=True))
     return textures if isinstance(textures, tuple) and is_unchanged else tuple(arrays)
 
 
 def require_mesh(name: str, value: object) -> None:
-    """Check that an argument is a mesh whose colors can be displayed.
+    """Check that an argument is a mesh with colors in [0, 1].
 
     Args:
         name: Name of the argument in the error.
-        value: The argument.
+        value: Value of the argument.
 
     Raises:
-        InputError: If it has another type, such as a path, or a color is not in
-            [0, 1].
+        InputError: If the value is no `Mesh`, or if a color is not in [0, 1].
     """
     if not isinstance(value, Mesh):
         path = repr(value) if isinstance(value, str) else "path"
@@ -316,27 +369,29 @@ def require_mesh(name: str, value: object) -> None:
         )
     if not value.displayable:
         raise InputError(
-            f"{name}: its corner_colors hold values beyond [0, 1]: divide colors of 8 bits by 255"
+            f"{name}.corner_colors has values outside of [0, 1]: divide 8-bit colors by 255"
         )
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
-    """Join meshes to one mesh with the faces of all of them, in order.
+    """Join several meshes to one mesh, which has the faces of all meshes in order.
 
-    Vertices are not merged. The joints are those of the first mesh, and do not
-    carry the vertices of meshes without joints.
+    Vertices are not merged. The result has the joints of the first mesh. These
+    joints do not move the vertices of meshes that have no joints.
 
     Args:
-        meshes: At least one mesh.
+        meshes: One or more meshes.
     """
+    # The indices of vertices and textures of a mesh grow by the numbers of vertices
+    # and textures of the meshes before it.
     faces = []
     texture_ids = []
     vertex_count = 0
     texture_count = 0
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
-        shifted = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
-        texture_ids.append(shifted.astype(np.int32))
+        shifted_ids = np.where(mesh.texture_ids < 0, NO_TEXTURE, mesh.texture_ids + texture_count)
+        texture_ids.append(shifted_ids.astype(np.int32))
         vertex_count += len(mesh.vertices)
         texture_count += len(mesh.textures)
     return Mesh(
@@ -346,61 +401,91 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
         texture_ids=np.concatenate(texture_ids),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
-        gloss=_joined_gloss(meshes),
-        gloss_textures=_joined_gloss_textures(meshes),
-        skin=_joined_skin(meshes),
+        gloss=_concatenate_gloss(meshes),
+        gloss_textures=_concatenate_gloss_textures(meshes),
+        skin=_concatenate_skins(meshes),
     )
 
 
-def _joined_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
-    """Return the gloss of the faces of all meshes, or None if all are matte."""
+def _concatenate_gloss(meshes: Sequence[Mesh]) -> np.ndarray | None:
+    """Concatenate the gloss of the faces of several meshes.
+
+    Args:
+        meshes: Meshes with F faces in total.
+
+    Returns:
+        Roughness, metallic and specular factor of each face, float32,
+        shape (F, 3). None if all meshes are matte.
+    """
     if all(mesh.gloss is None for mesh in meshes):
         return None
-    rows = []
+    gloss_by_mesh = []
     for mesh in meshes:
-        rows.append(_MATTE.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss)
-    return np.concatenate(rows)
+        matte_gloss = _MATTE.repeat(len(mesh.faces), 0)
+        gloss_by_mesh.append(matte_gloss if mesh.gloss is None else mesh.gloss)
+    return np.concatenate(gloss_by_mesh)
 
 
-def _joined_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
-    """Return a gloss texture for each texture of all meshes, or nothing if no mesh has any."""
+def _concatenate_gloss_textures(meshes: Sequence[Mesh]) -> tuple[np.ndarray, ...]:
+    """Concatenate the gloss textures of several meshes.
+
+    Args:
+        meshes: Meshes with T textures in total.
+
+    Returns:
+        T gloss textures, uint8, shape (H, W, 2) each. Textures of a mesh without
+        gloss textures get a neutral gloss texture. Empty if no mesh has gloss
+        textures.
+    """
     if not any(mesh.gloss_textures for mesh in meshes):
         return ()
-    joined: list[np.ndarray] = []
+    gloss_textures: list[np.ndarray] = []
     for mesh in meshes:
-        joined += mesh.gloss_textures or (_NEUTRAL_GLOSS,) * len(mesh.textures)
-    return tuple(joined)
+        neutral_textures = (_NEUTRAL_GLOSS,) * len(mesh.textures)
+        gloss_textures += mesh.gloss_textures or neutral_textures
+    return tuple(gloss_textures)
 
 
-def _joined_skin(meshes: Sequence[Mesh]) -> Skin | None:
-    """Return the skin of the first mesh, extended by the vertices of all meshes."""
+def _concatenate_skins(meshes: Sequence[Mesh]) -> Skin | None:
+    """Extend the skin of the first mesh to the vertices of several meshes.
+
+    Args:
+        meshes: Meshes with V vertices in total.
+
+    Returns:
+        Skin with the J joints of the first mesh. Its array `carried`,
+        shape (V, J, 4), is zero for the vertices of meshes without a skin, so no
+        joint moves them. None if the first mesh has no skin.
+    """
     skin = meshes[0].skin
     if skin is None:
         return None
-    rows = []
+    carried_by_mesh = []
     for mesh in meshes:
-        uncarried = np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32)
-        rows.append(mesh.skin.carried if mesh.skin else uncarried)
-    return replace(skin, carried=np.concatenate(rows))
+        zeros = np.zeros((len(mesh.vertices), *skin.carried.shape[1:]), dtype=np.float32)
+        carried_by_mesh.append(mesh.skin.carried if mesh.skin else zeros)
+    return replace(skin, carried=np.concatenate(carried_by_mesh))
 
 
 def normalize(mesh: Mesh) -> Mesh:
     """Return a copy of a mesh that is centered and scaled to the cube [-1, 1]³.
 
-    The centroid of the faces, weighted with their areas, moves to the origin.
-    (This is also the average of the vertices, weighted with the areas around
-    them, as in the paper's appendix.) The largest magnitude of a coordinate
-    becomes 1. The vertices are rounded to float32, which files hold exactly, so
-    a mesh that is read back covers the same pixels.
+    The centroid of the surface moves to the origin. It is the mean of the face
+    centers, weighted with the areas of the faces. (The paper's appendix averages
+    the vertices, weighted with the areas around them, which gives the same
+    point.) The largest magnitude of a coordinate becomes 1. The vertices are
+    rounded to float32. Mesh files store float32 numbers exactly, so a mesh that
+    is saved and loaded covers the same pixels.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh to normalize.
 
     Returns:
-        The normalized mesh, with float64 vertices.
+        Normalized mesh, with float64 vertices.
 
     Raises:
-        InputError: If the surface has no area. `load_mesh` ensures that it has.
+        InputError: If the surface has no area. A mesh from `load_mesh` always
+            has an area.
 
     Example:
         >>> import numpy as np
@@ -410,76 +495,85 @@ def normalize(mesh: Mesh) -> Mesh:
         1.0
     """
     require_mesh("mesh", mesh)
-    center, largest = center_and_extent(mesh)
+    center, extent = center_and_extent(mesh)
     centered = mesh.vertices - center
-    scaled = (centered / largest).astype(np.float32).astype(np.float64)
+    normalized = (centered / extent).astype(np.float32).astype(np.float64)
+    # The same transformation as an affine matrix, for the joints.
     matrix = np.eye(4)
-    matrix[:3] = np.column_stack([np.eye(3), -center]) / largest
+    matrix[:3] = np.column_stack([np.eye(3), -center]) / extent
     skin = mesh.skin and mesh.skin.transformed(matrix)
-    return replace(mesh, vertices=scaled, skin=skin)
+    return replace(mesh, vertices=normalized, skin=skin)
 
 
 def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
-    """Return the center and the extent that `normalize` brings to the origin and to 1.
+    """Compute the center of a mesh and its largest extent from the center.
+
+    `normalize` moves the center to the origin and scales the extent to 1.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh with F faces.
 
     Returns:
         A tuple of
-        - the centroid of the faces, weighted with their areas, shape (3,);
-        - the largest difference of a coordinate from the centroid.
+        - the mean of the face centers, weighted with the areas of the faces, in
+          world axes, shape (3,);
+        - the largest distance of a vertex from the center along an axis, in
+          world units.
 
     Raises:
         InputError: If the surface has no area.
     """
     areas = mesh.face_areas()
     if not areas.sum() > 0:
-        raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
-    centroids = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
-    center = np.average(centroids, axis=0, weights=areas)
+        raise InputError(
+            "the surface of the mesh has the area 0: give a mesh whose faces have an area"
+        )
+    face_centers = mesh.vertices.take(mesh.faces, axis=0).mean(axis=1)
+    center = np.average(face_centers, axis=0, weights=areas)
     return center, np.abs(mesh.vertices - center).max()
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """Return a copy of a mesh under an affine transformation.
+    """Return a copy of a mesh to which an affine transformation is applied.
 
-    A matrix that mirrors reverses the corners of the faces, so that normals stay
-    outward.
+    If the transformation mirrors the mesh, the order of the corners of each face
+    is reversed. The faces then stay counter-clockwise seen from outside.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh to transform.
         matrix: Affine matrix, shape (4, 4).
     """
     is_mirroring = np.linalg.det(matrix[:3, :3]) < 0
-    order = [0, 2, 1] if is_mirroring else [0, 1, 2]
+    corner_order = [0, 2, 1] if is_mirroring else [0, 1, 2]
     return replace(
         mesh,
         vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
-        faces=mesh.faces[:, order],
-        corner_colors=mesh.corner_colors[:, order],
-        corner_uvs=mesh.corner_uvs[:, order],
+        faces=mesh.faces[:, corner_order],
+        corner_colors=mesh.corner_colors[:, corner_order],
+        corner_uvs=mesh.corner_uvs[:, corner_order],
         skin=mesh.skin and mesh.skin.transformed(matrix),
     )
 
 
 def subdivide(mesh: Mesh, vertices: float) -> Mesh:
-    """Divide every face into four, until there are more vertices than a number.
+    """Divide all faces of a mesh into four, until the mesh has more than `vertices` vertices.
 
     The surface stays the same. New vertices are the midpoints of edges. Faces
-    that share an edge share the new vertex, so a closed mesh stays closed. Colors
-    (sRGB-encoded) and texture coordinates are interpolated. The old vertices
-    keep their indices, and the quarters of face f are the faces 4f to 4f + 3.
+    that share an edge share the new vertex, so a closed mesh stays closed. The
+    sRGB-encoded colors and the texture coordinates are interpolated. The old
+    vertices keep their indices. In one division, face f becomes the faces 4 f to
+    4 f + 3.
 
     Args:
-        mesh: The mesh.
-        vertices: The number, from 0 to `MAX_VERTICES`.
+        mesh: Mesh to divide.
+        vertices: Number of vertices that the result must exceed, from 0 to
+            `MAX_VERTICES`.
 
     Returns:
-        The subdivided mesh, or the given mesh if it has enough vertices.
+        Divided mesh. The given mesh if it has more vertices already.
 
     Raises:
-        InputError: If the number is not whole or out of range.
+        InputError: If `vertices` is not whole or out of range.
 
     Example:
         >>> import norm_balls as nb
@@ -489,7 +583,7 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
         (True, 0)
     """
     require_mesh("mesh", mesh)
-    # Whole numbers such as 1e4 are accepted.
+    # Floating-point numbers with whole values, such as 1e4, are accepted.
     is_whole_float = isinstance(vertices, float) and vertices.is_integer()
     require_whole("vertices", int(vertices) if is_whole_float else vertices)
     require_range("vertices", vertices, 0, MAX_VERTICES)
@@ -499,76 +593,102 @@ def subdivide(mesh: Mesh, vertices: float) -> Mesh:
 
 
 def refine(mesh: Mesh, area: float) -> Mesh:
-    """Divide faces into four until none has more than some area.
+    """Divide the large faces of a mesh into four, until all faces are small enough.
 
-    The surface stays the same. The faces come in another order. The old vertices
-    keep their indices, and new vertices may lie on the edge of a neighbor.
+    The surface stays the same, but the faces are in another order. The old
+    vertices keep their indices. A new vertex of a divided face may lie in the
+    middle of an edge of an undivided neighbor.
 
     Args:
-        mesh: The mesh.
-        area: Largest area of a face in squared world units.
+        mesh: Mesh to divide.
+        area: Largest allowed area of a face in squared world units.
 
     Returns:
-        The refined mesh, or the given mesh if no face is larger.
+        Divided mesh. The given mesh if all its faces are small enough.
     """
     is_large = mesh.face_areas() > area
     if not is_large.any():
         return mesh
     if is_large.all():
         return refine(_quartered(mesh), area)
-    small = select_faces(mesh, ~is_large)
-    refined = refine(_quartered(select_faces(mesh, is_large)), area)
-    joined: dict[str, Any] = {}
+    small_faces = select_faces(mesh, ~is_large)
+    # This mesh keeps the old vertices, so the indices of the small faces stay valid.
+    divided = refine(_quartered(select_faces(mesh, is_large)), area)
+    rows_of_all_faces: dict[str, Any] = {}
     for name in PER_FACE:
-        rows_of_small = getattr(small, name)
-        if rows_of_small is not None:
-            joined[name] = np.concatenate([rows_of_small, getattr(refined, name)])
-    return replace(refined, **joined)
+        rows_of_small_faces = getattr(small_faces, name)
+        # `gloss` is None for a matte mesh.
+        if rows_of_small_faces is not None:
+            rows = [rows_of_small_faces, getattr(divided, name)]
+            rows_of_all_faces[name] = np.concatenate(rows)
+    return replace(divided, **rows_of_all_faces)
 
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
     """Return a copy of a mesh with some of its faces and all of its vertices.
 
     Args:
-        mesh: The mesh.
-        faces: Indices, a mask or a slice of the faces to keep.
+        mesh: Mesh with F faces.
+        faces: Faces to keep: indices, a mask of shape (F,), or a slice.
     """
-    kept = {}
+    selected_rows = {}
     for name in PER_FACE:
         rows = getattr(mesh, name)
+        # `gloss` is None for a matte mesh.
         if rows is not None:
-            kept[name] = rows[faces]
-    return replace(mesh, **kept)
+            selected_rows[name] = rows[faces]
+    return replace(mesh, **selected_rows)
 
 
 def _quartered(mesh: Mesh) -> Mesh:
-    """Divide every face of a mesh into four."""
+    """Return a copy of a mesh in which each of the F faces is divided into four.
+
+    New vertices are the midpoints of edges. Faces that share an edge share its
+    midpoint.
+    """
     vertex_count = len(mesh.vertices)
-    ends_of_corners = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
-    # One number for each edge is sorted faster than a pair of vertices.
-    keys, edge_of_corner = np.unique(ends_of_corners @ [vertex_count, 1], return_inverse=True)
-    edge_ends = np.stack(np.divmod(keys, vertex_count), axis=1)
+    # Vertices at both ends of the three sides of each face, the lower index first,
+    # shape (3 F, 2).
+    side_ends = np.sort(mesh.faces[:, EDGES].reshape(-1, 2), axis=1)
+    # Two faces that share an edge have a side with the same key. np.unique sorts
+    # one number per side faster than a pair of vertices.
+    side_keys = side_ends @ [vertex_count, 1]
+    edge_keys, edge_of_side = np.unique(side_keys, return_inverse=True)
+    # Vertices at both ends of each edge, shape (edges, 2).
+    edge_ends = np.stack(np.divmod(edge_keys, vertex_count), axis=1)
     midpoints = mesh.vertices[edge_ends].mean(axis=1)
     skin = mesh.skin
     if skin is not None:
         carried = np.concatenate([skin.carried, skin.carried[edge_ends].mean(axis=1)])
         skin = replace(skin, carried=carried)
-    # The vertices of the six points of each face, shape (F, 6).
-    points = np.concatenate([mesh.faces, vertex_count + edge_of_corner.reshape(-1, 3)], axis=1)
+    # Vertices of the three corners and of the three midpoints of each face,
+    # shape (F, 6). The midpoints follow the old vertices.
+    midpoint_vertices = vertex_count + edge_of_side.reshape(-1, 3)
+    points = np.concatenate([mesh.faces, midpoint_vertices], axis=1)
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, midpoints]),
         faces=points[:, _QUARTERS].reshape(-1, 3),
-        corner_colors=_interpolated(mesh.corner_colors),
-        corner_uvs=_interpolated(mesh.corner_uvs),
+        corner_colors=_interpolate_quarters(mesh.corner_colors),
+        corner_uvs=_interpolate_quarters(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),
         skin=skin,
     )
 
 
-def _interpolated(corners: np.ndarray) -> np.ndarray:
-    """Return values (4F, 3, D) at the corners of quarters, from values (F, 3, D) of faces."""
-    midpoints = corners[:, EDGES].mean(axis=2)
-    points = np.concatenate([corners, midpoints], axis=1)
-    return points[:, _QUARTERS].reshape(-1, *corners.shape[1:])
+def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
+    """Interpolate values at the corners of faces to the corners of their quarters.
+
+    Args:
+        corner_values: D values at the three corners of F faces, shape (F, 3, D).
+
+    Returns:
+        Values at the corners of the four quarters of each face, in the order of
+        `_QUARTERS`, shape (4 F, 3, D).
+    """
+    # The EDGES select two corners each, shape (F, 3 edges, 2 ends, D).
+    midpoint_values = corner_values[:, EDGES].mean(axis=2)
+    # Shape (F, 6, D).
+    point_values = np.concatenate([corner_values, midpoint_values], axis=1)
+    return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])

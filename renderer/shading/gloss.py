@@ -1,28 +1,32 @@
-"""Gloss (specular reflection) of surfaces in the terms of glTF 2.0.
+"""Gloss (specular reflection) of surfaces, with the metallic-roughness material of glTF 2.0.
 
-A surface has roughness, metallic m and specular_factor s (glTF's `specularFactor`), and
-an albedo ρ. Its specular reflection has two parts, both of `renderer.shading.lobes`.
-A dielectric one with the factor (1 - m) s is white. A metallic one with the
-factor m has the color of the metal: it is Schlick's approximation with
-F0 = ρ and F90 = 1. The reflected radiance per irradiance is
+A surface has an albedo ρ, a roughness, a metallic fraction m (`metallic`), and a
+specular factor s (`specular_factor`, glTF's `specularFactor`). It reflects light
+specularly in two ways. A dielectric reflects (1 - m) s times a reflection that
+has the color of the light, called white here. A metal reflects m times
+Schlick's approximation with F0 = ρ and F90 = 1. The part with F0 is multiplied
+by the albedo, and is called colored here. The part with F90 is white. The
+reflected radiance per irradiance is
 
     ρ (diffuse + colored) + white.
 
-The diffuse surface lies below the dielectric layer, which is called coat here.
-The unit vectors n, l and v are the normal, the direction to the light and the
-direction to the camera. Let E(μ) be the fraction of a beam with the cosine μ
-that the coat reflects (`coat_albedo`), and E_avg = 2 ∫ E(μ) μ dμ its mean. Then
+A dielectric surface has a diffuse layer below a dielectric layer, which is
+called coat here. The unit vectors n, l and v are the normal, the direction to
+the light and the direction to the camera. E(μ) is the fraction of a light beam
+that the coat reflects, if μ is the cosine between the normal and the beam
+(`coat_albedo`). E_avg = 2 ∫ E(μ) μ dμ is its mean. Then
 
     diffuse = (1 - m) (1 - s E(n·l)) (1 - s E(n·v)) / (1 - s E_avg)
 
 (Kulla and Conty 2017, "Revisiting physically based shading at Imageworks"). This
-is reciprocal. A white surface with its coat reflects each beam entirely: the coat
-reflects s E(n·l), and the surface below reflects 1 - s E(n·l). Of environment
-light with the coefficients U_lm, the irradiance Σ (A_l - s B_l) U_lm Y_lm(n)
-passes the coat, with the A_l of `lambertian_factors` and the B_l of `coat_bands`.
+model is reciprocal. With ρ = 1, a dielectric reflects each beam entirely: the
+coat reflects s E(n·l), and the diffuse layer reflects 1 - s E(n·l).
+Environment light with the coefficients U_lm has the irradiance
+Σ (A_l - s B_l) U_lm Y_lm(n) below the coat, with A_l from `lambertian_factors`
+and B_l from `coat_bands`.
 
-Shapes use these letters: a view has S samples of a mesh with F faces. K is the
-number of SH coefficients, (degree + 1)².
+Shapes use these letters: a view has S covered samples of a mesh with F faces. K
+is the number of SH coefficients of environment light, (degree + 1)².
 """
 
 from __future__ import annotations
@@ -57,11 +61,13 @@ from renderer.visibility.fragments import Fragments
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+# Names of the values of `Gloss`, in the order of the columns of `Mesh.gloss`.
 _NAMES = ("roughness", "metallic", "specular_factor")
-# Percentile of the roughness of a texture that `smoothest` returns. Fewer texels
-# are smoother.
+# `smoothest` takes this percentile of the roughness of a texture as its smallest
+# roughness, so that a few smoother texels do not count.
 _SMOOTHEST_PERCENT = 1
-# Irradiance 1 of uniform light is radiance 1/π, whose first SH coefficient is:
+# SH coefficient of degree 0 of uniform light with irradiance 1. The radiance of
+# this light is 1/π.
 _UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
 
 
@@ -69,16 +75,17 @@ _UNIFORM_COEFFICIENT = math.sqrt(4 * math.pi) / math.pi
 class Gloss:
     """Specular reflection of a surface.
 
-    Each of the three values is a number in [0, 1] for all of a mesh, a tensor of
-    shape (), or a tensor of shape (F,) with a number for each face.
+    Roughness, metallic and specular factor are each a number in [0, 1] for the
+    whole mesh, a tensor of shape (), or a tensor of shape (F,) with a number for
+    each of the F faces.
 
     Attributes:
-        roughness: Roughness as in glTF. Below 0.2, it is taken for 0.2.
+        roughness: Roughness as in glTF. Values below 0.2 are shaded as 0.2.
         metallic: Fraction of the surface that is metal.
-        specular_factor: Factor of the dielectric reflection (`specularFactor` of
-            KHR_materials_specular).
-        textured: Whether the gloss textures of the mesh multiply the values.
-            Otherwise the textures are ignored.
+        specular_factor: Factor for the specular reflection of the dielectric
+            (`specularFactor` of the glTF extension KHR_materials_specular).
+        textured: True multiplies the values with the gloss textures of the
+            mesh. False ignores the gloss textures.
 
     Example:
         >>> import norm_balls as nb
@@ -93,13 +100,14 @@ class Gloss:
     textured: bool = field(default=False, kw_only=True)
 
     def on(self, mesh: Mesh) -> Mesh:
-        """Return a copy of a mesh with this gloss instead of its own.
+        """Return a copy of a mesh that has this gloss.
 
         Args:
-            mesh: The mesh.
+            mesh: Mesh with F faces. The gloss of this mesh is replaced.
 
         Raises:
-            InputError: If a value is out of range, NaN or has another shape.
+            InputError: If a value of the gloss is NaN, not in [0, 1], or has a
+                shape other than (), (1,) or (F,).
         """
         require_mesh("mesh", mesh)
         face_count = len(mesh.faces)
@@ -111,13 +119,17 @@ class Gloss:
         return replace(mesh, gloss=by_face, gloss_textures=textures)
 
     def checked(self, faces: int) -> list[Tensor]:
-        """Return roughness, metallic and specular factor as tensors of shape (1,) or (F,).
+        """Check the values, and convert them to tensors of shape (1,) or (F,).
 
         Args:
-            faces: Number of faces of the mesh, F.
+            faces: Number F of faces of the mesh.
+
+        Returns:
+            Roughness, metallic and specular factor.
 
         Raises:
-            InputError: If a value is out of range, NaN or has another shape.
+            InputError: If a value of the gloss is NaN, not in [0, 1], or has a
+                shape other than (), (1,) or (F,).
         """
         require_flag("textured", self.textured)
         checked = []
@@ -125,28 +137,29 @@ class Gloss:
             given = getattr(self, name)
             values = as_tensor(f"gloss: {name}", given)
             if isinstance(given, int | float):
-                # A Python number keeps its precision.
+                # `as_tensor` would round a Python number to float32.
                 values = torch.tensor(float(given), dtype=torch.float64)
             require_bounded(**{name: values})
-            has_shape = values.shape in ((), (1,), (faces,))
-            if not has_shape or not (values.min() >= 0 and values.max() <= 1):
+            has_right_shape = values.shape in ((), (1,), (faces,))
+            if not has_right_shape or not (values.min() >= 0 and values.max() <= 1):
                 raise InputError(
-                    f"gloss: {name} of shape {tuple(values.shape)}: "
-                    f"give one number or {faces}, in [0, 1]"
+                    f"gloss: {name} has shape {tuple(values.shape)} or values outside [0, 1]: "
+                    f"give one number, or {faces} numbers (one per face), in [0, 1]"
                 )
             checked.append(values.reshape(-1))
         return checked
 
 
 class SampleGloss(NamedTuple):
-    """The gloss at the samples of a view.
+    """Gloss at the S covered samples of a view.
 
     Each tensor has the shape (S,), or (1,) if all samples have the same value.
 
     Attributes:
         roughness: Roughness in [0.2, 1].
-        metallic: Fraction that is metal in [0, 1].
-        specular_factor: Factor of the dielectric reflection in [0, 1].
+        metallic: Fraction of the surface that is metal, in [0, 1].
+        specular_factor: Factor for the specular reflection of the dielectric,
+            in [0, 1].
     """
 
     roughness: Tensor
@@ -155,56 +168,64 @@ class SampleGloss(NamedTuple):
 
     @property
     def metal(self) -> bool:
-        """Return whether any sample is metallic, or may become so by differentiation."""
+        """True if a sample is metallic, or if a gradient by `metallic` is needed."""
         return self.metallic.requires_grad or bool(self.metallic.any())
 
     def at(self, samples: Tensor | slice) -> SampleGloss:
-        """Return the gloss at some of the samples.
+        """Select the gloss of some of the samples.
 
         Args:
-            samples: Indices of samples, or a slice.
+            samples: Indices of samples, any shape, or a slice.
         """
         return SampleGloss(*(at_samples(values, samples) for values in self))
 
     def to(self, like: Tensor) -> SampleGloss:
-        """Return the gloss in the dtype and on the device of another tensor.
+        """Return a copy in the dtype and on the device of another tensor.
 
         Args:
-            like: The other tensor.
+            like: Tensor with the dtype and the device.
         """
         return SampleGloss(*(values.to(like) for values in self))
 
     def lobes(self, cosine: Tensor, degree: int) -> tuple[Tensor | None, Tensor]:
-        """Compute the specular lobes as functions of the direction to the camera.
+        """Compute the specular lobes of S samples for environment light.
+
+        A lobe is the specular reflectance as a function of the direction to the
+        light. It is given by M = (degree + 1) (degree + 2) / 2 numbers, see
+        `renderer.shading.lobes.lobe_functions`.
 
         Args:
-            cosine: Cosine between normal and direction to the camera, n·v, shape
-                (S,).
+            cosine: Cosine n·v between normal and direction to the camera,
+                shape (S,).
             degree: Degree of the light.
 
         Returns:
-            The colored and the white lobe, in the M functions of
-            `renderer.shading.lobes.lobe_functions`, shape (M, S) each. The colored
-            lobe is None if no sample is metallic.
+            A tuple of
+            - the lobe that is multiplied by the albedo, shape (M, S), or None if
+              no sample is metallic;
+            - the lobe with the color of the light, shape (M, S).
         """
         terms = (DIELECTRIC, SCHLICK, EDGE) if self.metal else (DIELECTRIC,)
-        dielectric, *of_metals = lobe_functions(cosine, self.roughness, degree, terms)
+        dielectric, *metal_terms = lobe_functions(cosine, self.roughness, degree, terms)
         white = (1 - self.metallic) * self.specular_factor * dielectric
-        if not of_metals:
+        if not metal_terms:
             return None, white
-        schlick, edge = of_metals
+        schlick, edge = metal_terms
         return self.metallic * schlick, white + self.metallic * edge
 
     def even(self, normals: Tensor, toward: Tensor) -> tuple[Tensor | None, Tensor]:
-        """Compute the specular reflection of uniform light of irradiance 1.
+        """Compute the specular radiance of S samples under uniform light of irradiance 1.
 
         Args:
             normals: Unit normals, shape (S, 3).
-            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
 
         Returns:
-            The colored and the white radiance, shape (S,) each. The colored one
-            is None if no sample is metallic.
+            A tuple of
+            - the radiance that is multiplied by the albedo, shape (S,), or None
+              if no sample is metallic;
+            - the radiance with the color of the light, shape (S,).
         """
         cosine = (normals * toward).sum(1).clamp(0, 1)
         colored, white = self.lobes(cosine, degree=0)
@@ -214,45 +235,55 @@ class SampleGloss(NamedTuple):
         return colored[0] * _UNIFORM_COEFFICIENT, white_radiance
 
     def entering(self, cosine: Tensor) -> Tensor:
-        """Compute the fraction of light that passes the coat, 1 - s E(μ).
+        """Compute the fraction of a light beam that passes the dielectric coat.
 
-        The result is differentiable.
+        The fraction is 1 - s E(μ), with the specular factor s and the reflected
+        fraction E(μ) of `coat_albedo`. It is differentiable with respect to the
+        cosine and to the gloss.
 
         Args:
-            cosine: Cosine μ between normal and direction, any shape. Negative
-                ones count as 0.
+            cosine: Cosine μ between the normal and the beam, any shape. Negative
+                cosines count as 0.
 
         Returns:
-            Fractions in [0, 1], with the shape of `cosine`.
+            Fractions in [0, 1], in the shape of `cosine`.
         """
         return 1 - self.specular_factor * coat_albedo(cosine.clamp(0, 1), self.roughness)
 
     def entering_bands(self, degree: int) -> Tensor:
-        """Compute the factors A_l - s B_l of environment light below the coat.
+        """Compute the factor of each SH coefficient in the irradiance below the dielectric coat.
 
-        With these factors, the coefficients of the light become the irradiance of
-        the diffuse surface. The result is differentiable.
+        The irradiance is Σ_lm (A_l - s B_l) U_lm Y_lm(n), with the coefficients
+        U_lm of the light, the harmonics Y_lm, the normal n and the specular
+        factor s. A_l is the factor without a coat (`lambertian_factors`), and
+        B_l the factor of the light that the coat reflects (`coat_bands`). The
+        result is differentiable with respect to the gloss.
 
         Args:
-            degree: Degree of the light, at most `DIFFUSE_DEGREE`.
+            degree: Degree of the light, at most `harmonics.DIFFUSE_DEGREE`.
 
         Returns:
-            A factor for each coefficient, shape (K, S), or (K, 1) if all samples
-            have the same gloss.
+            Factor A_l - s B_l of each of the K coefficients, shape (K, S), or
+            (K, 1) if all samples have the same gloss.
         """
-        reflected = coat_bands(degree).to(self.roughness) @ along(self.roughness)
-        factors = lambertian_factors(degree).to(self.roughness)
-        return factors[:, None] - self.specular_factor * reflected[bands(degree)]
+        # Factor B_l for each degree l, shape (degree + 1, S).
+        coat_factors = coat_bands(degree).to(self.roughness) @ along(self.roughness)
+        # Factor A_l for each coefficient, shape (K,).
+        uncoated_factors = lambertian_factors(degree).to(self.roughness)
+        return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 
     def diffuse(self, normals: Tensor, toward: Tensor) -> Tensor:
-        """Compute how much of the diffuse radiance below the coat the camera sees.
+        """Compute the diffuse radiance of S samples per albedo and irradiance below the coat.
 
-        This is the factor (1 - m) (1 - s E(n·v)) / (1 - s E_avg) of the albedo and
-        of the light that passes the coat. The result is differentiable.
+        This is (1 - m) (1 - s E(n·v)) / (1 - s E_avg), with the symbols of the
+        module docstring. Metals (m = 1) have no diffuse reflection. The coat
+        reflects a part of the diffuse light back. The result is differentiable
+        with respect to the vectors and the gloss.
 
         Args:
-            normals: Unit normals, shape (S, 3).
-            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+            normals: Unit normals n, shape (S, 3).
+            toward: Unit vectors v to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
 
         Returns:
             Factors, shape (S,).
@@ -265,31 +296,36 @@ class SampleGloss(NamedTuple):
     def transfer(
         self, normals: Tensor, toward: Tensor, degree: int
     ) -> tuple[Tensor | None, Tensor, ViewFrame]:
-        """Compute the specular radiance per unit of each coefficient of environment light.
+        """Compute the specular radiance of S samples per unit of each of K SH coefficients.
 
-        The coefficients are those in the axes of the view. The result is
-        differentiable.
+        The coefficients are those of environment light in axes that face the
+        camera. The result is differentiable with respect to the vectors and the
+        gloss.
 
         Args:
             normals: Unit normals, shape (S, 3).
-            toward: Unit vectors to the camera, shape (S, 3) or (1, 3).
+            toward: Unit vectors to the camera, shape (S, 3), or (1, 3) if all
+                samples share one vector.
             degree: Degree of the light.
 
         Returns:
-            The colored radiance, which the albedo multiplies, shape (K, S), or
-            None if no sample is metallic; the white radiance, shape (K, S); and
-            the frame of the view, which turns coefficients to world axes
-            (`to_world`).
+            A tuple of
+            - the radiance that is multiplied by the albedo, shape (K, S), or
+              None if no sample is metallic;
+            - the radiance with the color of the light, shape (K, S);
+            - the axes that face the camera. `ViewFrame.to_world` converts the
+              radiance to coefficients in world axes, and `ViewFrame.from_world`
+              converts a light to the axes.
         """
         frame = ViewFrame.from_directions(normals, toward)
-        colored, white = self.lobes(frame.cosine, degree)
-        colored_transfer = None if colored is None else frame.harmonics(colored)
-        return colored_transfer, frame.harmonics(white), frame
+        colored_lobe, white_lobe = self.lobes(frame.cosine, degree)
+        colored_transfer = None if colored_lobe is None else frame.harmonics(colored_lobe)
+        return colored_transfer, frame.harmonics(white_lobe), frame
 
     def along(self, normals: Tensor, toward: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the specular radiance per irradiance from single directions.
+        """Compute the specular radiance per irradiance for light from single directions.
 
-        The result is differentiable.
+        The result is differentiable with respect to the vectors and the gloss.
 
         Args:
             normals: Unit normals, shape (..., 3).
@@ -297,8 +333,11 @@ class SampleGloss(NamedTuple):
             directions: Unit vectors to the light, shape (..., 3).
 
         Returns:
-            The colored radiance, which the albedo multiplies, and the white
-            radiance, shape (...) each.
+            A tuple of
+            - the radiance per irradiance that is multiplied by the albedo,
+              shape (...);
+            - the radiance per irradiance with the color of the light,
+              shape (...).
         """
         schlick, edge, dielectric = reflectance(normals, toward, directions, self.roughness)
         white = self.metallic * edge + (1 - self.metallic) * self.specular_factor * dielectric
@@ -306,37 +345,43 @@ class SampleGloss(NamedTuple):
 
 
 def smoothest(mesh: Mesh) -> float:
-    """Return the smallest roughness of the faces of a mesh that have gloss.
+    """Return the smallest roughness of all faces of a mesh that have gloss.
 
-    The hundredth of a texture that is smoothest does not count. The result is 1
-    for a matte mesh.
+    In each gloss texture, the 1% of the texels with the smallest roughness do
+    not count.
 
     Args:
-        mesh: The mesh.
+        mesh: Mesh whose gloss is examined.
+
+    Returns:
+        Roughness in [0, 1]. It is 1 for a matte mesh.
     """
     if mesh.gloss is None:
         return 1.0
-    factors = [
+    # The first channel of a gloss texture is a factor for the roughness.
+    roughness_factors = [
         np.percentile(texture[..., 0], _SMOOTHEST_PERCENT) / 255 for texture in mesh.gloss_textures
     ]
-    # The last factor is that of faces without a texture, whose index is -1.
-    factors.append(1.0)
-    factor_of_face = np.take(factors, mesh.texture_ids if mesh.gloss_textures else -1)
-    roughness = mesh.gloss[:, 0] * factor_of_face
+    # Faces without a texture have the texture index -1, so their factor comes last.
+    roughness_factors.append(1.0)
+    factor_of_face = np.take(roughness_factors, mesh.texture_ids if mesh.gloss_textures else -1)
+    roughness_of_face = mesh.gloss[:, 0] * factor_of_face
+    # A face is matte if metallic and specular factor are both 0.
     has_gloss = mesh.gloss[:, 1:].any(1)
-    return float(roughness.min(initial=1, where=has_gloss))
+    return float(roughness_of_face.min(initial=1, where=has_gloss))
 
 
 def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
-    """Return the values at some samples.
+    """Select the values of some samples from values that all samples may share.
 
     Args:
-        values: Values of all samples, shape (S, ...), or (1, ...) if all samples
-            share one.
-        samples: Indices of samples, or a slice.
+        values: Values of all S samples, shape (S, ...), or one value that all
+            samples share, shape (1, ...).
+        samples: Indices of samples, any shape, or a slice.
 
     Returns:
-        The chosen values, or the shared one.
+        Values of the selected samples. A shared value is returned as it is, in
+        the shape (1, ...).
     """
     return values if len(values) == 1 else values[samples]
 
@@ -344,35 +389,39 @@ def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
 def sample_gloss(
     mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
 ) -> SampleGloss | None:
-    """Look up the gloss at the samples of a view.
+    """Look up the gloss of a mesh at the covered samples of a view.
 
-    The result is differentiable in a given gloss. A warning is issued if
-    roughness is raised to its minimum.
+    The result is differentiable with respect to `gloss`. A warning is issued if
+    a roughness is raised to its minimum.
 
     Args:
-        mesh: The mesh.
-        fragments: Samples of the view.
-        gloss: Gloss instead of that of the mesh. None for that of the mesh.
+        mesh: Mesh that the view shows, with F faces.
+        fragments: The S covered samples of the view.
+        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
+            of the mesh.
 
     Returns:
-        The gloss in float64, or None for a matte surface.
+        Gloss at the samples, float64, or None for a matte surface.
 
     Raises:
-        InputError: If a value is out of range, NaN or has another shape.
+        InputError: If a value of the gloss is NaN, not in [0, 1], or has a shape
+            other than (), (1,) or (F,).
     """
-    textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
+    # The values of a given gloss are multiplied with textures only on request.
+    gloss_textures = mesh.gloss_textures if gloss is None or gloss.textured else ()
     if gloss is None:
         gloss = _gloss_of_mesh(mesh)
     if gloss is None:
         return None
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
-    roughness, metallic, specular_factor = (_by_sample(column, fragments) for column in columns)
-    if textures:
-        sources = []
-        for texture in textures:
-            factors = torch.from_numpy(texture).to(fragments.coverage) / 255
-            sources.append(Texture.from_values(factors))
-        roughness_factor, metallic_factor = sample_textures(sources, mesh, fragments)
+    roughness, metallic, specular_factor = (_at_faces(column, fragments) for column in columns)
+    if gloss_textures:
+        textures = []
+        for eight_bit_texture in gloss_textures:
+            factors = torch.from_numpy(eight_bit_texture).to(fragments.coverage) / 255
+            textures.append(Texture.from_values(factors))
+        # The two channels of a gloss texture multiply roughness and metallic.
+        roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
     if (roughness < MIN_ROUGHNESS).any():
@@ -385,37 +434,60 @@ def sample_gloss(
 
 
 def _gloss_of_mesh(mesh: Mesh) -> Gloss | None:
-    """Return the gloss of a mesh, with one row if all faces agree, or None if it is matte."""
+    """Convert the array `Mesh.gloss`, with a row for each of the F faces, to a `Gloss`.
+
+    Args:
+        mesh: Mesh with F faces.
+
+    Returns:
+        Gloss with tensors of shape (F,), or (1,) if all faces have the same
+        gloss. None for a matte mesh.
+    """
     if mesh.gloss is None:
         return None
-    is_even = (mesh.gloss == mesh.gloss[0]).all()
-    rows = mesh.gloss[:1] if is_even else mesh.gloss
+    has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
+    rows = mesh.gloss[:1] if has_one_gloss else mesh.gloss
     roughness, metallic, specular_factor = torch.from_numpy(rows).unbind(1)
     return Gloss(roughness, metallic, specular_factor)
 
 
-def _by_sample(column: Tensor, fragments: Fragments) -> Tensor:
-    """Return values (S,) of the samples, given values (F,) of the faces, or one value as it is."""
-    if len(column) == 1:
-        return column
-    return column.index_select(0, fragments.faces).index_select(0, fragments.face)
+def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
+    """Look up, at each sample, the value of the face that the sample shows.
+
+    Args:
+        face_values: A value for each of the F faces of the mesh, shape (F,), or
+            one value that all faces share, shape (1,).
+        fragments: The S covered samples of the view.
+
+    Returns:
+        Values at the samples, shape (S,). A shared value is returned as it is,
+        shape (1,).
+    """
+    if len(face_values) == 1:
+        return face_values
+    seen_face_values = face_values.index_select(0, fragments.faces)
+    return seen_face_values.index_select(0, fragments.face)
 
 
 def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:
-    """Compute unit vectors from the samples to the camera.
+    """Compute unit vectors from the S samples of a view to the camera.
+
+    The vectors are differentiable with respect to the vertices.
 
     Args:
-        fragments: Samples of the view.
-        vertices: Positions, shape (V, 3).
+        fragments: Covered samples of the view.
+        vertices: Vertex positions in world axes, shape (V, 3).
 
     Returns:
-        Unit vectors, shape (S, 3), or (1, 3) without perspective, where all are
-        equal. They have the dtype of the vertices, and are differentiable in
-        them.
+        Unit vectors in world axes, in the dtype of `vertices`, shape (S, 3).
+        Without perspective, all samples share one vector, and the shape is
+        (1, 3).
     """
-    # The last number is 1 for a position, and 0 for a direction.
     eye = fragments.eye.to(vertices)
-    if not eye[3]:
+    # The fourth number is 1 for the position of a perspective camera, and 0 for the
+    # direction to an orthographic camera.
+    has_perspective = bool(eye[3])
+    if not has_perspective:
         return eye[None, :3]
     points = fragments.interpolate(vertices[fragments.corners])
     return unit((eye[:3] - points).T).T
