@@ -1,14 +1,17 @@
-"""Estimate the camera and the light of a photograph of a mesh.
+"""Estimate the camera and the light of a photograph of an object whose mesh is known.
 
-All pixels outside of the mesh are set to one gray value, so that an image shows
-silhouette and shading at once. For each camera, the best light is the solution
-of a convex quadratic program, because images are linear in the light and the
-radiance of the light must not be negative. The differences of the pixels are
-therefore a function of the camera alone (variable projection, Golub and Pereyra
-1973). The Gauss-Newton method minimizes the sum of their squares.
+All pixels outside of the object are set to one gray value in the photograph and
+in the render, so that the images show the silhouette and the shading at once. An
+image is linear in the light, and the radiance of the light must not be negative.
+The best light for a given camera is therefore the solution of a convex quadratic
+program. The differences of the pixels are then a function of the camera alone
+(variable projection, Golub and Pereyra 1973). The Gauss-Newton method minimizes
+the sum of the squared differences.
 
-Light and albedo only appear as their product: doubling the albedo halves the
-light.
+Only the product of light and albedo can be seen: with twice the albedo, half the
+light is found.
+
+A light has K = 49 SH coefficients per color channel (degree 6).
 """
 
 from __future__ import annotations
@@ -40,81 +43,93 @@ from renderer.rendering import precompute_transfer, render
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
-# The search begins with cameras at these angles from +z in degrees, and at as
-# many azimuths for each of them. All have the same width in world units.
+# The search for a camera starts from cameras at these angles from +z in degrees,
+# with AZIMUTHS equally spaced azimuths for each angle.
 POLAR = (20, 40, 60, 80, 100)
 AZIMUTHS = 16
+# Width in world units that all these first cameras show. `_framed` changes the width
+# so that the mesh is as large as the object in the photograph.
 FIRST_WIDTH = 2.0
-# `fit_scene` first searches for cameras in images of this many pixels per side.
+# `fit_scene` searches for cameras in images with this many pixels per side, before
+# it refines the cameras in images of the full size.
 COARSE = 32
-# Descents start from as many of the best cameras of the search.
+# Number of cameras that the search keeps: the best first cameras from which a descent
+# starts, and the best cameras that are refined at the full size.
 KEPT = 3
-# Largest number of Gauss-Newton steps from one camera.
+# Largest number of Gauss-Newton steps in a descent from one camera.
 STEPS = 20
-# Relative change of the squared error, or of the camera, at which a descent ends.
+# A descent ends if a step changes the squared error, or the camera, by a smaller
+# fraction.
 LEAST_GAIN = 1e-3
-# Steps of the numerical derivatives by polar angle and azimuth (in radians),
-# relative width, right and up, as multiples of 1 / size. A step to the right is half a pixel.
+# Step sizes of the numerical derivatives of a descent, times the image size in
+# pixels. They belong to the polar angle and the azimuth in radians, the relative
+# width, and the shifts right and up in units of the width. A shift by 0.5 / size is
+# half a pixel.
 DIFFERENCES = (1.0, 1.0, 1.0, 0.5, 0.5)
-# Smallest angle between +z or -z and the camera in a descent. Descents are in
-# radians.
+# In a descent, the camera stays at least at this angle in radians from +z and from
+# -z, because the azimuth has no effect there.
 POLE_DISTANCE = 0.02
-# Samples per side of a pixel.
+# Number of samples along one side of a pixel in renders.
 SAMPLES = 8
-# Cameras whose axes differ by a smaller angle in degrees count as one.
+# `_distinct` treats two cameras as the same one if all their axes differ by less
+# than this angle in degrees.
 DISTINCT = 2.0
-# Cameras of the search are compared at the full size if their squared error is at
-# most this multiple of the smallest one.
+# A camera of the search is refined at the full size if its squared error is at most
+# this multiple of the smallest squared error.
 PLAUSIBLE = 3
-# Weight of the squared Laplacian of the light, or of its difference from the
-# expected light of a channel (see `_light_of_channels`). It is relative to the
-# squares of what the best channel shows of a uniform light. It bounds light that
-# the object does not show.
+# Weight of the smoothness penalty of the light, relative to the squared brightness
+# of the object under uniform light (see `_Target.penalty`). Without a penalty, light
+# from directions that the object hardly reflects could become arbitrarily bright.
 SMOOTH = 1e-6
-# Pixels of the photograph with this linear value or more count as clipped. The
-# scene may have been brighter there.
+# A pixel of the photograph with this linear value or more counts as clipped: the
+# scene may have been brighter than the photograph shows.
 CLIPPED = 0.995
-# The light is solved for as many times, each time with the clipped pixels of the
-# solution before.
+# The light is solved for up to this many times. Each time, the clipped pixels that
+# the last solution made brighter than 1 are left out.
 CLIPPING_ROUNDS = 3
-# The light is at least this fraction of its mean radiance in the directions of a
-# grid. This margin keeps it positive in the directions between them.
+# The radiance of the light must be at least this fraction of its mean in all
+# directions of a grid. The margin keeps the radiance positive between the
+# directions.
 LEAST_RADIANCE = 0.01
-# Largest number of iterations of non-negative least squares per direction. Three
-# are usual.
+# Largest number of iterations of SciPy's `nnls` per direction. Three are usual.
 MAX_EXCHANGES = 100
-# One of as many directions of a grid constrains the first solution.
+# The first solution for a light is constrained in every FIRST_DIRECTIONS-th direction
+# of the grid. Directions with negative radiance are added afterwards.
 FIRST_DIRECTIONS = 16
-# Subdivisions of the grid of directions while a camera is sought, and for the
-# light that is returned.
+# Number of subdivisions of the icosphere whose vertices are the grid of directions:
+# SEARCH_GRID while a camera is sought, and FINAL_GRID for the returned light.
 SEARCH_GRID = 2
 FINAL_GRID = 5
-# Pixels in which the object has a larger share belong to the object. At a smaller
-# limit, the background could outshine the object: a hundredth of a bright
-# background may be brighter than the blue of a banana.
+# A pixel counts as completely covered by the object if the object's share of the
+# pixel is larger than this. With a limit of 0.99, the other hundredth of a pixel could
+# be brighter than the object, such as a white background beside the blue channel of a
+# banana.
 WHOLE = 0.999
-# Pixels on the border of the object take their color from the object's pixels at
-# this distance or less.
+# Pixels on the border of the object get the mean color of the completely covered
+# pixels that are at most this many pixels away in each direction.
 BORDER = 2
-# Side of the window of an object, as a multiple of the longer side of its box.
+# Side of the square window that is cut around an object, as a multiple of the longer
+# side of the object's bounding box.
 MARGIN = 1.6
-# A pixel of a mask belongs to the object if its value is larger.
+# A pixel of an 8-bit mask belongs to the object if its value is larger than this.
 OPAQUE = 127
-# First guess of the camera's angle from +z, in degrees.
+# First guess of the angle between +z and the direction to the camera, in degrees.
 USUAL_POLAR = 60.0
-# If the axes of a window change by more, the window is cut anew.
+# `fit_photograph` cuts a window again if a component of the window's axes changes by
+# more than this.
 TILTED = 1e-3
-# Number of pixels that the object must cover.
+# Smallest number of pixels that the object must cover.
 MIN_COVERED_PIXELS = 16
+# Number of color channels.
 COLORS = 3
 
 
 class FittedPhotograph(NamedTuple):
-    """The result of `fit_photograph`.
+    """Camera, light and window that `fit_photograph` found.
 
     Attributes:
         scene: Camera and light. The camera looks at the center of the mesh.
-        window: The part of the photograph that this camera shows.
+        window: Part of the photograph that the camera shows.
     """
 
     scene: FittedScene
@@ -125,13 +140,14 @@ class FittedScene(NamedTuple):
     """Camera and light of a photograph.
 
     Attributes:
-        camera: The camera.
-        light: SH coefficients of a light with non-negative radiance, shape
-            (49, 3).
-        error: Root mean square of the differences in linear light over the
-            pixels of the object, divided by that of the photograph.
-        overlap: Intersection over union of the rendered and the given
-            silhouette.
+        camera: Camera from which the mesh looks most like the photograph.
+        light: SH coefficients of environment light without negative radiance,
+            shape (49, 3).
+        error: Root mean square difference between the linear values of the
+            render and of the photograph, over the pixels of the object, divided
+            by the root mean square of the photograph.
+        overlap: Intersection over union of the silhouettes in the render and in
+            the mask.
     """
 
     camera: Camera
@@ -152,66 +168,80 @@ def fit_photograph(
 ) -> FittedPhotograph:
     """Find the camera and the light of an object anywhere in a photograph.
 
-    The object is seen through a window, as by a camera that is turned towards it
-    (`renderer.photograph`). Which way is up in the window depends on how high the
-    camera stands. Window and camera are therefore found again if the first fit
-    shows that the window was tilted.
+    The function cuts a square window around the object out of the photograph.
+    The window shows what a camera would see that is turned toward the object
+    (see `renderer.photograph`), and it is fitted with `fit_scene`. The upward
+    direction in the window depends on the height of the camera, which is only
+    known after the fit. If the first window was tilted, a second window is cut
+    and fitted.
 
     Args:
-        photograph: Pixels of 8 bits, shape (H, W, 3). Its camera is upright, and
-            its optical axis passes through the center of the photograph.
-        mask: White where the object is, shape (H, W).
-        mesh: The mesh, normalized and upright.
-        size: Pixels per side that are compared.
-        fov: Angle across a square `MARGIN` times as wide as the object, in
-            degrees. None for a camera without perspective.
-        encoding: Encoding of the photograph and of the images that are to be
-            rendered, "linear" or "srgb".
-        **options: Further arguments of `fit_scene`.
+        photograph: Photograph with 8 bits per channel, shape (H, W, 3) for H
+            rows and W columns. The camera of the photograph is upright, and its
+            optical axis passes through the center of the photograph.
+        mask: Mask with 8 bits, white where the object is, shape (H, W).
+        mesh: Mesh of the object, normalized and upright.
+        size: Number of pixels per side of the images that are compared.
+        fov: Field of view of the window in degrees. The window is `MARGIN` times
+            as wide as the object. None for a camera without perspective.
+        encoding: Encoding of the photograph and of the images that will be
+            rendered with the result, "linear" or "srgb".
+        **options: Other arguments of `fit_scene`.
 
     Returns:
-        The scene and its window of the photograph.
+        Camera and light, and the window of the photograph that the camera shows.
 
     Raises:
-        InputError: If the mask holds no object.
+        InputError: If no pixel of the mask is white.
     """
     is_object = mask > OPAQUE
     rows = np.flatnonzero(is_object.any(axis=1))
     columns = np.flatnonzero(is_object.any(axis=0))
     if not len(rows):
         raise InputError(
-            "no object is found: give a mask that is white where it is, or a box around it"
+            "the mask has no white pixels: give a mask that is white where the object is, "
+            "or a box around the object"
         )
+    # Center of the bounding box in pixels, and side of the window in pixels.
     center = np.array([columns[0] + columns[-1] + 1, rows[0] + rows[-1] + 1]) / 2
     side = MARGIN * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
     camera_image = Photograph(photograph, focal_length)
     fit = _WindowFit(photograph, mask, mesh, size, {**options, "fov": fov, "encoding": encoding})
 
+    # First fit: the world's z-axis, in the axes of the photograph's camera, is guessed.
     usual_polar = math.radians(USUAL_POLAR)
-    up_at_usual_angle = np.array([0.0, math.sin(usual_polar), math.cos(usual_polar)])
-    window = camera_image.window(center, side, up_at_usual_angle)
+    guessed_up = np.array([0.0, math.sin(usual_polar), math.cos(usual_polar)])
+    window = camera_image.window(center, side, guessed_up)
     scene = fit.fit(window, None)
+    # Second fit: the z-axis is known from the first fit. It has no component to the
+    # right, because the camera of the photograph is upright.
     up = _up_direction(scene.camera, window)
-    # The camera of the photograph is upright.
     up[0] = 0
-    upright = camera_image.window(center, side, up)
-    if np.abs(upright.axes - window.axes).max() > TILTED:
-        window = upright
+    upright_window = camera_image.window(center, side, up)
+    if np.abs(upright_window.axes - window.axes).max() > TILTED:
+        window = upright_window
         scene = fit.fit(window, scene.camera)
+    # The returned camera and window are centered on the mesh instead of the mask.
     camera = scene.camera
     up = _up_direction(camera, window)
+    # Position of the mesh center in the window, in pixels from the window's center.
     shift = np.array([camera.right, camera.up]) * side / camera.width
     mesh_center = np.array(window.pixels(*shift))
-    turned_scene = scene._replace(camera=_turned_to_mesh(camera))
-    return FittedPhotograph(turned_scene, camera_image.window(mesh_center, side, up))
+    centered_scene = scene._replace(camera=_turned_to_mesh(camera))
+    return FittedPhotograph(centered_scene, camera_image.window(mesh_center, side, up))
 
 
 @dataclass(frozen=True)
 class _WindowFit:
-    """A photograph with a mask and a mesh, which is fitted in windows of the photograph.
+    """Fits of the camera and the light in windows of one photograph.
 
-    `options` are arguments of `fit_scene`.
+    Attributes:
+        photograph: Photograph with 8 bits per channel, shape (H, W, 3).
+        mask: Mask with 8 bits, white where the object is, shape (H, W).
+        mesh: Mesh of the object.
+        size: Number of pixels per side of the images that are compared.
+        options: Keyword arguments of `fit_scene`.
     """
 
     photograph: NDArray[Any]
@@ -221,25 +251,48 @@ class _WindowFit:
     options: dict[str, Any]
 
     def fit(self, window: Window, start: Camera | None) -> FittedScene:
-        """Fit camera and light in one window, from a camera nearby if one is given."""
-        linear = window.cut(self.photograph, self.size, self.options["encoding"])
-        share = window.cut(self.mask[..., None], self.size, beyond=0)[0]
-        return fit_scene(linear, share, self.mesh, start=start, **self.options)
+        """Fit the camera and the light in one window.
+
+        Args:
+            window: Window of the photograph.
+            start: Camera near the one that is sought. None searches for a
+                camera.
+
+        Returns:
+            Camera and light.
+        """
+        linear_image = window.cut(self.photograph, self.size, self.options["encoding"])
+        # The object's share of each pixel, shape (size, size).
+        coverage = window.cut(self.mask[..., None], self.size, beyond=0)[0]
+        return fit_scene(linear_image, coverage, self.mesh, start=start, **self.options)
 
 
 def _up_direction(camera: Camera, window: Window) -> NDArray[Any]:
-    """Return the world's z axis in the axes of the photograph's camera.
+    """Convert the world's z-axis to the axes of the camera that took the photograph.
 
-    `camera` is the camera that shows the window.
+    Args:
+        camera: Fitted camera, which shows the window.
+        window: Window of the photograph.
+
+    Returns:
+        Unit vector (right, up, back), shape (3,).
     """
-    return window.axes.T @ camera.axes()[:, 2]
+    z_axis_in_window = camera.axes()[:, 2]
+    return window.axes.T @ z_axis_in_window
 
 
 def _turned_to_mesh(camera: Camera) -> Camera:
-    """Return a camera at the same place that looks at the center of the mesh.
+    """Return a copy of a camera at the same place that looks at the center of the mesh.
 
-    If the mesh is not in the center of the image, a camera with perspective sees
-    it from another angle than that of the optical axis.
+    The center of the mesh is the origin. If the camera has perspective and does
+    not show the origin in the image center, its viewing direction changes.
+
+    Args:
+        camera: Camera whose image center may be shifted from the origin by
+            `camera.right` and `camera.up`.
+
+    Returns:
+        Camera without a shift.
     """
     if not isinstance(camera, PerspectiveCamera):
         return replace(camera, right=0.0, up=0.0)
@@ -258,7 +311,11 @@ def _turned_to_mesh(camera: Camera) -> Camera:
 
 @dataclass(frozen=True)
 class _RenderOptions:
-    """Arguments of `render` and of `precompute_transfer`, as `fit_scene` has them."""
+    """Settings that are passed on to `render` and `precompute_transfer`.
+
+    The attributes are arguments of `fit_scene`, except for `samples`, the number
+    of samples along one side of a pixel.
+    """
 
     albedo_scale: float
     encoding: str
@@ -281,34 +338,36 @@ def fit_scene(
     rasterizer: str = "auto",
     start: Camera | None = None,
 ) -> FittedScene:
-    """Find the camera and the light whose render of a mesh resembles a photograph most.
+    """Find the camera and the light with which a render of a mesh resembles a photograph most.
 
-    The light is environment light. The camera is upright, and its optical axis may
-    lie outside of the center of the image (`Camera.right`, `Camera.up`).
+    The light is environment light. The camera is upright. The mesh may be shifted
+    from the center of the image (`Camera.right`, `Camera.up`).
 
     Args:
-        photograph: Linear values in [0, 1], shape (3, size, size). Values of 1
-            count as clipped.
+        photograph: Linear values in [0, 1], shape (3, size, size). Values of
+            `CLIPPED` or more count as clipped.
         mask: The object's share of each pixel in [0, 1], shape (size, size).
-        mesh: The mesh, normalized and upright.
-        fov: Angle between the sides of the image in degrees. None for a camera
-            without perspective.
-        albedo_scale: Factor of the mesh's albedo.
-        encoding: Encoding of the images that are to be rendered with the result,
-            "linear" or "srgb". With "srgb", the colors of the mesh are decoded, as
-            in `render`. The photograph is linear in either case.
+        mesh: Mesh of the object, normalized and upright.
+        fov: Angle between opposite sides of the image in degrees. None for a
+            camera without perspective.
+        albedo_scale: Factor for the albedo of the mesh.
+        encoding: Encoding of the images that will be rendered with the result,
+            "linear" or "srgb". With "srgb", the colors of the mesh are decoded,
+            as in `render`. The photograph is linear in both cases.
         normals: "flat" or "smooth".
-        bounces: Bounces of the returned light, with shadows. Without them, the
-            light of a concave mesh is too bright or too dim. The search for the
-            camera ignores shadows.
+        bounces: Number of light bounces, with shadows, with which the returned
+            light is fitted. With 0, the light for a concave mesh is too bright
+            or too dim. The search for the camera ignores shadows and bounces.
         rasterizer: "auto", "opengl", "numba" or "numpy".
-        start: A camera near the one that is sought. None to search for one.
+        start: Camera near the one that is sought. None searches for a camera.
 
     Returns:
-        The camera, the light, and how well they fit.
+        Camera and light, the error of the pixels, and the overlap of the
+        silhouettes.
 
     Raises:
-        InputError: If the mask holds no object, or if shapes do not fit.
+        InputError: If the photograph or the mask has a wrong shape, or if the
+            mask covers fewer than `MIN_COVERED_PIXELS` pixels.
 
     Example:
         >>> import norm_balls as nb
@@ -323,54 +382,76 @@ def fit_scene(
     if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"
         raise InputError(
-            f"photograph and mask of shapes {given} do not fit: "
-            "give (3, size, size) and (size, size)"
+            f"photograph and mask have the shapes {given}: "
+            "give a photograph (3, size, size) and a mask (size, size)"
         )
-    covered = float(mask.sum())
-    if covered < MIN_COVERED_PIXELS:
+    covered_pixels = float(mask.sum())
+    if covered_pixels < MIN_COVERED_PIXELS:
         raise InputError(
-            f"the mask covers {covered:.0f} pixels of {size}²: give one that shows the object"
+            f"the mask covers {covered_pixels:.0f} pixels of {size} × {size}, but at least "
+            f"{MIN_COVERED_PIXELS} are needed: give a mask that shows the object"
         )
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
     mask = mask.double()
-    fine = _Target.of(photograph, mask, mesh, size, options)
+    fine_target = _Target.from_photograph(photograph, mask, mesh, size, options)
     if start is None:
-        coarse = _Target.of(photograph, mask, mesh, min(COARSE, size), options)
-        starts = _plausible_cameras(coarse, mask, fov)
+        coarse_size = min(COARSE, size)
+        coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
+        starts = _plausible_cameras(coarse_target, mask, fov)
     else:
         starts = [start]
-    _, camera = fine.ranked(fine.descended(camera) for camera in starts)[0]
-    with_bounces = replace(options, bounces=bounces)
-    return fine._replace(options=with_bounces).scene(camera)
+    refined_cameras = [fine_target.refine_camera(camera) for camera in starts]
+    _, best_camera = fine_target.rank_cameras(refined_cameras)[0]
+    target_with_bounces = fine_target._replace(options=replace(options, bounces=bounces))
+    return target_with_bounces.fit_final_light(best_camera)
 
 
-def _plausible_cameras(coarse: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
-    """Return a few cameras, one of which should be near the best one.
+def _plausible_cameras(target: _Target, mask: Tensor, fov: float | None) -> list[Camera]:
+    """Search all directions for a few cameras, one of which should be near the best camera.
 
-    They are sought in small images.
+    Args:
+        target: Small image to which renders are compared.
+        mask: The object's share of each pixel in the full image,
+            shape (size, size).
+        fov: Field of view in degrees. None for cameras without perspective.
+
+    Returns:
+        At most `KEPT` different cameras, the best one first.
     """
-    mesh = coarse.mesh
+    mesh = target.mesh
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
-    cameras = []
+    first_cameras = []
     for polar in POLAR:
         for camera in orbit_cameras(AZIMUTHS, FIRST_WIDTH, polar, fov=fov):
-            cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
-    framed = [camera for _, camera in coarse.ranked(cameras)]
-    # All azimuths fit a round object equally well. The best camera of each polar
-    # angle is therefore a start, too.
-    best_of_polar = {camera.polar: camera for camera in reversed(framed)}
-    starts = dict.fromkeys([*framed[:KEPT], *best_of_polar.values()])
-    descended = coarse.ranked(coarse.descended(camera) for camera in starts)
-    smallest_error, _ = descended[0]
-    plausible = [camera for error, camera in descended if error <= PLAUSIBLE * smallest_error]
+            first_cameras.append(_framed(camera.with_clip_range(radius), mesh, mask))
+    # From the best camera to the worst.
+    ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
+    # All azimuths fit a round object equally well, so the best cameras may all have
+    # the same polar angle. A descent therefore also starts from the best camera of
+    # each polar angle. In reversed order, the best camera is written last.
+    best_of_polar = {camera.polar: camera for camera in reversed(ranked_cameras)}
+    # dict.fromkeys removes duplicates and keeps the order.
+    starts = dict.fromkeys([*ranked_cameras[:KEPT], *best_of_polar.values()])
+    refined = target.rank_cameras(target.refine_camera(camera) for camera in starts)
+    smallest_error, _ = refined[0]
+    plausible = [camera for error, camera in refined if error <= PLAUSIBLE * smallest_error]
     return _distinct(plausible)[:KEPT]
 
 
 def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return the cameras, except those whose axes are near the axes of an earlier one."""
+    """Remove cameras that look in nearly the same direction as an earlier camera.
+
+    Args:
+        cameras: Cameras in order of preference.
+
+    Returns:
+        The cameras whose axes differ from those of each earlier camera by at
+        least `DISTINCT` degrees.
+    """
     kept: list[Camera] = []
     for camera in cameras:
+        # Cosine of the largest angle between the axes of two cameras.
         cosines = [float((camera.axes() * other.axes()).sum(1).min()) for other in kept]
         if max(cosines, default=-1.0) < math.cos(math.radians(DISTINCT)):
             kept.append(camera)
@@ -378,13 +459,16 @@ def _distinct(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 class _LightFit(NamedTuple):
-    """The best light for a camera.
+    """Best light for a given camera.
 
     Attributes:
-        residuals: Differences of the pixels and square roots of the penalties,
-            whose squares sum to the error, shape (N,).
+        residuals: Differences between the render and the target for all pixels
+            and channels, followed by the weighted differences of the light's
+            coefficients from the expected light, shape (N,). The sum of their
+            squares is the error.
         light: SH coefficients, shape (49, 3).
-        coverage: Rendered coverage of each pixel, shape (size²,).
+        coverage: Fraction of each pixel that the mesh covers in the render,
+            shape (size²,).
     """
 
     residuals: Tensor
@@ -393,15 +477,16 @@ class _LightFit(NamedTuple):
 
 
 class _Target(NamedTuple):
-    """The image that renders should resemble.
+    """Image of an object that renders of a mesh should resemble.
 
     Attributes:
-        image: Linear values, shape (3, size²), gray where the mask is 0.
+        image: Linear values of the photograph, shape (3, size²). Pixels outside
+            of the object have the value `gray`.
         mask: The object's share of each pixel, shape (size²,).
         gray: Linear value outside of the object, 0 or 1.
-        mesh: The mesh.
-        size: Pixels per side.
-        options: How the mesh is rendered.
+        mesh: Mesh of the object.
+        size: Number of pixels per side.
+        options: Settings with which the mesh is rendered.
     """
 
     image: Tensor
@@ -412,125 +497,191 @@ class _Target(NamedTuple):
     options: _RenderOptions
 
     @staticmethod
-    def of(
+    def from_photograph(
         photograph: Tensor, mask: Tensor, mesh: Mesh, size: int, options: _RenderOptions
     ) -> _Target:
-        """Resample a photograph (3, H, H) and a mask (H, H), and remove the background.
+        """Resample a photograph and its mask, and replace the background by a gray value.
 
-        Pixels on the border of the object show a mixture of object and background.
-        They get the mean color of the object's pixels around them.
+        Pixels on the border of the object show a mixture of object and
+        background. They get the mean color of the object's pixels around them.
+
+        Args:
+            photograph: Linear values, shape (3, H, H).
+            mask: The object's share of each pixel, shape (H, H).
+            mesh: Mesh of the object.
+            size: Number of pixels per side of the target.
+            options: Settings with which the mesh is rendered.
+
+        Returns:
+            Target with `size` pixels per side.
         """
+        # 1 in pixels that the object covers completely, shape (1, H, H).
         is_inside = (mask > WHOLE).double()[None]
+        # Mean color of the inside pixels around each pixel: sum over their count.
         window = 2 * BORDER + 1
-        near = F.avg_pool2d(photograph * is_inside, window, 1, BORDER)
-        weight = F.avg_pool2d(is_inside, window, 1, BORDER)
-        color = torch.where(is_inside > 0, photograph, near / weight.clamp(min=1e-9))
+        mean_inside_color = F.avg_pool2d(photograph * is_inside, window, 1, BORDER)
+        inside_fraction = F.avg_pool2d(is_inside, window, 1, BORDER)
+        border_color = mean_inside_color / inside_fraction.clamp(min=1e-9)
+        color = torch.where(is_inside > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
         mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
-        # The gray value is far from the object's own brightness.
+        # Black behind a bright object, and white behind a dark object, so that the
+        # silhouette stands out.
         is_bright = float(object_image.sum()) > 0.5 * COLORS * float(mask.sum())
         gray = 0.0 if is_bright else 1.0
         image = object_image + gray * (1 - mask)
         return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
 
-    def fitted(self, camera: Camera, least: float = 0.0, grid: int = SEARCH_GRID) -> _LightFit:
-        """Fit the light for a camera.
+    def fit_light(
+        self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
+    ) -> _LightFit:
+        """Find the light under which a render from a camera resembles the target most.
 
         Args:
-            camera: The camera.
-            least: Share of a pixel that both mesh and mask must cover, so that the
-                pixel counts.
-            grid: Subdivisions of the grid of directions in which the light is at
-                least `LEAST_RADIANCE`.
+            camera: Camera from which the mesh is rendered.
+            min_coverage: Smallest share of a pixel that the mesh and the mask
+                must both cover. Other pixels do not count.
+            grid: Number of subdivisions of the grid of directions in which the
+                radiance of the light is constrained (see `LEAST_RADIANCE`).
+
+        Returns:
+            Best light, with its residuals and the rendered coverage.
         """
         operator = precompute_transfer(self.mesh, camera, self.size, **asdict(self.options))
-        units = torch.eye(COEFFICIENTS, dtype=torch.float64)[..., None].expand(-1, -1, COLORS)
+        # 49 lights, each with a single coefficient of 1, shape (49, 49, 3).
+        unit_lights = torch.eye(COEFFICIENTS, dtype=torch.float64)
+        unit_lights = unit_lights[..., None].expand(-1, -1, COLORS)
         # Radiance of the P covered pixels per unit of each coefficient, (3, 49, P).
-        shown = operator.radiance(units).permute(1, 0, 2)
+        transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
         no_coverage = self.mask.new_zeros(self.size**2)
         coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
-        is_seen = torch.minimum(coverage, self.mask)[pixels] >= least
-        is_seen = is_seen.expand(COLORS, -1)
+        is_covered = torch.minimum(coverage, self.mask)[pixels] >= min_coverage
+        is_covered = is_covered.expand(COLORS, -1)
         is_clipped = image >= CLIPPED
-        is_used = is_seen
+        is_used = is_covered
         for _ in range(CLIPPING_ROUNDS):
-            used = shown * is_used[:, None]
-            squares = used @ shown.mT
-            penalty = self.penalty(squares)
-            wanted = (used @ (image - background[pixels])[..., None])[..., 0]
-            light, expected = _light_of_channels(squares, wanted, penalty, grid)
-            predicted = (light.T[:, None] @ shown)[:, 0] + background[pixels]
-            # A clipped pixel may be brighter than the photograph shows.
-            is_explained = is_seen & ~(is_clipped & (predicted > 1))
+            # Normal equations of the least squares over the used pixels: matrix
+            # (3, 49, 49) and right side (3, 49).
+            used_transfer = transfer * is_used[:, None]
+            normal_matrix = used_transfer @ transfer.mT
+            penalty = self.penalty(normal_matrix)
+            difference = (image - background[pixels])[..., None]
+            right_side = (used_transfer @ difference)[..., 0]
+            light, expected_light = _fit_channels(normal_matrix, right_side, penalty, grid)
+            # Rendered values of the covered pixels, shape (3, P).
+            predicted = (light.T[:, None] @ transfer)[:, 0] + background[pixels]
+            # A clipped pixel may be brighter than the photograph shows. It is left
+            # out if the render is brighter than 1.
+            is_explained = is_covered & ~(is_clipped & (predicted > 1))
             if torch.equal(is_explained, is_used):
                 break
             is_used = is_explained
         rendered = background.repeat(COLORS, 1).index_copy(1, pixels, predicted)
         differences = rendered.clamp(max=1) - self.image
-        penalties = penalty.sqrt() * (light - expected).T
+        penalties = penalty.sqrt() * (light - expected_light).T
         residuals = torch.cat([differences.flatten(), penalties.flatten()])
         return _LightFit(residuals, light, coverage)
 
-    def ranked(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-        """Return the squared error of each camera with its best light, smallest first."""
+    def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
+        """Sort cameras by the squared error that is left with the best light of each camera.
+
+        Args:
+            cameras: Cameras to compare.
+
+        Returns:
+            Pairs of the squared error and the camera, the smallest error first.
+        """
         errors = [
-            (float(self.fitted(camera).residuals.square().sum()), camera) for camera in cameras
+            (float(self.fit_light(camera).residuals.square().sum()), camera) for camera in cameras
         ]
         return sorted(errors, key=lambda pair: pair[0])
 
-    def penalty(self, squares: Tensor) -> Tensor:
-        """Return the weights (49,) of the squared coefficients of a light in the error.
+    def penalty(self, normal_matrix: Tensor) -> Tensor:
+        """Compute the weights of the squared SH coefficients of a light in the error.
 
-        They are in proportion to the squares (3, 49, 49) of what the coefficients
-        show, so the result does not depend on the scale of the albedo.
+        The weights of band l are proportional to 1 + (l (l + 1))², because
+        -l (l + 1) is the eigenvalue of the Laplacian on the sphere. They are also
+        proportional to the squared brightness of the object under uniform light,
+        so the fit does not depend on the scale of the albedo.
+
+        Args:
+            normal_matrix: For each channel, the sums over pixels of products of
+                the radiances per unit of two coefficients, shape (3, 49, 49).
+
+        Returns:
+            Weight of each coefficient, shape (49,).
         """
-        brightest = squares[:, 0, 0].max() + 1e-12 * self.mask.sum()
+        # Coefficient 0 is uniform light. The small addition avoids weights of 0.
+        uniform_brightness = normal_matrix[:, 0, 0].max() + 1e-12 * self.mask.sum()
         band = bands(DEGREE).double()
-        return SMOOTH * brightest * (1 + (band * (band + 1)).square())
+        return SMOOTH * uniform_brightness * (1 + (band * (band + 1)).square())
 
-    def descended(self, camera: Camera) -> Camera:
-        """Return the camera after descent from a camera."""
+    def refine_camera(self, camera: Camera) -> Camera:
+        """Minimize the error over cameras near a given camera, and return the best camera."""
         return _Descent(self, camera).run()
 
-    def rendered(self, camera: Camera, light: Tensor) -> Tensor:
-        """Render the mesh in linear light, shape (3, size²)."""
+    def render_linear(self, camera: Camera, light: Tensor) -> Tensor:
+        """Render the mesh, and decode the image to linear values.
+
+        Args:
+            camera: Camera of the image.
+            light: SH coefficients, shape (49, 3).
+
+        Returns:
+            Linear values, shape (3, size²).
+        """
         options = asdict(self.options)
         image = render(self.mesh, camera, light, self.size, self.gray, **options)
         return decode(image, self.options.encoding).flatten(1)
 
-    def scene(self, camera: Camera) -> FittedScene:
-        """Fit the light for a camera, and compare the render with the target."""
-        fit = self.fitted(camera, WHOLE, FINAL_GRID)
-        image = self.rendered(camera, fit.light)
+    def fit_final_light(self, camera: Camera) -> FittedScene:
+        """Fit the light for the final camera, and compute how well the render fits.
+
+        Args:
+            camera: Camera that was found.
+
+        Returns:
+            Camera and light, with the error and the overlap of the silhouettes.
+        """
+        # Only pixels inside of the object count, and the grid of directions is fine.
+        fit = self.fit_light(camera, WHOLE, FINAL_GRID)
+        rendered = self.render_linear(camera, fit.light)
         is_inside = self.mask > WHOLE
-        target = self.image[:, is_inside]
-        error = (image - self.image)[:, is_inside].norm() / target.norm()
+        inside_image = self.image[:, is_inside]
+        error = (rendered - self.image)[:, is_inside].norm() / inside_image.norm()
         intersection = torch.minimum(fit.coverage, self.mask).sum()
-        overlap = intersection / torch.maximum(fit.coverage, self.mask).sum()
+        union = torch.maximum(fit.coverage, self.mask).sum()
+        overlap = intersection / union
         return FittedScene(camera, fit.light, float(error), float(overlap))
 
 
 class _Descent:
-    """The Gauss-Newton method in a trust region, over five values of a camera.
+    """Gauss-Newton method in a trust region that minimizes the error over five camera values.
 
-    The values are polar angle and azimuth in radians, the width relative to the first camera's,
-    and the shifts right and up in units of the first camera's width. The light is
-    fitted anew for each camera (variable projection). Central differences over
-    half a pixel smooth the steps that the error makes at single samples.
+    The values are the polar angle and the azimuth in radians, the width divided
+    by the width of the first camera, and the shifts right and up divided by the
+    width of the first camera. The best light is computed for each camera
+    (variable projection). The error jumps slightly if a sample changes from one
+    face to another. Derivatives are therefore differences over about a pixel.
+
+    Args:
+        target: Image that the render should resemble.
+        camera: First camera.
     """
 
     def __init__(self, target: _Target, camera: Camera):
         self._target = target
-        self._camera = camera
+        self._first_camera = camera
 
     def run(self) -> Camera:
-        """Return the camera with the smallest error that is found."""
-        camera = self._camera
+        """Return the camera with the smallest error that the descent finds."""
+        camera = self._first_camera
         right = camera.right / camera.width
         up = camera.up / camera.width
+        # Bounds of the five values.
         lowest = [POLE_DISTANCE, -np.inf, 0.5, -1.0, -1.0]
         highest = [math.pi - POLE_DISTANCE, np.inf, 2.0, 1.0, 1.0]
         polar = math.radians(camera.polar)
@@ -549,130 +700,175 @@ class _Descent:
         return self._camera_of(found.x)
 
     def _camera_of(self, values: np.ndarray) -> Camera:
-        """Return the camera of the five values."""
+        """Convert the five values of the descent, shape (5,), to a camera."""
         polar, azimuth, relative_width, right, up = values.tolist()
-        width = self._camera.width
+        width = self._first_camera.width
         moved = replace(
-            self._camera,
+            self._first_camera,
             polar=math.degrees(polar),
             azimuth=math.degrees(azimuth),
             width=width * relative_width,
             right=width * right,
             up=width * up,
         )
-        # The distance changes with the width, so that the angle of view stays.
+        # The distance changes with the width, so that the field of view stays.
         if isinstance(moved, PerspectiveCamera):
             moved = replace(moved, distance=moved.distance * relative_width)
         return moved
 
     def _residuals(self, values: np.ndarray) -> np.ndarray:
-        """Return the residuals (N,) of the target, for the camera of the five values."""
-        return self._target.fitted(self._camera_of(values)).residuals.numpy()
+        """Compute the residuals of the target for a camera with its best light.
+
+        Args:
+            values: Five values of the camera, shape (5,).
+
+        Returns:
+            Residuals of `_LightFit`, shape (N,).
+        """
+        return self._target.fit_light(self._camera_of(values)).residuals.numpy()
 
     def _jacobian(self, values: np.ndarray) -> np.ndarray:
-        """Return the derivatives (N, 5) of the residuals, by central differences."""
+        """Compute the derivatives of the residuals by the five values, by central differences.
+
+        Args:
+            values: Five values of the camera, shape (5,).
+
+        Returns:
+            Derivatives, shape (N, 5).
+        """
         columns = []
-        for step in np.diag(np.array(DIFFERENCES) / self._target.size):
+        step_sizes = np.array(DIFFERENCES) / self._target.size
+        # Each row of the diagonal matrix changes one value.
+        for step in np.diag(step_sizes):
             difference = self._residuals(values + step) - self._residuals(values - step)
             columns.append(difference / (2 * step.sum()))
         return np.stack(columns, axis=1)
 
 
-def _light_of_channels(
-    squares: Tensor, wanted: Tensor, penalty: Tensor, grid: int
+def _fit_channels(
+    normal_matrix: Tensor, right_side: Tensor, penalty: Tensor, grid: int
 ) -> tuple[Tensor, Tensor]:
-    """Fit the light of the channel that the object shows best, and then of the other channels.
+    """Solve the normal equations for the light of the brightest channel, then of all channels.
 
-    The other channels are expected to resemble the first one, because the object
-    may show little of them. For example, a yellow object hardly shows from where
-    blue light comes.
+    The object may hardly reflect a color. For example, a yellow object hardly
+    shows from where blue light comes. The light of each channel is therefore
+    expected to be a multiple of the light of the brightest channel, and
+    differences from this expected light are penalized.
 
     Args:
-        squares: Products of what the coefficients of the light show, shape
-            (3, 49, 49).
-        wanted: Products of what the coefficients show with what is to be shown,
-            shape (3, 49).
-        penalty: Weights of the squared differences from the expected light, shape
-            (49,).
-        grid: Subdivisions of the grid of directions.
+        normal_matrix: For each channel, the sums over pixels of products of the
+            radiances per unit of two coefficients, shape (3, 49, 49).
+        right_side: For each channel, the sums over pixels of products of the
+            radiance per unit of a coefficient and the radiance of the
+            photograph, shape (3, 49).
+        penalty: Weights of the squared differences of the coefficients from the
+            expected light, shape (49,).
+        grid: Number of subdivisions of the grid of directions in which the
+            radiance is constrained.
 
     Returns:
-        The light and the expected light, shape (49, 3) each. The expected light of
-        the first channel is zero.
+        The light and the expected light, shape (49, 3) each. The expected light
+        of the brightest channel is zero.
     """
-    regularized = squares + torch.diag(penalty)
-    best = int(squares[:, 0, 0].argmax())
-    best_light = _nonnegative_light(regularized[best, None], wanted[best, None], grid)[:, 0]
-    shown_squared = (squares @ best_light) @ best_light
+    regularized = normal_matrix + torch.diag(penalty)
+    # Coefficient 0 is uniform light.
+    best = int(normal_matrix[:, 0, 0].argmax())
+    best_light = _nonnegative_light(regularized[best, None], right_side[best, None], grid)[:, 0]
+    # For each channel, the factor for `best_light` with the smallest squared error.
+    squared_radiance = (normal_matrix @ best_light) @ best_light
     tiny = torch.finfo(torch.float64).tiny
-    brightness = (wanted @ best_light) / shown_squared.clamp(min=tiny)
-    expected = best_light[:, None] * brightness.clamp(min=0)
+    factors = (right_side @ best_light) / squared_radiance.clamp(min=tiny)
+    expected = best_light[:, None] * factors.clamp(min=0)
     expected[:, best] = 0
-    wanted_and_expected = wanted + (penalty[:, None] * expected).T
-    return _nonnegative_light(regularized, wanted_and_expected, grid), expected
+    # The penalty pulls each channel toward its expected light.
+    penalized_right_side = right_side + (penalty[:, None] * expected).T
+    return _nonnegative_light(regularized, penalized_right_side, grid), expected
 
 
-def _nonnegative_light(squares: Tensor, wanted: Tensor, grid: int) -> Tensor:
-    """Minimize xᵀ S x / 2 − wᵀ x for each channel, over lights x of non-negative radiance.
+def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tensor:
+    """Minimize xᵀ S x / 2 − wᵀ x over lights x without negative radiance, for each channel.
 
     With S = L Lᵀ and y = Lᵀ x, this is the projection of L⁻¹ w onto the cone
-    {y: G y ≥ 0}. Here G = R L⁻ᵀ, and the rows of R are the harmonics in the
-    directions of a grid. By Moreau's decomposition, the projection is L⁻¹ w + Gᵀ μ
-    with the non-negative μ that minimizes |L⁻¹ w + Gᵀ μ|.
+    {y: G y ≥ 0}. Here G = R L⁻ᵀ, and a row of R maps x to its radiance in one
+    direction. By Moreau's decomposition, the projection is L⁻¹ w + Gᵀ μ with the
+    non-negative μ that minimizes |L⁻¹ w + Gᵀ μ|.
 
     Args:
-        squares: The positive definite matrices S, shape (C, 49, 49).
-        wanted: The vectors w, shape (C, 49).
-        grid: Subdivisions of the grid of directions.
+        matrices: Positive definite matrix S of each of C channels,
+            shape (C, 49, 49).
+        right_sides: Vector w of each channel, shape (C, 49).
+        grid: Number of subdivisions of the grid of directions.
 
     Returns:
-        The lights, shape (49, C).
+        Lights x, shape (49, C).
     """
-    rows = _radiance_above_least(grid)
+    # Matrix R, shape (N, 49).
+    radiance_rows = _radiance_rows(grid)
     lights = []
-    for square, vector in zip(squares.numpy(), wanted.numpy(), strict=True):
-        lower = np.linalg.cholesky(square)
-        unconstrained = solve_triangular(lower, vector, lower=True)
-        sides = solve_triangular(lower, rows.T, lower=True)
+    for matrix, right_side in zip(matrices.numpy(), right_sides.numpy(), strict=True):
+        # L, L⁻¹ w and Gᵀ.
+        lower = np.linalg.cholesky(matrix)
+        unconstrained = solve_triangular(lower, right_side, lower=True)
+        constraints = solve_triangular(lower, radiance_rows.T, lower=True)
         nearest = unconstrained
-        # Few directions matter. The first solution has some of them, and others
-        # join if radiance is negative there. The result is that of all directions.
-        is_constrained = np.arange(len(rows)) % FIRST_DIRECTIONS == 0
-        is_negative = unconstrained @ sides < 0
+        # Only few directions limit the light. The first solution is constrained in
+        # some directions. Directions in which its radiance is negative are added,
+        # until there are none. The result is the same as with all directions.
+        is_constrained = np.arange(len(radiance_rows)) % FIRST_DIRECTIONS == 0
+        is_negative = unconstrained @ constraints < 0
         while is_negative.any():
             iterations = MAX_EXCHANGES * len(is_constrained)
-            multipliers, _ = nnls(sides[:, is_constrained], -unconstrained, maxiter=iterations)
-            nearest = unconstrained + sides[:, is_constrained] @ multipliers
-            is_negative = (nearest @ sides < 0) & ~is_constrained
+            active_constraints = constraints[:, is_constrained]
+            multipliers, _ = nnls(active_constraints, -unconstrained, maxiter=iterations)
+            nearest = unconstrained + active_constraints @ multipliers
+            is_negative = (nearest @ constraints < 0) & ~is_constrained
             is_constrained |= is_negative
+        # x = L⁻ᵀ y.
         lights.append(solve_triangular(lower, nearest, lower=True, trans="T"))
     return torch.from_numpy(np.stack(lights, axis=1))
 
 
 @cache
-def _radiance_above_least(grid: int) -> NDArray[Any]:
-    """Return the matrix (N, 49) from the coefficients of a light to its radiance in N directions.
+def _radiance_rows(grid: int) -> NDArray[Any]:
+    """Compute the matrix from SH coefficients to radiance above the smallest allowed radiance.
 
-    `LEAST_RADIANCE` times the mean radiance of the light is subtracted. The
-    directions are the vertices of an icosphere with `grid` subdivisions.
+    The smallest allowed radiance is `LEAST_RADIANCE` times the mean radiance of
+    the light.
+
+    Args:
+        grid: Number of subdivisions of the icosphere whose N vertices are the
+            directions.
+
+    Returns:
+        Matrix from 49 coefficients to N directions, shape (N, 49).
     """
     directions, _ = sphere(grid)
     rows = basis(torch.from_numpy(directions), DEGREE).numpy()
-    # Coefficient 0 alone determines the mean radiance.
+    # Coefficient 0 is the mean radiance times a constant, so reducing its column
+    # subtracts a fraction of the mean.
     rows[:, 0] *= 1 - LEAST_RADIANCE
     return rows
 
 
 def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
-    """Return a camera whose image of the mesh has the bounding box of the mask.
+    """Change the width and the shift of a camera so that the mesh is as large as the mask.
 
-    Width and shift of the camera change. The area of the box is matched, and not
-    its width and height separately. Boxes are in coordinates from -1 to 1, with x
-    to the right and y up.
+    The bounding box of the mesh in the image gets the center and the area of the
+    bounding box of the mask.
+
+    Args:
+        camera: Camera whose direction is kept.
+        mesh: Mesh of the object.
+        mask: The object's share of each pixel, shape (size, size).
+
+    Returns:
+        Copy of the camera with another width, shift and, if it has perspective,
+        distance.
     """
+    # Bounding boxes in image coordinates from -1 to 1, with x to the right and y up.
     points = camera.project(mesh.vertices[np.unique(mesh.faces)])[:, :2]
-    low = points.min(0)
-    high = points.max(0)
+    mesh_low = points.min(0)
+    mesh_high = points.max(0)
     size = len(mask)
     rows = np.flatnonzero((mask > 0.5).any(1).numpy())
     columns = np.flatnonzero((mask > 0.5).any(0).numpy())
@@ -680,11 +876,13 @@ def _framed(camera: Camera, mesh: Mesh, mask: Tensor) -> Camera:
     right = 2 * (columns[-1] + 1) / size - 1
     bottom = 1 - 2 * (rows[-1] + 1) / size
     top = 1 - 2 * rows[0] / size
-    # The factor of the camera's width.
-    factor = math.sqrt(float(np.prod(high - low)) / ((right - left) * (top - bottom)))
+    mesh_area = float(np.prod(mesh_high - mesh_low))
+    mask_area = (right - left) * (top - bottom)
+    # A camera that is wider by this factor shows the mesh smaller by this factor.
+    factor = math.sqrt(mesh_area / mask_area)
     width = camera.width * factor
     mask_center = np.array([left + right, bottom + top]) / 2
-    shift = mask_center - (low + high) / 2 / factor
+    shift = mask_center - (mesh_low + mesh_high) / 2 / factor
     framed = replace(camera, width=width, right=shift[0] * width / 2, up=shift[1] * width / 2)
     if isinstance(framed, PerspectiveCamera):
         framed = replace(framed, distance=framed.distance * factor)

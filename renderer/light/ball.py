@@ -8,20 +8,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# Newton steps to the surface of a ball. Four are usual. If more were needed, the
-# result would be inside of the ball instead of on its surface.
+# Largest number of Newton steps in `_nearest_in_box_and_sphere`. Four are usual. With
+# too few steps, the result would lie inside of the ball instead of on its surface.
 _MAX_STEPS = 20
-# Relative error of the squared distance from the center, in units of the dtype's eps.
+# Newton's method stops if the squared distance from the center differs from the
+# squared radius by at most this multiple of the dtype's `eps`, relative to the
+# squared radius.
 _ROUNDING_UNITS = 8
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A norm-ball for each of A rows of values.
+    """Norm-balls with one radius around A centers, one for each row of a batch.
 
     Attributes:
-        center: Centers of the balls, shape (A, ...).
-        radius: Radius of each ball.
+        center: Center of each ball, shape (A, ...).
+        radius: Radius of all balls.
         norm: "linf" for the maximum norm, or "l2" for the Euclidean norm over
             all values of a row.
     """
@@ -31,28 +33,32 @@ class Ball:
     norm: str
 
     def unflatten(self, *shape: int) -> Ball:
-        """Return the ball of values (A, *shape) that corresponds to this ball of values (A, D)."""
+        """Return the same balls for rows that are reshaped from (A, D) to (A, *shape).
+
+        Args:
+            *shape: New shape of a row. The product of the sizes is D.
+        """
         return Ball(self.center.unflatten(1, shape), self.radius, self.norm)
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """Return the lowest and the highest values in a ball of the norm "linf"."""
+        """Lowest and highest values in the balls of the norm "linf", shape (A, ...) each."""
         return self.center - self.radius, self.center + self.radius
 
 
 def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = None) -> Tensor:
-    """Project values onto a box, or onto the intersection of a box and a norm-ball.
+    """Project each row of values onto a box, or onto the intersection of a box and a norm-ball.
 
-    The result is the nearest point in the Euclidean sense.
+    The projection is the nearest point with respect to the Euclidean distance.
 
     Args:
-        values: Values, shape (A, ...).
+        values: A rows of values, shape (A, ...).
         low: Lowest values of the box, a number or a tensor that broadcasts.
         high: Highest values of the box, a number or a tensor that broadcasts.
-        within: Norm-ball whose centers lie in the box. None for the box alone.
+        within: Norm-balls whose centers lie in the box. None uses the box alone.
 
     Returns:
-        The projections, with the shape of the values.
+        Projections, shape (A, ...).
 
     Example:
         >>> ball = Ball(torch.zeros(1, 2), radius=1.0, norm="l2")
@@ -67,18 +73,28 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
 
 
 def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
-    """Project values v (A, ...) onto the intersection of a box and an L2 ball.
+    """Project each row of values onto the intersection of a box and an L2 ball.
 
-    With a multiplier λ for the ball, the projection is the box's nearest point
-    to c + (v - c) / (1 + λ), in which c is the center. Its squared distance from
-    c is a concave and piecewise linear function of s = 1 / (1 + λ)². Newton's
-    method from s = 0 therefore reaches the radius without passing it.
+    Let v be a row, c the center of its ball, and λ the Lagrange multiplier of the
+    ball. The projection is the point of the box that is nearest to
+    c + (v - c) / (1 + λ). The squared distance of this point from c is a concave
+    and piecewise linear function of s = 1 / (1 + λ)². Newton's method from s = 0
+    therefore reaches the squared radius without passing it.
+
+    Args:
+        values: A rows v of values, shape (A, ...).
+        low: Lowest values of the box, a number or a tensor that broadcasts.
+        high: Highest values of the box, a number or a tensor that broadcasts.
+        ball: L2 balls whose centers lie in the box.
+
+    Returns:
+        Projections, shape (A, ...).
     """
     offset = values - ball.center
     squared_radius = ball.radius**2
     rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
-    # The current s, and the squared distance and its derivative by s. They have
-    # the shape (A, 1, ...), or () before the first step.
+    # For each row, the current s, the squared distance, and its derivative by s. The
+    # shapes are (A, 1, ...), or () before the first step.
     s = offset.new_zeros(())
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
@@ -86,17 +102,25 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
         missing = squared_radius - squared_distance
         step = missing / slope.clamp(min=torch.finfo(values.dtype).tiny)
         s = (s + step.clamp(min=0)).clamp(max=1)
-        # The target at s = 1 is the values themselves, without rounding.
+        # With s = 1, the target is v. `values` has no rounding error.
         target = torch.where(s < 1, ball.center + s.sqrt() * offset, values)
         nearest = target.clamp(low, high)
+        # Clamped values do not change with s.
         slope = _squared_norm(offset * (nearest == target))
         squared_distance = _squared_norm(nearest - ball.center)
-        is_short = (s < 1) & (squared_radius - squared_distance > rounding)
-        if not is_short.any():
+        is_too_short = (s < 1) & (squared_radius - squared_distance > rounding)
+        if not is_too_short.any():
             break
     return nearest
 
 
 def _squared_norm(offsets: Tensor) -> Tensor:
-    """Return the squared L2 norm of each row of offsets (A, ...), shape (A, 1, ...)."""
+    """Compute the squared L2 norm of each row.
+
+    Args:
+        offsets: A rows of values, shape (A, ...).
+
+    Returns:
+        Squared norms, shape (A, 1, ...), which broadcasts to `offsets`.
+    """
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

@@ -1,14 +1,16 @@
-"""Environment maps: read them, write them, and compute them from SH coefficients.
+"""Environment maps: read and write files, and compute maps from SH coefficients.
 
-An environment map is a tensor (H, W, 3) of linear RGB radiance in the layout of
-`harmonics.equirectangular`. Row 0 faces up (+z), the middle column faces +x, and
-azimuth grows to the left, as seen from inside the sphere.
+An environment map is a tensor of linear RGB radiance, shape (H, W, 3) for H rows
+and W columns of texels, in the layout of `harmonics.equirectangular`. Row 0 faces
+up (+z), the middle column faces +x, and azimuth grows to the left, as seen from
+inside the sphere.
 
 Blender's Environment Texture has the same layout and needs no rotation. Mitsuba
-3's `envmap` has y up and the middle column towards +z, as OpenEXR defines such
+3's `envmap` has y up and the middle column toward +z, as OpenEXR defines such
 maps. A `to_world` matrix with the rows (0, 0, 1), (1, 0, 0) and (0, 1, 0)
-rotates it to our layout. Blender and Mitsuba shade with albedo / π, while this
-project leaves out the π, so a strength of π gives the same image there.
+rotates such a map to our layout. Blender and Mitsuba shade with albedo / π, but
+this project shades with the albedo. A map of strength π gives the same image in
+Blender and Mitsuba.
 """
 
 import math
@@ -25,54 +27,61 @@ from renderer.io.arrays import read_numbers, write_numbers
 from renderer.io.files import replacing
 from renderer.light.harmonics import basis, equirectangular
 
+# Suffixes of the files that `write_map` writes.
 SUFFIXES = (".npy", ".hdr", ".exr")
-# `read_panorama` refuses maps with fewer rows. The midpoint rule of `project`
-# would give a map of uniform radiance a direction: an error of 16 % at 4 rows.
+# `read_panorama` raises an error for maps with fewer rows. `harmonics.project` would
+# integrate such a map too coarsely: at 4 rows, a map of uniform radiance would get
+# coefficients of degree 1 or more with 16% of its norm.
 FEWEST_ROWS = 8
-# `light_radiance` evaluates as many directions at a time, which fit into the
-# CPU cache.
+# `light_radiance` evaluates this many directions at once. Their harmonics fit into
+# the cache of the processor.
 BLOCK = 2**12
-# `read_panorama` accepts negative radiance up to this fraction of the maximum.
-# Filters that scale maps leave such values.
+# `read_panorama` sets negative radiance to 0 if its magnitude is at most this
+# fraction of the largest radiance. Filters that scale maps leave such values.
 NEGATIVE = 1e-4
-# Largest image in MB that OpenImageIO reads. A damaged header may claim more.
+# Size in MB of the largest image that OpenImageIO reads. The limit is for damaged
+# files whose header claims a huge image.
 LARGEST_MAP = 4096
-# RGBE stores the channels of a texel as bytes with a common exponent.
+# Number of bits of a channel in an .hdr file (RGBE), whose three channels share one
+# exponent.
 _RGBE_BITS = 8
+# Names that the channels of an .npy array get, by the number of channels.
 _CHANNEL_NAMES_BY_COUNT = {1: "Y", 3: "RGB", 4: "RGBA"}
+# Names of alpha channels, and of red, green and blue channels, in lower case.
 _ALPHA_NAMES = ("a", "alpha")
 _COLOR_NAMES = (("r", "g", "b"), ("red", "green", "blue"))
 
 
 def to_map(coefficients: Tensor, height: int) -> Tensor:
-    """Compute the environment map of a light.
+    """Compute the environment map of a light that is given by SH coefficients.
 
-    The radiance is negative in places where the SH series rings. The function
-    `harmonics.project` inverts this one up to the error of its midpoint rule
-    along z. At degree 6, this error is at most 22.2 / height² of the L2 norm of
-    the coefficients (3.4e-4 at a height of 256).
+    The radiance may be negative, because few harmonics oscillate around bright
+    places. `harmonics.project` computes the coefficients from the map again, up
+    to the error of its midpoint rule along z. At degree 6, the L2 norm of this
+    error is at most 22.2 / height² times the norm of the coefficients (3.4e-4 at
+    a height of 256).
 
     Args:
         coefficients: SH coefficients, shape ((degree + 1)², 3).
         height: Number of rows. The map has twice as many columns.
 
     Returns:
-        Radiance at the centers of the texels, shape (height, 2 height, 3),
-        float64.
+        Radiance at the centers of the texels, float64,
+        shape (height, 2 · height, 3).
     """
     directions, _ = equirectangular(height, 2 * height)
     return light_radiance(coefficients, directions)
 
 
 def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Evaluate the radiance of a light from some directions.
+    """Compute the radiance that arrives from given directions.
 
     Args:
-        coefficients: SH coefficients, shape ((degree + 1)², 3).
-        directions: Directions of any length, shape (..., 3).
+        coefficients: SH coefficients of the light, shape ((degree + 1)², 3).
+        directions: Directions toward the light, of any length, shape (..., 3).
 
     Returns:
-        Radiance, shape (..., 3), in the dtype of the directions.
+        RGB radiance in the dtype of `directions`, shape (..., 3).
     """
     degree = math.isqrt(len(coefficients)) - 1
     blocks = directions.flatten(0, -2).split(BLOCK)
@@ -81,10 +90,10 @@ def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
 
 
 def negative_fraction(radiance: Tensor) -> float:
-    """Return the share of negative radiance in an environment map.
+    """Compute which fraction of the light of an environment map is negative.
 
-    This is the integral over the sphere of max(-radiance, 0), divided by the
-    integral of |radiance|, over all channels.
+    This is the integral of max(-radiance, 0) over the sphere and the channels,
+    divided by the integral of |radiance|.
 
     Args:
         radiance: Environment map, shape (H, W, 3).
@@ -101,37 +110,37 @@ def negative_fraction(radiance: Tensor) -> float:
 def read_map(path: str | Path) -> Tensor:
     """Read an environment map from a file.
 
-    Values are taken as linear RGB in the unit of the file. An alpha channel is
-    dropped, and a single gray channel becomes all three. If an .exr file has
-    layers, the layer without a name is read, or else the first layer that has
-    red, green and blue.
+    The values of the file are taken as linear RGB radiance. An alpha channel is
+    dropped. A single gray channel is used for red, green and blue. If an .exr
+    file has layers, the layer without a name is read. If all layers have names,
+    the first layer with red, green and blue is read.
 
     Args:
         path: An .npy, .hdr or .exr file. The array of an .npy file has the
-            shape (H, W, C) with 1, 3 or 4 channels.
+            shape (H, W, C) with C = 1, 3 or 4 channels.
 
     Returns:
-        Radiance, shape (H, W, 3), float32.
+        Radiance, float32, shape (H, W, 3).
 
     Raises:
-        InputError: If the file does not exist, cannot be read or is not such a
-            map, or if its radiance is NaN, infinite or above 1e12. (The sun has
-            1.6e9 cd/m².)
+        InputError: If the file does not exist, cannot be read or has no RGB or
+            gray channels, or if its radiance is NaN, infinite or above 1e12.
+            (The sun has 1.6e9 cd/m².)
     """
     path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
         texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
         radiance = texels[..., _color_channels(names)]
+    # NumPy and OpenImageIO raise many kinds of errors for a damaged file.
     except Exception as error:
-        # NumPy and OpenImageIO raise many kinds of errors for a damaged file.
         message = str(error).partition("\n")[0]
         raise InputError(f"environment map {path} cannot be read: {message}") from error
-    # NaN fails the comparison.
+    # The comparison is also False for NaN.
     if not (np.abs(radiance) <= MAX_MAGNITUDE).all():
         raise InputError(
-            f"environment map {path} holds NaN, infinity or radiance beyond {MAX_MAGNITUDE:g}: "
-            "replace these values and save it again"
+            f"environment map {path} has NaN, infinity or radiance above {MAX_MAGNITUDE:g}: "
+            "replace these values and save the map again"
         )
     return torch.from_numpy(radiance)
 
@@ -140,23 +149,25 @@ def read_panorama(path: str | Path) -> Tensor:
     """Read an environment map that covers the whole sphere and has no negative radiance.
 
     Args:
-        path: An .npy, .hdr or .exr file, as for `read_map`.
+        path: An .npy, .hdr or .exr file, see `read_map`.
 
     Returns:
-        Radiance of at least 0, shape (H, W, 3), float32. Negative radiance of at
-        most `NEGATIVE` times the maximum becomes zero.
+        Radiance of at least 0, float32, shape (H, W, 3). Negative radiance is
+        set to 0 if its magnitude is at most `NEGATIVE` times the largest
+        radiance.
 
     Raises:
-        InputError: See `read_map`. Also if the map has fewer than
-            `FEWEST_ROWS` rows, is not about twice as wide as high (such as a
-            mirror ball), or has more negative radiance.
+        InputError: If `read_map` raises it. If the map has fewer than
+            `FEWEST_ROWS` rows, or is not about twice as wide as high (such as a
+            photograph of a mirror ball). If the map has radiance below
+            -`NEGATIVE` times the largest radiance.
     """
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
         raise InputError(
-            f"environment map {path} has {width} × {height} texels: "
-            f"give an equirectangular one, twice as wide as high, of {FEWEST_ROWS} rows or more"
+            f"environment map {path} has {width} × {height} texels: give an equirectangular map, "
+            f"which is twice as wide as high, with at least {FEWEST_ROWS} rows"
         )
     minimum = radiance.min()
     if minimum < -NEGATIVE * radiance.max():
@@ -171,21 +182,24 @@ def write_map(path: str | Path, radiance: Tensor) -> None:
     """Write an environment map to a file.
 
     An .npy or .exr file stores float32 and keeps negative radiance. An .hdr file
-    stores RGBE, which has no sign and one exponent for three channels. There,
-    negative radiance becomes zero (`negative_fraction` returns how much that
-    is), and the error is at most 2⁻⁸ of the largest channel of the texel.
+    stores RGBE, which has no sign and one exponent for three channels. In an .hdr
+    file, negative radiance becomes 0 (see `negative_fraction`), and the rounding
+    error is at most 2⁻⁸ of the largest channel of a texel.
 
     Args:
-        path: An .npy, .hdr or .exr file. Its folder is created.
+        path: File to write, with the suffix .npy, .hdr or .exr. Its folder is
+            created.
         radiance: Environment map, shape (H, W, 3).
 
     Raises:
-        InputError: If the suffix is another one or the file cannot be written.
+        InputError: If the file has another suffix or cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
+        raise InputError(
+            f"{path} has no suffix of an environment map: use one of {', '.join(SUFFIXES)}"
+        )
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -201,7 +215,19 @@ def write_map(path: str | Path, radiance: Tensor) -> None:
 
 
 def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
-    """Write texels (H, W, 3) in a format of OpenImageIO, replacing the file at once."""
+    """Write an image with OpenImageIO.
+
+    A temporary file is written first and then renamed, so a reader never sees a
+    part of the file.
+
+    Args:
+        path: File to write or to replace.
+        texels: Linear values, shape (H, W, 3).
+        file_format: Name of the format in OpenImageIO, "hdr" or "openexr".
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
     image = _openimageio().ImageBuf(texels.contiguous().numpy())
     with replacing(path) as temporary:
         if not image.write(str(temporary), "unknown", file_format):
@@ -209,48 +235,96 @@ def _write_image(path: Path, texels: Tensor, file_format: str) -> None:
 
 
 def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
-    """Read the texels (H, W, C) of an .npy file and the names of their channels."""
+    """Read an environment map from an .npy file.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The texels, shape (H, W, C), and the names of the C channels.
+
+    Raises:
+        InputError: If the array does not have 3 dimensions and 1, 3 or 4
+            channels.
+    """
     array = read_numbers(path)
     names = _CHANNEL_NAMES_BY_COUNT.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
         raise InputError(
-            f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels"
+            f"the array has the shape {array.shape}, but (height, width, channels) with 1, 3 or 4 "
+            "channels is needed"
         )
     return array, names
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
-    """Read the texels (H, W, C) of an .hdr or .exr file and the names of their channels."""
+    """Read an environment map from an .hdr or .exr file.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The texels, shape (H, W, C), and the names of the C channels.
+
+    Raises:
+        InputError: If the file cannot be read or has another format, or if the
+            image is cropped or turned.
+    """
     image = _openimageio().ImageBuf(str(path))
-    # `get_pixels` would end the process if the file could not be read.
+    # Read explicitly, because `get_pixels` ends the process if reading fails.
     if not image.read():
         raise InputError(image.geterror())
     texels = image.get_pixels("float")
     spec = image.spec()
     if image.file_format_name not in ("hdr", "openexr"):
-        raise InputError(f"it is a {image.file_format_name} image, give an .hdr or .exr file")
+        raise InputError(
+            f"the file is a {image.file_format_name} image, but an .hdr or .exr file is needed"
+        )
     is_cropped = spec.roi != spec.roi_full
+    # The orientation 1 of EXIF means that the top row is stored first.
     is_turned = image.orientation != 1
     if is_cropped or is_turned:
-        raise InputError("it is stored cropped or turned, save it whole, its top row first")
+        raise InputError(
+            "the image is stored cropped or turned, but the whole image with its top row first "
+            "is needed"
+        )
     return texels, spec.channelnames
 
 
 def _to_rgbe_precision(radiance: Tensor) -> Tensor:
-    """Round radiance (H, W, 3) to values that RGBE holds exactly.
+    """Round radiance to the nearest values that the format RGBE of .hdr files can store.
 
-    OpenImageIO truncates instead, which would darken and tint the light.
+    OpenImageIO truncates instead of rounding, which would darken and tint the
+    light.
+
+    Args:
+        radiance: Environment map, shape (H, W, 3).
+
+    Returns:
+        Rounded radiance of at least 0, shape (H, W, 3).
     """
     radiance = radiance.clamp(min=0)
+    # The exponent of the largest channel of a texel holds for its three channels.
     _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
-    unit = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - _RGBE_BITS)
-    return (radiance / unit).round().clamp(max=2**_RGBE_BITS - 1) * unit
+    # Difference between two neighboring values of a channel, shape (H, W, 1).
+    step = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - _RGBE_BITS)
+    largest_integer = 2**_RGBE_BITS - 1
+    return (radiance / step).round().clamp(max=largest_integer) * step
 
 
 def _color_channels(names: Sequence[str]) -> list[int]:
-    """Return the indices of the red, green and blue channel, which are equal for a gray image.
+    """Find the red, green and blue channel of an image by the names of its channels.
 
-    The name of a channel is "CHANNEL" or "LAYER.CHANNEL", in any case.
+    Args:
+        names: Names of all channels, "CHANNEL" or "LAYER.CHANNEL", in upper or
+            lower case.
+
+    Returns:
+        Indices of the red, the green and the blue channel. The three indices are
+        equal for a gray image.
+
+    Raises:
+        InputError: If there is no such channel.
     """
     layers = []
     channels = []
@@ -259,23 +333,29 @@ def _color_channels(names: Sequence[str]) -> list[int]:
         layers.append(layer)
         channels.append(channel)
     layers_and_channels = list(zip(layers, channels, strict=True))
-    # The library puts the layer without a name first.
+    # OpenImageIO lists the channels of the layer without a name first, so this loop
+    # prefers this layer.
     for layer in layers:
-        for colors in _COLOR_NAMES:
-            wanted = [(layer, color) for color in colors]
+        for color_names in _COLOR_NAMES:
+            wanted = [(layer, color_name) for color_name in color_names]
             if set(wanted) <= set(layers_and_channels):
                 return [layers_and_channels.index(channel) for channel in wanted]
-    gray = [index for index, channel in enumerate(channels) if channel not in _ALPHA_NAMES]
-    if len(gray) == 1:
-        return gray * 3
-    raise InputError(f"its channels are {', '.join(names)}, give R, G and B, or one gray channel")
+    gray_channels = [index for index, channel in enumerate(channels) if channel not in _ALPHA_NAMES]
+    if len(gray_channels) == 1:
+        return gray_channels * 3
+    raise InputError(
+        f"the channels are {', '.join(names)}, but R, G and B, or one gray channel, are needed"
+    )
 
 
 def _openimageio() -> ModuleType:
-    """Import OpenImageIO, which takes long, and limit its threads and its memory."""
+    """Import OpenImageIO, and limit its threads and its memory.
+
+    The import takes long, so it happens only if an image is read or written.
+    """
     import OpenImageIO
 
-    # A pool of threads beside torch's own would slow both down.
+    # OpenImageIO's threads would compete with torch's threads.
     OpenImageIO.attribute("threads", 1)
     OpenImageIO.attribute("exr_threads", -1)
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)

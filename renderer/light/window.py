@@ -1,24 +1,25 @@
-"""The window that truncates a light at a degree without ringing.
+"""Windows: factors for the SH coefficients of a light that prevent negative radiance.
 
-A window multiplies the coefficients of band l by w_l. This is the convolution
-of the light with a kernel, where P_l are the Legendre polynomials and θ is the
-angle between two directions:
+A light that is cut off at a degree rings: its radiance oscillates around bright
+places and becomes negative. A window multiplies the coefficients of band l (the
+harmonics of degree l) by a factor w_l. This convolves the light with a kernel
 
-    k(cos θ) = Σ_l (2l + 1) / 4π w_l P_l(cos θ).
+    k(cos θ) = Σ_l (2l + 1) / 4π w_l P_l(cos θ),
 
-If the kernel is non-negative, a non-negative light stays so. With w_0 = 1, the
-light keeps its mean.
+with the Legendre polynomials P_l and the angle θ between two directions. If the
+kernel is non-negative, a non-negative light stays non-negative. With w_0 = 1,
+the light keeps its mean.
 
-Of these kernels, `nonnegative_window` computes the one that gives a point
-source the smallest irradiance error, Σ_l (2l + 1) A_l² (1 - w_l)². The factors
-A_l of `harmonics.lambertian_factors` are zero in the odd bands from the third
-on. Half of the smallest positive factor takes their place, which raises the
-error by less than 10⁻⁵ of it.
+`nonnegative_window` computes the non-negative kernel that gives a point source
+the smallest error of irradiance, Σ_l (2l + 1) A_l² (1 - w_l)². The factors A_l
+of `harmonics.lambertian_factors` are zero for odd l from 3 on. The program uses
+half of the smallest positive factor instead of zero, which raises the error by
+less than 10⁻⁵ of the error.
 
-This is a convex quadratic program with a constraint for each angle. The
+This is a convex quadratic program with one constraint for each angle θ. The
 exchange method (Hettich and Kortanek 1993, "Semi-infinite programming", section
-7) solves it for some angles, adds those at which the kernel is negative, and
-repeats.
+7) solves the program for some angles, adds the angles at which the kernel is
+negative, and repeats.
 """
 
 import math
@@ -30,83 +31,94 @@ from torch import Tensor
 
 from renderer.light.harmonics import bands, lambertian_factors, per_degree
 
-# Exchange steps. Eight are usual.
+# Largest number of rounds of the exchange method in `best_window`. Eight are usual.
 _MAX_ROUNDS = 100
-# The kernel may be below zero by this fraction of its largest value.
+# `best_window` stops if no value of the lobe is below minus this fraction of the
+# largest value.
 _MAX_DEPTH = 1e-9
 
 
 @per_degree
 def nonnegative_window(degree: int) -> Tensor:
-    """Compute the non-negative window with the smallest irradiance error of a point source.
+    """Compute the window that keeps lights non-negative and best keeps their irradiance.
 
-    The rms error is 0.17, 0.073 and 0.039 of the rms irradiance of the source
+    The window minimizes the error of the irradiance of a point source. The root
+    mean square error is 0.17, 0.073 and 0.039 of the root mean square irradiance
     at degrees 6, 12 and 19.
 
     Args:
         degree: Degree of the light, from 0 to 20.
 
     Returns:
-        Factors in [0, 1] of each coefficient, shape ((degree + 1)²,), float64.
-        They are equal within a band, and 1 for the first coefficient.
+        Factor in [0, 1] for each coefficient, float64, shape ((degree + 1)²,).
+        All coefficients of a band have the same factor. The first factor is 1.
     """
+    # The first harmonic of band l has the index l².
     first_of_band = np.arange(degree + 1) ** 2
-    weights = irradiance_weights(degree)[first_of_band].numpy()
-    # A point source has the energy 2l + 1 in band l.
-    weights = np.sqrt(2 * np.arange(degree + 1) + 1) * weights
+    irradiance_by_band = irradiance_weights(degree)[first_of_band].numpy()
+    # In band l, a point source of power 1 has the sum of squared coefficients
+    # (2l + 1) / 4π. The error of band l is therefore weighted with its square root,
+    # and the constant 4π does not matter.
+    weights = np.sqrt(2 * np.arange(degree + 1) + 1) * irradiance_by_band
     return best_window(np.ones(degree + 1), weights)
 
 
 def best_window(spectrum: np.ndarray, weight: np.ndarray) -> Tensor:
-    """Compute the window that changes a lobe least and makes it non-negative.
+    """Compute the window that makes a lobe non-negative and changes the lobe least.
 
-    A lobe is a function of the angle θ from its axis, Σ (2l + 1) s_l P_l(cos θ).
-    The window minimizes Σ weight_l² (w_l - 1)² such that
-    Σ (2l + 1) s_l w_l P_l is non-negative.
+    A lobe is a function of the angle θ from an axis, Σ_l (2l + 1) s_l P_l(cos θ),
+    with the Legendre polynomials P_l. A window multiplies s_l by a factor w_l.
+    The window minimizes Σ_l weight_l² (w_l - 1)², and Σ_l (2l + 1) s_l w_l P_l
+    is non-negative.
 
     Args:
-        spectrum: Positive factors s_l of the lobe in each band, shape
-            (degree + 1,). Ones are the lobe of a point source.
-        weight: Weight of w_l - 1 in each band, shape (degree + 1,).
+        spectrum: Positive factors s_l of the lobe, shape (degree + 1,). Ones are
+            the lobe of a point source.
+        weight: Weight of w_l - 1 for each l, shape (degree + 1,).
 
     Returns:
-        Factors w_l of each coefficient, shape ((degree + 1)²,), float64. They
-        are equal within a band, and 1 for the first coefficient.
+        Factor w_l for each coefficient of a light, float64,
+        shape ((degree + 1)²,). All coefficients of degree l have the same
+        factor. The first factor is 1.
     """
     degree = len(weight) - 1
     if degree == 0:
         return torch.ones(1, dtype=torch.float64)
+    # Cosines of the angles at which the windowed lobe is constrained.
     cosines = np.cos(np.linspace(0, math.pi, 2 * degree + 1))
     for _ in range(_MAX_ROUNDS):
         factors = _best_factors(cosines, weight, spectrum)
+        # Legendre coefficients of the windowed lobe.
         series = (2 * np.arange(degree + 1) + 1) * spectrum * factors
-        # The series has its minimum at a root of its derivative or at an end.
+        # The minima of the lobe are at roots of its derivative, or at an end.
         stationary = legendre.legroots(legendre.legder(series))
         candidates = np.concatenate([stationary.real.clip(-1, 1), [-1.0, 1.0]])
-        values = legendre.legval(candidates, series)
-        negative = candidates[values < -_MAX_DEPTH * values.max()]
-        if not len(negative):
+        lobe_values = legendre.legval(candidates, series)
+        negative_cosines = candidates[lobe_values < -_MAX_DEPTH * lobe_values.max()]
+        if not len(negative_cosines):
             break
-        cosines = np.concatenate([cosines, negative])
-    # Mixing with the constant kernel 1 lifts what is left below zero.
-    factors[1:] /= max(1 - values.min(), 1)
+        cosines = np.concatenate([cosines, negative_cosines])
+    # Reducing all factors but the first one mixes the lobe with a constant. This
+    # lifts a slightly negative minimum to 0.
+    factors[1:] /= max(1 - lobe_values.min(), 1)
     return torch.from_numpy(factors)[bands(degree)]
 
 
 @per_degree
 def irradiance_weights(degree: int) -> Tensor:
-    """Compute the weight of each coefficient in the irradiance, relative to the first one.
+    """Compute how strongly each SH coefficient changes the irradiance of a diffuse surface.
 
-    The weights are |A_l| / A_0, with the factors A_l of `lambertian_factors`.
-    Where A_l is zero, half of the smallest positive factor up to the next
-    degree takes its place.
+    The weight of a coefficient of degree l is |A_l| / A_0, with the factors A_l
+    of `lambertian_factors`. If A_l is zero, the weight is half of the smallest
+    positive weight up to degree + 1, so that all weights are positive.
 
     Args:
         degree: Degree of the light.
 
     Returns:
-        Positive weights, shape ((degree + 1)²,), float64.
+        Positive weight of each coefficient, float64, shape ((degree + 1)²,).
     """
+    # One more degree, because the smallest positive factor may belong to it.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
     weights = factors.clamp(min=smallest / 2) / factors[0]
@@ -114,16 +126,27 @@ def irradiance_weights(degree: int) -> Tensor:
 
 
 def _best_factors(cosines: np.ndarray, weight: np.ndarray, spectrum: np.ndarray) -> np.ndarray:
-    """Return the factors w_l (degree + 1,) of the best window for N angles.
+    """Compute the window of `best_window` with constraints at N angles only.
 
-    The windowed lobe is non-negative at the cosines (N,) of these angles. The
-    program is solved for the vector weight (w - 1) without the first band, whose
-    length is the error.
+    The unknowns are weight_l (w_l - 1) for l ≥ 1. The squared length of this
+    vector is the error, so the shortest vector that fulfills the constraints is
+    the solution.
+
+    Args:
+        cosines: Cosines of the angles at which the windowed lobe must not be
+            negative, shape (N,).
+        weight: Weight of w_l - 1 for each l, shape (degree + 1,).
+        spectrum: Factors s_l of the lobe, shape (degree + 1,).
+
+    Returns:
+        Factors w_l, the first of which is 1, shape (degree + 1,).
     """
     degree = len(weight) - 1
-    # The import of scipy.linalg takes a tenth of a second, and few programs need it.
+    # The module imports scipy.linalg, which takes a tenth of a second.
     from renderer.light.program import shortest
 
-    kernel = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
-    change = shortest(kernel[:, 1:] / weight[1:], -kernel.sum(1))
-    return np.concatenate([[1.0], 1 + change / weight[1:]])
+    # Values of (2l + 1) s_l P_l at the angles, shape (N, degree + 1).
+    terms = legendre.legvander(cosines, degree) * (2 * np.arange(degree + 1) + 1) * spectrum
+    # Without a window, the lobe has the values `terms.sum(1)`.
+    weighted_change = shortest(terms[:, 1:] / weight[1:], -terms.sum(1))
+    return np.concatenate([[1.0], 1 + weighted_change / weight[1:]])
