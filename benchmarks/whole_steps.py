@@ -94,35 +94,44 @@ class ByHand:
 
     The products with the operator, the background, the mask of clamped values
     and the gradient are written out for one light of the operator's type, a
-    gray background and linear values. There are no checks and no autograd.
+    gray background and linear values. There are no checks and no autograd. As in
+    the library, equal pixels are multiplied once if most pixels are equal.
 
     Args:
-        operator: Operator of P covered pixels from the light to the image.
+        operator: Operator of P covered pixels from the light to the image. U of
+            them are multiplied.
         background: Gray value in [0, 1].
 
     Attributes:
         shape: Shape (3, size, size) of the image.
-        pixels: Row-major indices of the covered pixels, shape (P,).
-        pixels_of_channels: The same indices for each channel, shape (3, P).
+        pixels: Row-major indices of the covered pixels for each channel, shape
+            (3, P).
         coefficients: Indices of the K coefficients that reach the surface,
             shape (K,).
-        transfer: Transfer matrix, shape (K, P).
-        albedo: Albedo of the covered pixels, shape (3, P).
-        background_part: What the background contributes to the covered pixels,
-            shape (P,).
+        source: For each channel and covered pixel, the index of the equal pixel
+            that is multiplied, shape (3, P). None if all pixels are multiplied.
+        transfer: Transfer matrix of the multiplied pixels, shape (K, U).
+        albedo: Albedo of the multiplied pixels, shape (3, U).
+        background_part: What the background contributes to the multiplied
+            pixels, shape (U,).
         empty_image: Image of the background alone, shape (3, size²).
     """
 
     def __init__(self, operator: TransferOperator, background: float):
         size = operator.settings.size
         self.shape = (3, size, size)
-        self.pixels = operator.pixels
-        self.pixels_of_channels = operator.pixels.expand(3, -1)
+        self.pixels = operator.pixels.expand(3, -1)
         self.coefficients = operator.nonzero
+        self.source = None
         self.transfer = operator.transfer[0]
         self.albedo = operator.albedo
         self.background_part = (1 - operator.coverage) * background
         self.empty_image = operator.coverage.new_full((3, size**2), background)
+        if operator.distinct is not None:
+            self.source = operator.distinct.source.expand(3, -1)
+            self.transfer = self.transfer.index_select(1, operator.distinct.first)
+            self.albedo = self.albedo.index_select(1, operator.distinct.first)
+            self.background_part = self.background_part.index_select(0, operator.distinct.first)
 
     def step(self, light: Tensor, loss: Loss) -> tuple[Tensor, Tensor]:
         """Render a light, and compute the gradient of the loss by the light.
@@ -140,9 +149,13 @@ class ByHand:
         clamped = values.clamp(0, 1)
         # Operations in place reuse the memory of the values.
         is_unclamped = values.eq_(clamped)
-        image = self.empty_image.clone().scatter_(1, self.pixels_of_channels, clamped)
+        shown = clamped if self.source is None else clamped.gather(1, self.source)
+        image = self.empty_image.clone().scatter_(1, self.pixels, shown)
         image = image.view(self.shape)
-        image_gradient = loss.gradient(image).reshape(3, -1).index_select(1, self.pixels)
+        image_gradient = loss.gradient(image).reshape(3, -1).gather(1, self.pixels)
+        if self.source is not None:
+            sums = torch.zeros_like(clamped)
+            image_gradient = sums.scatter_add_(1, self.source, image_gradient)
         irradiance_gradient = image_gradient.mul_(is_unclamped).mul_(self.albedo)
         reaching_gradient = torch.nn.functional.linear(irradiance_gradient, self.transfer)
         gradient = torch.zeros_like(light)

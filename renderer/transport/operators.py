@@ -53,6 +53,9 @@ BLOCK = 2**12
 # need several times as many numbers.
 GLOSSY = 2**20
 COLORS = 3
+# An operator multiplies equal pixels once if it saves as many pixels. In smaller
+# images, copying the pixels takes more time than the product.
+FEWEST_EQUAL = 2**12
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ class TransferOperator:
         sparse: Entries in three channels that are added to the dense transfer.
             They are those of projected patterns, which are mostly zero. None
             without such entries.
+        distinct: Pixels that differ, so that equal pixels are multiplied once.
+            None if most pixels differ.
 
     Example:
         >>> import torch
@@ -103,6 +108,7 @@ class TransferOperator:
     settings: ImageSettings
     basis: Basis = HARMONICS
     sparse: SparseTransfer | None = None
+    distinct: DistinctPixels | None = None
 
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
@@ -233,7 +239,9 @@ class TransferOperator:
                 f"radiance_gradient of shape {given} is not of the operator's pixels: "
                 f"give {expected}"
             )
-        return self._light_gradient(radiance_gradient)
+        if self._compact is None:
+            return self._light_gradient(radiance_gradient)
+        return self._compact._light_gradient(self._sum_equal(radiance_gradient))
 
     def _images(
         self, lights: Tensor, background: _PreparedBackground
@@ -241,10 +249,11 @@ class TransferOperator:
         """Render without a graph.
 
         Returns the images (..., 3, size, size), ones and zeros where the clamp
-        lets the gradient pass or not (..., 3, P), and the clamped linear values
-        (..., 3, P).
+        lets the gradient pass or not (..., 3, U), and the clamped linear values
+        (..., 3, U) of the U distinct pixels.
         """
-        unclamped = self._radiance(lights).add_(background.term)
+        operator = self._compact or self
+        unclamped = operator._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
         # The gradient passes at the bounds themselves, as in `renderer.image.clamp`.
         is_passing = unclamped.eq_(clamped)
@@ -258,6 +267,8 @@ class TransferOperator:
             image_shape = (*batch, *image_shape)
         images = canvas.clone(memory_format=torch.contiguous_format)
         encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
+        if self._compact is not None:
+            encoded = self._copy_equal(encoded)
         # index_copy_ takes twice as long as scatter_ on a CPU.
         images.scatter_(-1, rows, encoded)
         return images.view(image_shape), is_passing, clamped
@@ -269,14 +280,18 @@ class TransferOperator:
 
         The gradient by the images has the shape (..., 3, size, size).
         """
-        # torch selects ten times as fast from two axes as from three.
-        by_channel = image_gradient.reshape(-1, self._image_shape[1] * self._image_shape[2])
-        covered = by_channel.index_select(1, self.pixels)
+        rows = self._pixel_rows
         if is_passing.ndim > 2:
-            covered = covered.view(is_passing.shape)
+            rows = rows.expand(*is_passing.shape[:-2], -1, -1)
+        # index_select takes longer, and much longer if there are three axes.
+        covered = image_gradient.flatten(-2).gather(-1, rows)
+        operator = self
+        if self._compact is not None:
+            operator = self._compact
+            covered = self._sum_equal(covered)
         if not self._is_linear:
             covered = encode_gradient(clamped, covered, self.settings.encoding)
-        gradient = self._light_gradient(covered.mul_(is_passing))
+        gradient = operator._light_gradient(covered.mul_(is_passing))
         # A sum takes less time than the largest magnitude of all pixels.
         if not math.isfinite(gradient.sum().item()):
             require_bounded(image_gradient=covered)
@@ -344,6 +359,19 @@ class TransferOperator:
             gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
         )
 
+    def _copy_equal(self, values: Tensor) -> Tensor:
+        """Copy values (..., U) of the distinct pixels to all covered pixels, shape (..., P)."""
+        assert self.distinct is not None
+        source = self.distinct.source.expand(*values.shape[:-1], -1)
+        return values.gather(-1, source)
+
+    def _sum_equal(self, values: Tensor) -> Tensor:
+        """Sum values (..., P) of equal pixels, shape (..., U)."""
+        assert self.distinct is not None
+        sums = values.new_zeros(*values.shape[:-1], len(self.distinct.first))
+        source = self.distinct.source.expand(values.shape)
+        return sums.scatter_add_(-1, source, values)
+
     def _prepare_background(
         self, background: float | Tensor, lights: Tensor
     ) -> _PreparedBackground:
@@ -368,13 +396,14 @@ class TransferOperator:
         The images have the shape (..., 3, size, size), and the lights
         (..., coefficients, 3).
         """
+        operator = self._compact or self
         flat = images.flatten(-2)
-        at_pixels = flat.index_select(-1, self.pixels)
+        at_pixels = flat.index_select(-1, operator.pixels)
         if self.settings.encoding != "linear":
             # The last bit of a power depends on the position in memory, so it is
             # computed for each light.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
-        coverage = self.coverage.to(images)[None]
+        coverage = operator.coverage.to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
         return _PreparedBackground(flat, term)
 
@@ -392,7 +421,8 @@ class TransferOperator:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        return replace(self, **tensors, sparse=sparse)
+        # On a GPU, the order of the sums of equal pixels would differ from run to run.
+        return replace(self, **tensors, sparse=sparse, distinct=None)
 
     @property
     def by_channel(self) -> Tensor:
@@ -414,6 +444,21 @@ class TransferOperator:
     def _white(self) -> Tensor | None:
         """Return the white transfer (K, P) of gloss, or None without it."""
         return self.transfer[1] if len(self.transfer) == 2 else None
+
+    @cached_property
+    def _compact(self) -> TransferOperator | None:
+        """Return the operator of the distinct pixels, or None if most pixels differ."""
+        if self.distinct is None:
+            return None
+        first = self.distinct.first
+        return replace(
+            self,
+            transfer=self.transfer.index_select(-1, first),
+            albedo=self.albedo.index_select(-1, first),
+            coverage=self.coverage.index_select(0, first),
+            pixels=self.pixels.index_select(0, first),
+            distinct=None,
+        )
 
     @cached_property
     def _kept_background(self) -> dict[str, Any]:
@@ -449,13 +494,29 @@ class TransferOperator:
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
+class DistinctPixels(NamedTuple):
+    """The U covered pixels of an operator that differ from each other.
+
+    Equal pixels have the same transfer, albedo and coverage.
+
+    Attributes:
+        first: First of the equal pixels, as an index into the P covered pixels,
+            ascending, shape (U,).
+        source: Index into `first` of the pixel that each covered pixel equals,
+            shape (P,).
+    """
+
+    first: Int[Tensor, " U"]
+    source: Int[Tensor, " P"]
+
+
 class _PreparedBackground(NamedTuple):
     """A background of an operator.
 
     Attributes:
         images: Background images, shape (..., 3, size²).
-        term: Linear values that are added to the radiance of the covered pixels,
-            shape (..., 3, P).
+        term: Linear values that are added to the radiance of the U distinct
+            pixels, shape (..., 3, U).
     """
 
     images: Tensor
@@ -468,7 +529,9 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
         ctx.operator = operator
-        return operator._radiance(lights)
+        if operator._compact is None:
+            return operator._radiance(lights)
+        return operator._copy_equal(operator._compact._radiance(lights))
 
     @staticmethod
     @once_differentiable
@@ -663,16 +726,27 @@ class _OperatorBuilder:
         if self.basis.environment is not None:
             dense.append(self._environment_rows(self.basis.environment, surface, channels))
         joined_rows = self._join(dense, channels.number, len(fragments.pixels))
+        albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
+        distinct = None
+        if self._is_alike_on_faces(surface, channels):
+            distinct = _distinct_pixels(fragments, albedo)
         return TransferOperator(
             transfer=joined_rows.transfer,
-            albedo=channels.pixel_albedo.T.to(self.dtype).contiguous(),
+            albedo=albedo,
             coverage=fragments.coverage.to(self.dtype),
             pixels=fragments.pixels,
             nonzero=joined_rows.coefficients,
             settings=self.settings,
             basis=self.basis,
             sparse=joined(sparse),
+            distinct=distinct,
         )
+
+    def _is_alike_on_faces(self, surface: Surface, channels: _Channels) -> bool:
+        """Return whether all pixels that one face fills have the same transfer."""
+        is_matte = surface.gloss is None and channels.is_shared
+        is_open = self.transport is None and not self.basis.local_lights
+        return is_matte and is_open and self.settings.normals == "flat"
 
     def _channels(self, surface: Surface) -> _Channels:
         """Choose the layout with the fewest channels that is exact."""
@@ -875,6 +949,33 @@ def _copied_from_faces(fragments: Fragments, face_harmonics: Tensor, dtype: torc
         block = summed_pixels[first : first + BLOCK].expand(len(filtered), -1)
         filtered.scatter_(1, block, sums.to(dtype).T.contiguous())
     return filtered[None]
+
+
+def _distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | None:
+    """Find equal pixels of a view in which all samples of a face have the same transfer.
+
+    The pixels that one face fills are equal if they have the same albedo, given
+    in shape (3, P). None is returned if there are too few to save time.
+    """
+    pixel_count = len(fragments.pixels)
+    if pixel_count < FEWEST_EQUAL:
+        return None
+    filling_runs = _indices(fragments.runs.sample_count == fragments.samples**2)
+    pixel = fragments.runs.pixel.index_select(0, filling_runs)
+    face = fragments.runs.face.index_select(0, filling_runs)
+    first_of_face = face.new_full((len(fragments.faces),), pixel_count)
+    first_of_face.scatter_reduce_(0, face, pixel, "amin")
+    all_pixels = torch.arange(pixel_count)
+    first_equal = all_pixels.index_copy(0, pixel, first_of_face.index_select(0, face))
+    is_first = first_equal == all_pixels
+    first = _indices(is_first)
+    saved = pixel_count - len(first)
+    if saved < FEWEST_EQUAL or 2 * saved < pixel_count:
+        return None
+    if not torch.equal(albedo, albedo.index_select(1, first_equal)):
+        return None
+    position_in_first = is_first.cumsum(0) - 1
+    return DistinctPixels(first, position_in_first.index_select(0, first_equal))
 
 
 def _indices(is_chosen: Tensor) -> Tensor:
