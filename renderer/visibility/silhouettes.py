@@ -43,7 +43,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 # A silhouette is visible if it lies behind the surface beside it by at most
-# this fraction of the depth of the mesh. It then lies on that surface.
+# this fraction of the depth of the mesh. An object that stands on another
+# surface touches it there, and by rounding, or as it was modeled, the object's
+# edge may lie slightly below this surface.
 NEAR = 1e-3
 
 # Index of samples that show no mesh.

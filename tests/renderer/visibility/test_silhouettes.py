@@ -259,6 +259,35 @@ def test_a_growing_square_gains_its_perimeter_times_the_jump_of_radiance(meshes,
     assert growth / pixels_per_area == pytest.approx(perimeter * jump, abs=0.04)
 
 
+def test_a_growing_pyramid_on_the_ground_gains_its_perimeter_times_the_jump_of_radiance():
+    """By rounding, the ground hides the base of the pyramid.
+
+    The radiance is 0.6 on the pyramid and 0.12 on the ground.
+    """
+    base = square(0.5, 0.0).vertices - np.array([0, 0, 1e-12])
+    corners = [*base, [0, 0, 0.5]]
+    pyramid = renderer.Mesh.plain(corners, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    white_ground = square(0.9, 0.0)
+    ground = renderer.Mesh.plain(white_ground.vertices, white_ground.faces, (0.2, 0.2, 0.2))
+    mesh = concatenate([pyramid, ground])
+    vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+    image = rendered(
+        mesh,
+        FROM_ABOVE,
+        32,
+        8,
+        light=soft_front_light(0.6),
+        vertices=vertices,
+        albedo_scale=1.0,
+    )
+    (gradient,) = torch.autograd.grad(image[0].sum(), vertices)
+    outward = vertices.detach()[:4, :2].sign()
+    growth = float((gradient[:4, :2] * outward).sum())
+    pixels_per_area = (32 / FROM_ABOVE.width) ** 2
+    perimeter = 8 * 0.5
+    assert growth / pixels_per_area == pytest.approx(perimeter * (0.6 - 0.12), abs=0.02)
+
+
 def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
     """Create a square of cells² cells with displaced corners, and two triangles for each cell.
 
