@@ -53,9 +53,9 @@ BLOCK = 2**12
 # need several times as many numbers.
 GLOSSY = 2**20
 COLORS = 3
-# An operator multiplies equal pixels once if it saves as many pixels. In smaller
+# An operator multiplies equal pixels once if this saves at least so many. In smaller
 # images, copying the pixels takes more time than the product.
-FEWEST_EQUAL = 2**12
+FEWEST_SAVED_PIXELS = 2**12
 
 
 @dataclass(frozen=True)
@@ -958,7 +958,7 @@ def _distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | N
     in shape (3, P). None is returned if there are too few to save time.
     """
     pixel_count = len(fragments.pixels)
-    if pixel_count < FEWEST_EQUAL:
+    if pixel_count < FEWEST_SAVED_PIXELS:
         return None
     filling_runs = _indices(fragments.runs.sample_count == fragments.samples**2)
     pixel = fragments.runs.pixel.index_select(0, filling_runs)
@@ -970,7 +970,7 @@ def _distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | N
     is_first = first_equal == all_pixels
     first = _indices(is_first)
     saved = pixel_count - len(first)
-    if saved < FEWEST_EQUAL or 2 * saved < pixel_count:
+    if saved < FEWEST_SAVED_PIXELS or 2 * saved < pixel_count:
         return None
     if not torch.equal(albedo, albedo.index_select(1, first_equal)):
         return None

@@ -165,7 +165,7 @@ CLOSE_UP = PerspectiveCamera(70.0, 0.0, 2.2, distance=3.0)
 )
 def test_pixels_of_one_face_under_other_light_are_not_equal(monkeypatch, mesh, changed, basis):
     # The rows of the projector are dense, and stand in the transfer.
-    monkeypatch.setattr(lamp_paths, "SPARSE", 0)
+    monkeypatch.setattr(lamp_paths, "SPARSE_FRACTION", 0)
     settings = ImageSettings(96, 1, **changed)
     [operator] = build_operators(mesh, [CLOSE_UP], settings, choose("numpy"), basis=basis)
     light = draw(basis.size, 3).float()
