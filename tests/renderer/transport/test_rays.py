@@ -36,7 +36,7 @@ def starts_of_rays(sample_count: int) -> Tensor:
     surface = Surface(mesh, fragments, settings)
     [hits] = Rays(mesh).hits(surface, sphere(DIRECTIONS))
     assert hits.pixels.tolist() == list(range(SIZE**2))
-    return hits.sample - sample_count * hits.pixels[:, None]
+    return hits.sample_of_ray - sample_count * hits.pixels[:, None]
 
 
 @pytest.mark.parametrize("sample_count", [9, 16])
