@@ -29,6 +29,7 @@ main = Command(
         "in addition.",
         examples=[
             "pnb-audit classifier=torchvision:resnet50 meshes=orange.glb",
+            "pnb-audit classifier=efficientnet_lite0 photographs=FOLDER",
             "pnb-audit classifier=torchvision:mobilenet_v3_small weights=mine.pth "
             "classes=mine.txt meshes=orange.glb",
             "pnb-audit classifier=NAME meshes=[orange.glb] hard_negatives=[solid:lemon] out=audit",

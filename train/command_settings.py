@@ -360,7 +360,12 @@ class AuditSettings(ClassifierSettings):
         "file tells. Each class has an audit of its own.",
         is_text=True,
     )
-    meshes: list[Any] = setting([], "Meshes of the class.")
+    meshes: list[Any] = setting([], "Meshes of the class. []: only `photographs` are audited.")
+    photographs: str | None = setting(
+        None,
+        "Folder of any photographs, without labels: which ones keep their predicted class in the "
+        "light of a projector? At most 100 times `budget` of them are attacked.",
+    )
     hard_negatives: list[Any] = setting(
         [],
         "Meshes of other classes, in the same lighting. []: generated fruit and balls, but "
@@ -388,10 +393,15 @@ class AuditSettings(ClassifierSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.meshes:
+        if not self.meshes and self.photographs is None:
             raise InputError(
-                "meshes is empty: name one mesh or more, as in meshes=[solid:orange]", "meshes"
+                "meshes is empty: name one mesh or more, as in meshes=[solid:orange], or a folder "
+                "of photographs, as in photographs=FOLDER",
+                "meshes",
             )
+        for key in ("hard_negatives", "photos", "laboratory"):
+            if getattr(self, key) and not self.meshes:
+                raise InputError(f"{key} is for an audit of meshes: set meshes, too", key)
         if self.laboratory and self.hard_negatives:
             instead = f"hard_negatives are rendered instead of laboratory={self.laboratory}"
             raise InputError(f"{instead}: leave one of them out", "hard_negatives")

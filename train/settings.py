@@ -275,7 +275,7 @@ class TrainSettings(Settings):
     interpolate: bool = setting(
         False,
         "At the end, interpolate between the weights of train.init_from and the trained weights, "
-        "by the factor that validates best on unchanged and relit images (WiSE-FT).",
+        "by the factor with the lowest loss on unchanged and relit validation images (WiSE-FT).",
     )
     ema_decay: float = setting(
         0.0,

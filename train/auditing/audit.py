@@ -33,10 +33,16 @@ from train.auditing.lights import (
     transfer_success,
 )
 from train.auditing.plain_light import PlainViews, find_plain_views
+from train.auditing.relit_audit import (
+    RELIT_PART,
+    measure_photographs,
+    photographs_screen,
+    write_photographs_page,
+)
 from train.class_names import class_name, class_of_meshes, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
-from train.data.photographs import OTHER_PREFIX, find_photographs
+from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabeled
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.predictions import Predictor
 from train.evaluation.scores.scoring import evaluate_photographs
@@ -74,7 +80,7 @@ NO_HARD_NEGATIVES = (
     "name meshes of what the classifier may confuse with the class."
 )
 # Keys of settings that may be set when a stopped audit continues.
-ADDED = ("hardened", "photos")
+ADDED = ("hardened", "photos", "photographs")
 
 
 def run_audit(
@@ -98,6 +104,8 @@ def run_audit(
     is_named = networks is None
     if networks is None:
         networks = load_networks(settings)
+    if not settings.meshes:
+        return _audit_photographs(settings, networks, is_named)
     caveats = _compare_sizes(networks.values())
     if not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
@@ -129,12 +137,52 @@ def run_audit(
                 renders,
                 lambda folder: write_laboratory(replace(laboratory, out=str(folder))),
             )
-        for key in plan.networks:
+        for key, network in plan.networks.items():
             plan.measure(key, out / key)
-        names = {key: network.name for key, network in plan.networks.items()}
-        if len(set(names.values())) < len(names):
-            names[page.HARDENED] += " (hardened)"
+            if settings.photographs:
+                _measure_photographs(network, settings, out / key)
+        names = _names(plan.networks)
         return page.write_audit_page(settings.label, names, plan.folders, out, caveats)
+
+
+def _audit_photographs(
+    settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
+) -> page.Audited:
+    """Audit networks on relit photographs alone, and write the report."""
+    device = choose_device(settings.device)
+    find_unlabeled(published(Path(str(settings.photographs))))
+    out = writable_folder(settings.out, "out")
+    own = _own_results(out) if is_named else ()
+    require_replaceable(out, "out", settings.overwrite, own=own)
+    caveats = _compare_sizes(networks.values())
+    for network in networks.values():
+        if not network.has_gradients:
+            caveats.append(f"{network.name} has no gradients: only random search attacks it.")
+    for sentence in caveats:
+        console.warning(sentence)
+    with sole_writer("out", out):
+        _begin(settings, out, out / "renders")
+        for key, network in networks.items():
+            (out / key).mkdir(exist_ok=True)
+            _measure_photographs(network.to(device), settings, out / key)
+        names = _names(networks)
+        paths = {name: out / key for key, name in names.items()}
+        screen = photographs_screen(paths)
+        path = write_photographs_page(screen, paths, out, caveats)
+        return page.Audited(path, screen, "", names)
+
+
+def _measure_photographs(network: Classifier, settings: AuditSettings, own: Path) -> None:
+    """Measure a network on relit photographs, unless this part exists in its folder."""
+    _write_folder(own / RELIT_PART, partial(measure_photographs, network, settings))
+
+
+def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
+    """Return the names of networks, which differ."""
+    names = {key: network.name for key, network in networks.items()}
+    if len(set(names.values())) < len(names):
+        names[page.HARDENED] += " (hardened)"
+    return names
 
 
 class _Plan:

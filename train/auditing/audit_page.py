@@ -12,6 +12,7 @@ from renderer.io.images import read_square
 from train.auditing.audit_screen import attack_pictures, charts, plain_sentence, screen_of_one
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.auditing.plain_light import PlainViews
+from train.auditing.relit_audit import relit_sections
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -132,6 +133,7 @@ def write_audit_page(
         screen=screen,
         caveats=[*caveats, *_unreadable_caveats(folders, list(paths.values())[-1])],
         agreement=_agreement(scored),
+        relit=relit_sections(paths),
         config=read_config(out / CONFIG),
     )
     return Audited(path, screen, label, names)

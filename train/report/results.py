@@ -21,7 +21,7 @@ from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
 # Files that the commands write to a folder, as patterns of `Path.glob`. An error
 # message names the first file that is found.
-OF_AUDIT = ("*/recognized.json",)
+OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
 OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
 OF_SCORES = (SUMMARY, PREDICTIONS, CONTACT_SHEET, ROC_TABLE, ROC_FIGURE)

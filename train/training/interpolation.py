@@ -1,9 +1,9 @@
 """Interpolation between the initial and the trained weights of a network.
 
 See Wortsman et al. 2022, "Robust fine-tuning of zero-shot models" (WiSE-FT). The
-factor is chosen on images that are kept aside. They need no labels: a
-prediction is right if it is that of the initial network for the unchanged
-image.
+factor is chosen on images that are kept aside. They need no labels, because
+predictions are compared with those of the initial network for the unchanged
+images.
 """
 
 from collections.abc import Mapping
@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from augment.losses import kl_divergence
 from augment.model_passes import eval_mode
 from augment.photographs.projected_light import relight_photographs
 from augment.progress import progress
@@ -34,8 +35,13 @@ def interpolate(
     trained: Mapping[str, Tensor],
     validation: Split,
     seed: int,
+    weights: tuple[float, float] = (1.0, 1.0),
 ) -> tuple[dict[str, Tensor], float]:
-    """Interpolate by the factor that validates best on unchanged and relit images.
+    """Interpolate by the factor with the lowest loss on validation images.
+
+    The loss is that of the training: the divergence from the predictions of
+    the initial network for the unchanged images, of the predictions for
+    unchanged images and of those for images in the light of a projector.
 
     Args:
         initial: Network before the training.
@@ -43,6 +49,7 @@ def interpolate(
         trained: Weights after the training.
         validation: Images that neither network learned from.
         seed: Seed of the light.
+        weights: Weights of both parts of the loss: unchanged and relit.
 
     Returns:
         The weights, on the CPU, and the factor. Among equally good factors,
@@ -50,21 +57,26 @@ def interpolate(
     """
     begin = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     wanted = predict(initial, validation)
-    best_score = -1.0
+    key = (seed, "validation")
+    lowest = float("inf")
     best_factor = FACTORS[0]
     for factor in FACTORS:
         selected.network.load_state_dict(mix(begin, trained, factor))
-        unchanged = agreement(predict(selected, validation), wanted)
-        relit_predictions = predict_relit(selected, validation, seed, "validation")
-        relit = agreement(relit_predictions, wanted)
-        console.debug("weights %.2f: agreement %.4f, relit %.4f", factor, unchanged, relit)
-        score = (unchanged + relit) / 2
-        if score > best_score:
-            best_score = score
+        unchanged = predict(selected, validation)
+        relit = predict(selected, validation, *key)
+        loss = weights[0] * divergence(unchanged, wanted) + weights[1] * divergence(relit, wanted)
+        console.debug(
+            "weights %.2f: loss %.4f, agreement %.4f, relit %.4f",
+            factor,
+            loss,
+            agreement(unchanged, wanted),
+            agreement(relit, wanted),
+        )
+        if loss < lowest:
+            lowest = loss
             best_factor = factor
-    console.info(
-        "weights: %.0f%% trained, %.0f%% original", 100 * best_factor, 100 - 100 * best_factor
-    )
+    trained_share = 100 * best_factor
+    console.info("weights: %.0f%% trained, %.0f%% original", trained_share, 100 - trained_share)
     return mix(begin, trained, best_factor), best_factor
 
 
@@ -89,57 +101,53 @@ def mix(
     return mixed
 
 
-def predict(model: MixedPrecision, split: Split) -> Tensor:
-    """Return the classes that a network predicts for images.
+def agreement(logits: Tensor, wanted: Tensor) -> float:
+    """Return the fraction of images for which two networks predict the same class.
 
     Args:
-        model: Network.
-        split: Images.
-
-    Returns:
-        Classes, on the CPU, shape (N,).
-    """
-    return _predict(model, split, None)
-
-
-def predict_relit(model: MixedPrecision, split: Split, seed: int, key: str) -> Tensor:
-    """Return the classes that a network predicts for images in the light of a projector.
-
-    Args:
-        model: Network.
-        split: Images.
-        seed: Seed of the light.
-        key: Key of the random stream, such as "test".
-
-    Returns:
-        Classes, on the CPU, shape (N,).
-    """
-    return _predict(model, split, stream_seed(seed, key, "relit"))
-
-
-def agreement(predicted: Tensor, wanted: Tensor) -> float:
-    """Return the fraction of images for which two predictions are the same class.
-
-    Args:
-        predicted: Classes, shape (N,).
-        wanted: Other classes, shape (N,).
+        logits: Logits of a network, shape (N, classes).
+        wanted: Logits of the other network, shape (N, classes).
 
     Returns:
         The fraction, in [0, 1].
     """
-    return float((predicted == wanted).double().mean())
+    return float((logits.argmax(1) == wanted.argmax(1)).double().mean())
+
+
+def divergence(logits: Tensor, wanted: Tensor) -> float:
+    """Return the mean divergence of predictions from those of another network.
+
+    Args:
+        logits: Logits of a network, shape (N, classes).
+        wanted: Logits of the other network, shape (N, classes).
+
+    Returns:
+        Kullback–Leibler divergence, at least 0.
+    """
+    return float(kl_divergence(logits, wanted).mean())
 
 
 @torch.no_grad()
-def _predict(model: MixedPrecision, split: Split, seed: int | None) -> Tensor:
-    """Return predictions (N,) for the images of a split, which are relit if there is a seed."""
+def predict(model: MixedPrecision, split: Split, *light_key: int | str) -> Tensor:
+    """Compute the logits of a network for images.
+
+    Args:
+        model: Network.
+        split: Images.
+        light_key: Key of the random stream of the light of a projector. The
+            images are unchanged if there is none.
+
+    Returns:
+        Logits, on the CPU, shape (N, classes).
+    """
     device = next(model.parameters()).device
     batches = torch.arange(len(split)).split(BATCH)
-    predicted = []
+    logits = []
     with eval_mode(model):
         shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
         for index, images in enumerate(shown):
-            if seed is not None:
-                images = relight_photographs(images, stream_seed(seed, index), slides=images)
-            predicted.append(model(to_unit(images.to(device))).argmax(1).cpu())
-    return torch.cat(predicted)
+            if light_key:
+                light_seed = stream_seed(*light_key, index, "relit")
+                images = relight_photographs(images, light_seed, slides=images)
+            logits.append(model(to_unit(images.to(device))).float().cpu())
+    return torch.cat(logits)

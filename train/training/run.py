@@ -61,7 +61,6 @@ from train.training.interpolation import (
     agreement,
     interpolate,
     predict,
-    predict_relit,
 )
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
@@ -348,8 +347,14 @@ class Run:
         if INTERPOLATION in best or trainer.initial is None:
             return best
         validation = self.data.train[self.held_out]
+        recipe = self.settings.train
         weights, factor = interpolate(
-            trainer.initial, trainer.selected, best["model"], validation, self.settings.seed
+            trainer.initial,
+            trainer.selected,
+            best["model"],
+            validation,
+            self.settings.seed,
+            (recipe.distillation_weight or 1.0, recipe.consistency_weight or 1.0),
         )
         interpolated = best | {"model": weights, INTERPOLATION: factor}
         if distributed.rank() == 0:
@@ -376,7 +381,7 @@ class Run:
         wanted = predict(initial, test)
         scores = {"test/agreement": agreement(predict(self.trainer.selected, test), wanted)}
         for name, model in (("before", initial), ("after", self.trainer.selected)):
-            predicted = predict_relit(model, test, self.settings.seed, "test")
+            predicted = predict(model, test, self.settings.seed, "test")
             scores[f"test/relit_agreement_{name}"] = agreement(predicted, wanted)
         console.info(
             "agreement with the original on %d photographs kept aside: unchanged %.3f; "

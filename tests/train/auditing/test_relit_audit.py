@@ -1,0 +1,101 @@
+"""An audit of photographs in the light of a projector, without a mesh or a label."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import augment
+from renderer.errors import InputError
+from tests.helpers import bright_or_dark
+from train.auditing.audit import run_audit
+from train.auditing.relit_audit import RELIT_PART
+from train.command_settings import AuditSettings
+from train.evaluation.relit import RELIT, read_relit
+
+NETWORKS = {
+    "classifier": augment.Classifier(bright_or_dark, 16, ["bright", "dark"], "first"),
+    "hardened": augment.Classifier(
+        lambda x: bright_or_dark(0 * x), 16, ["bright", "dark"], "second"
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    """Save ten photographs near the limit of the two classes."""
+    folder = tmp_path_factory.mktemp("photographs")
+    rng = np.random.default_rng(0)
+    for index in range(10):
+        pixels = rng.integers(0, 2 * (20 + 3 * index), (20, 24, 3))
+        Image.fromarray(pixels.astype(np.uint8)).save(folder / f"{index}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def settings(photographs, tmp_path_factory) -> AuditSettings:
+    out = tmp_path_factory.mktemp("audit") / "out"
+    return AuditSettings(classifier="first", photographs=str(photographs), out=str(out))
+
+
+@pytest.fixture(scope="module")
+def page(settings) -> str:
+    """Run the audit and return its page."""
+    return run_audit(settings, NETWORKS).path.read_text()
+
+
+def test_the_page_counts_the_photographs_that_keep_their_class(page, settings):
+    first = read_relit(Path(settings.out) / "classifier" / RELIT_PART)
+    second = read_relit(Path(settings.out) / "hardened" / RELIT_PART)
+    # The second network answers all images alike.
+    assert [second.kept(light).hits for light in second.lights] == [10, 10, 10]
+    for light in first.lights:
+        kept = sum(item.kept[light] for item in first.photographs)
+        assert f"{kept} of 10" in page
+    assert first.kept("adversarial").hits < 10
+
+
+def test_the_page_names_every_class_and_shows_pictures(page, settings):
+    scores = read_relit(Path(settings.out) / "classifier" / RELIT_PART)
+    for row in scores.class_table().rows:
+        assert f"<td>{row[0]}</td><td>{row[1]}</td>" in page
+    for index in scores.pictures:
+        assert f'alt="{scores.photographs[index].path}.' in page
+    assert page.count("data:image") >= len(scores.pictures)
+
+
+def test_a_part_that_exists_is_not_measured_again(settings, photographs, tmp_path):
+    name = "python:tests.train.commands.test_attack_photographs:load_bright_or_dark"
+    named = replace(settings, classifier=name, out=str(tmp_path / "out"), budget=0.02)
+    run_audit(named)
+    path = tmp_path / "out" / "classifier" / RELIT_PART / RELIT
+    marked = path.read_text().replace('"predicted": "', '"predicted": "marked ')
+    path.write_text(marked)
+    assert "marked" in run_audit(named).path.read_text()
+    with pytest.raises(InputError, match="budget"):
+        run_audit(replace(named, budget=0.05))
+
+
+def test_the_budget_limits_the_photographs(photographs, tmp_path):
+    out = tmp_path / "out"
+    few = AuditSettings(classifier="first", photographs=str(photographs), out=str(out), budget=0.03)
+    text = run_audit(few, {"classifier": NETWORKS["classifier"]}).path.read_text()
+    scores = read_relit(out / "classifier" / RELIT_PART)
+    assert [item.path for item in scores.photographs] == ["0.png", "4.png", "9.png"]
+    assert "holds 10 photographs" in text
+
+
+@pytest.mark.parametrize("values", [{}, {"photographs": "a", "hard_negatives": ["solid:ball"]}])
+def test_an_audit_needs_meshes_or_photographs(values):
+    with pytest.raises(InputError, match="meshes"):
+        AuditSettings(classifier="first", **values)
+
+
+def test_a_missing_folder_is_an_error_before_anything_is_written(tmp_path):
+    out = tmp_path / "out"
+    settings = AuditSettings(classifier="first", photographs=str(tmp_path / "no"), out=str(out))
+    with pytest.raises(InputError, match="not a folder"):
+        run_audit(settings, {"classifier": NETWORKS["classifier"]})
+    assert not out.exists()
