@@ -10,6 +10,7 @@ intervals of a bootstrap over photographs.
 """
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,21 +38,45 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--slides", type=int, default=4, help="random slides of each photograph")
     parser.add_argument("--passes", type=int, default=11, help="passes of each search")
     parser.add_argument("--seed", type=int, default=1000, help="seed of the light")
+    parser.add_argument("--scores", type=Path, help="folder of scores that later calls read")
     options = parser.parse_args(arguments)
-    wanted: Tensor | None = None
+    original = options.networks[0]
     first: dict[str, Tensor] = {}
     for name in options.networks:
-        classifier = load_network(name)
-        photographs, labels = load(options.folder, classifier.size, options.every)
-        if wanted is None:
-            wanted = predict(classifier, photographs)
-        columns = score(classifier, photographs, labels, wanted, options)
+        columns = load_or_score(name, original, options)
         if not first:
             first = columns
             print(f"|network|{'|'.join(columns)}|")
             print("|-" * (1 + len(columns)) + "|")
         cells = [cell(column, first[title]) for title, column in columns.items()]
         print(f"|{name}|{'|'.join(cells)}|", flush=True)
+
+
+def load_or_score(name: str, original: str, options: argparse.Namespace) -> dict[str, Tensor]:
+    """Score a network, or read the scores of an earlier call.
+
+    Args:
+        name: Name of the network.
+        original: Name of the original network.
+        options: Options of the command line.
+
+    Returns:
+        Numbers in [0, 1] by column, shape (N,) each.
+    """
+    file = None
+    if options.scores is not None:
+        options.scores.mkdir(parents=True, exist_ok=True)
+        stem = re.sub(r"\W+", "_", name)
+        file = options.scores / f"{stem}.pt"
+        if file.exists():
+            return torch.load(file)
+    classifier = load_network(name)
+    photographs, labels = load(options.folder, classifier.size, options.every)
+    wanted = predict(load_network(original), photographs)
+    columns = score(classifier, photographs, labels, wanted, options)
+    if file is not None:
+        torch.save(columns, file)
+    return columns
 
 
 def load(folder: Path, size: int, every: int) -> tuple[Tensor, Tensor]:
