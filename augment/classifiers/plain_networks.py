@@ -177,8 +177,7 @@ def as_classifier(
     if isinstance(network, type):
         name = network.__name__
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
-    if isinstance(network, nn.Module) and any(part.training for part in network.modules()):
-        raise InputError(f"{argument} is a network in training mode: call its eval() first")
+    require_evaluation_mode(network, argument)
     size = USUAL_SIZE if size is None else size
     device = device_of(network) if device is None else device
     function = _preprocessed(network, normalization, value_range).to(device)
@@ -188,6 +187,27 @@ def as_classifier(
         raise InputError(f"{fault}: give one name per output")
     name = name or type(network).__name__
     return Classifier(function, size, names or index_names(count), name, normalize_light)
+
+
+def require_evaluation_mode(network: object, argument: str) -> None:
+    """Check that no part of a network is in training mode.
+
+    Args:
+        network: A module. Other values have no mode.
+        argument: Name of the argument of the caller, for errors.
+
+    Raises:
+        InputError: If a part is in training mode.
+    """
+    if not isinstance(network, nn.Module) or not any(part.training for part in network.modules()):
+        return
+    # torch.export replaces the method by one that raises an error.
+    if "eval" in vars(network):
+        raise InputError(
+            f"{argument} is a module of torch.export, which has no eval(): save it by "
+            "torch.export.save, and give nb.load_classifier('network.pt2')"
+        )
+    raise InputError(f"{argument} is a network in training mode: call its eval() first")
 
 
 def device_of(network: object) -> torch.device:

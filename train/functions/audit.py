@@ -21,6 +21,7 @@ from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
+from train.report.results import require_replaceable
 from train.system.folders import folder_or_temporary
 
 
@@ -52,8 +53,8 @@ def audit(
     Args:
         network: A classifier, or a plain network from images to logits, such as
             a `torch.nn.Module`.
-        meshes: Meshes of one class: files, solids such as "solid:orange", or
-            pairs of these and the class.
+        meshes: Meshes of one class: files, solids such as "solid:orange",
+            `nb.Mesh`, or pairs of these and the class.
         label: Class of the meshes, a name or an index. None if a mesh is in a
             pair with its class, or is named by it.
         hard_negatives: Meshes of other classes, rendered in the same lighting,
@@ -113,15 +114,16 @@ def audit(
                 normalize_light=None if is_classifier else normalize_light,
             )
         classifier = networks[page.CLASSIFIER]
-        items = as_mappings("meshes", meshes, classifier)
-        positive_classes = studied_classes(label, items, classifier)
-        if len(positive_classes) > 1:
-            raise InputError(
-                f"meshes are of several classes ({', '.join(positive_classes)}): give one"
-            )
-        negatives = as_mappings("hard_negatives", hard_negatives, classifier)
-        require_others(negatives, positive_classes)
         with folder_or_temporary(out) as folder:
+            require_replaceable(folder, "out", overwrite)
+            items = as_mappings("meshes", meshes, classifier, folder)
+            positive_classes = studied_classes(label, meshes, items, classifier)
+            if len(positive_classes) > 1:
+                raise InputError(
+                    f"meshes are of several classes ({', '.join(positive_classes)}): give one"
+                )
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
+            require_others(negatives, positive_classes)
             settings = AuditSettings(
                 classifier=classifier.name,
                 label=positive_classes[0],

@@ -18,6 +18,7 @@ from augment.classifiers.plain_networks import (
     Normalization,
     as_classifier,
     device_of,
+    require_evaluation_mode,
 )
 from augment.settings import AugmentationSettings, NormalizeLight, RendererSettings
 from renderer.errors import InputError, describe
@@ -77,9 +78,9 @@ def harden(
     Args:
         network: A plain network from images to logits, in evaluation mode, or
             a `Classifier` that contains one. It stays as it is.
-        meshes: Meshes of the class: files, solids such as "solid:orange", or
-            pairs of these and the class. Meshes of several classes harden all
-            of them.
+        meshes: Meshes of the class: files, solids such as "solid:orange",
+            `nb.Mesh`, or pairs of these and the class. Meshes of several
+            classes harden all of them.
         photographs: Folder of any photographs, with labels or without.
         label: Class of the meshes, a name or an index. None if each mesh is in
             a pair with its class, or is named by it.
@@ -132,11 +133,14 @@ def harden(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with folder_or_temporary(out) as folder:
-        classifier = as_classifier(deepcopy(network), *options, normalize_light=normalize_light)
+        require_new_run(folder, "out", overwrite, resume=False)
+        classifier = as_classifier(
+            _trainable_copy(network), *options, normalize_light=normalize_light
+        )
         if next(classifier.parameters(), None) is None:
             raise InputError("network has no parameters: give one whose weights can be trained")
-        items = as_mappings("meshes", meshes, classifier)
-        labels = studied_classes(label, items, classifier)
+        items = as_mappings("meshes", meshes, classifier, folder)
+        labels = studied_classes(label, meshes, items, classifier)
         changes: dict[str, Any] = {
             "run": str(folder.absolute()),
             "seed": seed,
@@ -147,7 +151,7 @@ def harden(
             "train": {"init_from": classifier.name, "device": str(device)},
         }
         if hard_negatives is not None:
-            negatives = as_mappings("hard_negatives", hard_negatives, classifier)
+            negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
             require_others(negatives, labels)
             changes["scene"]["hard_negatives"] = negatives
         if out is None:
@@ -162,10 +166,22 @@ def harden(
         settings = _read_settings(changes, sections)
         if settings.label is None:
             settings = with_classes_of_meshes(settings, classifier.classes)
-        require_new_run(folder, "out", overwrite, resume=False)
         with sole_writer("out", folder), _state_of_torch_kept():
             trained = _train(settings, classifier, has_report=out is not None)
     return _copy_with(network, classifier, trained)
+
+
+def _trainable_copy(network: nn.Module) -> nn.Module:
+    """Return a copy of a network whose weights can be trained."""
+    if not isinstance(network, Classifier):
+        require_evaluation_mode(network, "network")
+    copy = deepcopy(network)
+    if not all(weight.is_leaf for weight in copy.parameters()):
+        raise InputError(
+            "network contains a module of torch.jit, whose copy cannot be trained: "
+            "give nb.load_classifier('network.pt') of the file that torch.jit.save wrote"
+        )
+    return copy
 
 
 def _read_settings(

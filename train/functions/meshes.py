@@ -1,27 +1,33 @@
 """The meshes that callers name, as the settings take them."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from augment.classifiers import Classifier
 from augment.settings import ObjectSettings
 from renderer.errors import InputError, describe
+from renderer.geometry.mesh import Mesh
+from renderer.io.export import export_mesh
+from renderer.io.files import atomic_write
 from renderer.validation import as_list
 from train.class_names import classes_of_meshes, name_of_mesh
 
-# A mesh as an argument: a file or solid:NAME, a pair of these and a class, or
-# settings.
-MeshItem = str | Path | tuple[str | Path, str | int] | ObjectSettings
+# File of a mesh, solid:NAME, or the mesh itself.
+MeshSource = str | Path | Mesh
+# A mesh as an argument: alone, in a pair with its class, or as settings.
+MeshItem = MeshSource | tuple[MeshSource, str | int] | ObjectSettings
 EXPECTED = (
-    "a list of files or solids such as 'solid:orange', "
-    "of pairs such as ('orange.glb', 'orange'), or of ObjectSettings"
+    "a list of files, of solids such as 'solid:orange', of nb.Mesh, of pairs of these and a class "
+    "such as ('orange.glb', 'orange'), or of nb.ObjectSettings"
 )
 
 
 def as_mappings(
-    name: str, meshes: Sequence[MeshItem], classifier: Classifier
+    name: str, meshes: Sequence[MeshItem], classifier: Classifier, folder: Path
 ) -> list[dict[str, Any]]:
     """Convert meshes to mappings with the fields of `ObjectSettings`.
 
@@ -29,6 +35,8 @@ def as_mappings(
         name: Name of the argument, for errors.
         meshes: Meshes, with or without their classes.
         classifier: Classifier whose classes the labels name or count.
+        folder: Folder to which meshes in memory are written, since settings
+            name files.
 
     Returns:
         The mappings. Without a class, a mapping has no key "label".
@@ -37,15 +45,16 @@ def as_mappings(
         InputError: If an item is something else, or if the classifier lacks a
             class.
     """
-    kinds = str | Path | tuple | list | ObjectSettings
+    kinds = MeshSource | tuple | list | ObjectSettings
     mappings = []
     for index, item in enumerate(as_list(name, meshes, kinds, EXPECTED)):
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
-        elif isinstance(item, str | Path):
-            mapping = {"mesh": str(item)}
-        elif len(item) == 2 and isinstance(item[0], str | Path):
-            mapping = {"mesh": str(item[0]), "label": item[1]}
+        elif isinstance(item, MeshSource):
+            mapping = _of_source(item, folder)
+        elif len(item) == 2 and isinstance(item[0], MeshSource):
+            source, label = item
+            mapping = _of_source(source, folder) | {"label": label}
         else:
             raise InputError(f"{name}[{index}] is {describe(item)}: give {EXPECTED}")
         if mapping.get("label", "") != "":
@@ -54,14 +63,33 @@ def as_mappings(
     return mappings
 
 
+def _of_source(source: MeshSource, folder: Path) -> dict[str, Any]:
+    """Return the mapping of a mesh, which is written to the folder if it is in memory."""
+    if not isinstance(source, Mesh):
+        return {"mesh": str(source)}
+    with TemporaryDirectory() as temporary:
+        written = Path(temporary) / "mesh.glb"
+        export_mesh(source, written)
+        content = written.read_bytes()
+    # The hash in the name keeps the meshes of an earlier call in the folder.
+    path = folder / f"mesh_{hashlib.sha256(content).hexdigest()[:8]}.glb"
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, content)
+    return {"mesh": str(path), "gloss": None if source.gloss is None else "file"}
+
+
 def studied_classes(
-    label: str | int | None, meshes: Sequence[dict[str, Any]], classifier: Classifier
+    label: str | int | None,
+    given: Sequence[MeshItem],
+    meshes: Sequence[dict[str, Any]],
+    classifier: Classifier,
 ) -> list[str]:
     """Return the positive classes.
 
     Args:
         label: A class, or None for those of the meshes.
-        meshes: Meshes as `as_mappings` returns them.
+        given: Meshes as the caller gave them.
+        meshes: The same meshes as `as_mappings` returns them.
         classifier: Classifier that has the classes.
 
     Returns:
@@ -73,6 +101,13 @@ def studied_classes(
     """
     if label is not None:
         return [classifier.classes[classifier.label(label)]]
+    for index, item in enumerate(given):
+        if isinstance(item, Mesh):
+            name = classifier.classes[0]
+            raise InputError(
+                f"meshes[{index}] is an nb.Mesh without a class: give it in a pair, such as "
+                f"(mesh, {name!r}), or give label={name!r}"
+            )
     return list(dict.fromkeys(classes_of_meshes(meshes, classifier.classes, "meshes")))
 
 

@@ -72,7 +72,7 @@ def test_nothing_is_written_without_a_folder(options, tmp_path, monkeypatch):
 
 
 def test_a_mesh_without_a_class_needs_a_label(options):
-    with pytest.raises(nb.InputError, match="label is not given"):
+    with pytest.raises(nb.InputError, match="label"):
         nb.audit(Brightness().eval(), ["solid:lemon"], **options)
 
 
@@ -85,3 +85,32 @@ def test_a_hard_negative_of_the_class_itself_is_refused(options):
     negatives = ["solid:apple", "solid:orange:1"]
     with pytest.raises(nb.InputError, match=r"hard_negatives\[1\]"):
         nb.audit(Brightness().eval(), ["solid:orange"], hard_negatives=negatives, **options)
+
+
+def counts_of(report: nb.AuditReport) -> tuple:
+    """Return the numbers of the attack of an audit."""
+    attack = report.network.attacks["lighting"]
+    return attack.views, attack.correct, attack.adversarial
+
+
+@pytest.mark.filterwarnings("ignore:.*deprecated")
+@pytest.mark.parametrize("suffix", ["pt2", pytest.param("pt", marks=pytest.mark.slow)])
+def test_a_mesh_in_memory_and_a_network_of_a_file_are_audited_by_index(options, tmp_path, suffix):
+    """The numbers are those of the mesh's file and of the network itself, by name."""
+    network = Brightness().eval()
+    mesh = nb.solid("orange", 0)
+    nb.export_mesh(mesh, tmp_path / "orange.glb")
+    expected = nb.audit(network, [tmp_path / "orange.glb"], **options)
+
+    path = tmp_path / f"network.{suffix}"
+    images = torch.rand(2, 3, SIZE, SIZE)
+    if suffix == "pt":
+        torch.jit.save(torch.jit.trace(network, images), path)
+    else:
+        sizes = ({0: torch.export.Dim("batch")},)
+        torch.export.save(torch.export.export(network, (images,), dynamic_shapes=sizes), path)
+    classifier = nb.load_classifier(str(path), classes=CLASSES, size=SIZE)
+    options |= {"classes": None, "size": None}
+    found = nb.audit(classifier, [mesh], label=0, **options)
+    assert counts_of(found) == counts_of(expected)
+    assert found.label == "orange"

@@ -171,3 +171,54 @@ def test_a_field_that_does_not_exist_is_refused(network, photographs):
 def test_a_function_is_refused(photographs):
     with pytest.raises(nb.InputError, match="network"):
         harden(lambda images: images.mean((2, 3)), photographs)
+
+
+def test_a_mesh_in_memory_trains_as_its_file_does(network, photographs, tmp_path):
+    mesh = nb.Gloss(0.6).on(nb.solid("orange", 0))
+    negative = nb.solid("lemon")
+    nb.export_mesh(mesh, tmp_path / "a.glb")
+    nb.export_mesh(negative, tmp_path / "b.glb")
+    item = nb.ObjectSettings(str(tmp_path / "a.glb"), "orange", gloss="file")
+    options = {"hard_negatives": [tmp_path / "b.glb"], "seed": 3}
+    expected = harden(network, photographs, meshes=[item], **options)
+    options = {"hard_negatives": [negative], "seed": 3, "out": tmp_path / "run"}
+    hardened = harden(network, photographs, meshes=[(mesh, 1)], **options)
+    assert torch.equal(hardened[4].weight, expected[4].weight)
+    assert len([*(tmp_path / "run").glob("mesh_*.glb")]) == 2
+
+
+def test_a_mesh_in_memory_needs_a_class(network, photographs):
+    with pytest.raises(nb.InputError, match=r"meshes\[0\]"):
+        harden(network, photographs, meshes=[nb.solid("orange")])
+
+
+def torchscript(network: nn.Module, path: Path) -> nn.Module:
+    torch.jit.save(torch.jit.trace(network, torch.rand(2, 3, SIZE, SIZE)), path)
+    return torch.jit.load(path)
+
+
+def exported(network: nn.Module, path: Path) -> nn.Module:
+    batch = torch.export.Dim("batch")
+    images = torch.rand(2, 3, SIZE, SIZE)
+    program = torch.export.export(network, (images,), dynamic_shapes=({0: batch},))
+    torch.export.save(program, path)
+    return program.module()
+
+
+@pytest.mark.filterwarnings("ignore:.*deprecated")
+@pytest.mark.parametrize(("write", "suffix"), [(torchscript, "pt"), (exported, "pt2")])
+def test_a_network_of_a_file_is_hardened_for_the_index_of_a_class(
+    network, photographs, tmp_path, write, suffix
+):
+    """The file has no class names. The module of the file itself cannot be trained."""
+    path = tmp_path / f"network.{suffix}"
+    module = write(network, path)
+    classifier = nb.load_classifier(str(path), size=SIZE)
+    options = {"classes": None, "size": None, "label": 1}
+    hardened = harden(classifier, photographs, **options)
+    expected = harden(network, photographs, classes=None, label=1)
+    weights = dict(hardened.named_parameters())
+    last = next(value for name, value in weights.items() if name.endswith("4.weight"))
+    torch.testing.assert_close(last, expected[4].weight)
+    with pytest.raises(nb.InputError, match="load_classifier"):
+        harden(module, photographs, label=1)
