@@ -7,6 +7,7 @@ from typing import Any
 
 from augment.classifiers.adapter import class_index, nearest
 from renderer.errors import InputError
+from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
 from train.data.photographs import OTHER_PREFIX
 from train.settings import OTHER, ExperimentSettings, simplified, solid_name
 
@@ -100,12 +101,26 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
         mesh = str(values.get("mesh"))
         name = class_of_name(name_of_mesh(mesh), classes)
         if name is None:
-            choices = nearest(name_of_mesh(mesh), classes)
-            fault = f"label is not set, and {mesh} is not named like a class of the network"
-            remedy = f"give label=CLASS or {{mesh: {mesh}, label: CLASS}}, such as {choices}"
-            raise InputError(f"{fault}: {remedy}", "label")
+            raise _unnamed(mesh, classes)
         found.append(name)
     return found
+
+
+def _unnamed(mesh: str, classes: Sequence[str]) -> InputError:
+    """Return the error for a mesh whose name is not the name of a class."""
+    solid = solid_name(mesh)
+    if not solid and not Path(mesh).exists():
+        return InputError(f"{mesh} does not exist: give the path of a mesh, or solid:NAME")
+    if solid and solid not in (*SOLIDS, *HARD_NEGATIVES):
+        choices = nearest(solid, (*SOLIDS, *HARD_NEGATIVES))
+        return InputError(f"{mesh} is not a solid: choose one, such as {choices}")
+    if list(classes) == [str(index) for index in range(len(classes))]:
+        remedy = f"give label=INDEX, from 0 to {len(classes) - 1}, or name the classes in classes="
+        return InputError(f"label is not set, and the classes have no names: {remedy}", "label")
+    choices = nearest(name_of_mesh(mesh), classes)
+    fault = f"label is not set, and {mesh} is not named like a class of the network"
+    remedy = f"give label=CLASS or {{mesh: '{mesh}', label: CLASS}}, such as {choices}"
+    return InputError(f"{fault}: {remedy}", "label")
 
 
 def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> str:

@@ -685,8 +685,12 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     if current_folder not in sys.path:
         sys.path.insert(0, current_folder)
     try:
-        function = getattr(importlib.import_module(module_name), function_name)
-        network, size, classes = function()
+        module = importlib.import_module(module_name)
+        if not hasattr(module, function_name):
+            choices = nearest(function_name, [*vars(module)])
+            fault = f"name=python:{name}: {module.__file__} has no function {function_name}"
+            raise InputError(f"{fault}: did you mean {choices}?", "name")
+        network, size, classes = getattr(module, function_name)()
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.

@@ -8,6 +8,7 @@ checked against the network.
 
 import argparse
 import importlib
+import pickle
 import re
 import textwrap
 import zipfile
@@ -421,6 +422,8 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
         if (advice := advice_for_pickles(path)) is not None:
             raise InputError(f"weights={path} {advice}", "weights") from error
         reason = textwrap.shorten(str(error), 200)
+        if isinstance(error, pickle.UnpicklingError):
+            reason = "it is no file of weights, or contains other objects"
         fault = f"weights={path} cannot be read ({reason})"
         raise InputError(f"{fault}: save a network's state_dict() alone", "weights") from error
 

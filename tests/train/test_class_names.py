@@ -53,10 +53,21 @@ def test_generated_hard_negatives_of_these_classes_are_left_out():
     [
         ("bananas.glb", "label is not set, and bananas.glb is not named like a class"),
         ("bananas.glb", "such as banana"),
+        ("absent.glb", "absent.glb does not exist"),
+        ("solid:ornage", "solid:ornage is not a solid: choose one, such as orange"),
         ({"mesh": "a.glb", "label": 4}, "scene.meshes[0].label: the label 4 is not a class"),
         ({"mesh": "a.glb", "label": "mug"}, "scene.meshes[0].label: 'mug' is not a class"),
     ],
 )
-def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message):
+def test_a_mesh_of_no_class_is_refused_in_one_sentence(mesh, message, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bananas.glb").touch()
     with pytest.raises(InputError, match=re.escape(message)):
         class_names.with_classes_of_meshes(settings([mesh]), CLASSES)
+
+
+def test_a_mesh_tells_no_class_if_the_classes_have_no_names(tmp_path):
+    mesh = tmp_path / "orange.glb"
+    mesh.touch()
+    with pytest.raises(InputError, match="give label=INDEX, from 0 to 2"):
+        class_names.with_classes_of_meshes(settings([str(mesh)]), ["0", "1", "2"])

@@ -79,6 +79,8 @@ NO_HARD_NEGATIVES = (
     "hard_negatives is empty, so false positives are measured on generated fruit and balls; "
     "name meshes of what the classifier may confuse with the class."
 )
+# Keys of the settings that name the folder of a part.
+FOLDER_KEYS = {page.LABORATORY: "laboratory", page.PHOTOGRAPHS: "photos"}
 # Keys of settings that may be set when a stopped audit continues.
 ADDED = ("hardened", "photos", "photographs")
 
@@ -207,7 +209,7 @@ class _Plan:
         folders = {page.LABORATORY: settings.laboratory, page.PHOTOGRAPHS: settings.photos}
         self.folders = {part: published(Path(folder)) for part, folder in folders.items() if folder}
         items = [*meshes, *hard_negatives]
-        _require_classes(self.networks.values(), items, self.folders.values(), self.label)
+        _require_classes(self.networks.values(), items, self.folders, self.label)
         # The hard negatives are loaded, too, so that an unreadable file is
         # reported at once.
         objects = [load_object(item) for item in items]
@@ -311,7 +313,7 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
 def _require_classes(
     networks: Collection[Classifier],
     items: Sequence[ObjectSettings],
-    folders: Collection[Path],
+    folders: Mapping[str, Path],
     label: str,
 ) -> None:
     """Raise InputError if a network lacks the class of a mesh or of a photograph."""
@@ -319,8 +321,9 @@ def _require_classes(
     for network in networks:
         for name in labels:
             network.label(name)
-        for folder in folders:
-            find_photographs(folder, network.classes, label)
+        for part, folder in folders.items():
+            with keyed(FOLDER_KEYS[part]):
+                find_photographs(folder, network.classes, label)
 
 
 def _compare_sizes(networks: Collection[Classifier]) -> list[str]:

@@ -25,6 +25,7 @@ from train.command_settings import ClassifierSettings
 from train.networks import PYTHON, WIDERESNET, build_network
 from train.runs.checkpoint import BEST, checked, load
 from train.settings import published
+from train.system.user_errors import keyed
 
 # The name of a trained network among the sources of classifiers is this, and then a folder.
 RUN = "run:"
@@ -72,7 +73,8 @@ def load_network(
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
-        classifier = load_run(name.removeprefix(RUN), weights)
+        with keyed(run="name"):
+            classifier = load_run(name.removeprefix(RUN), weights)
         return classifier.normalizing_light(normalize_light)
     return load_classifier(name, weights, classes, size, normalization, normalize_light)
 
