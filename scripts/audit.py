@@ -4,17 +4,6 @@ from train.command import Command
 from train.command_settings import AuditSettings
 from train.help import HelpText
 
-OWN_NETWORK = """\
-  import torch
-  from torchvision import models, transforms
-
-  def load():
-      network = models.resnet18(num_classes=10)
-      network.load_state_dict(torch.load("mine.pth"))
-      normalize = transforms.Normalize((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-      classes = open("classes.txt").read().splitlines()
-      return torch.nn.Sequential(normalize, network), 224, classes"""
-
 main = Command(
     name="audit",
     settings=AuditSettings,
@@ -23,8 +12,8 @@ main = Command(
         about="Measure how safe a classifier is in unusual lighting, and what hardening costs.\n\n"
         "Your own network: classifier=torchvision:NAME weights=FILE classes=FILE, a file of "
         "TorchScript, of torch.export (.pt2) or of ONNX (.onnx), or "
-        "classifier=python:my_network:load, a function in my_network.py:"
-        f"\n\n{OWN_NETWORK}\n\n"
+        "classifier=python:my_network.load, a function in my_network.py. It returns the network, "
+        "the pixels per side of its images, and the names of its classes.\n\n"
         "An audit that was stopped continues with the same settings, and with hardened= or photos= "
         "in addition.",
         examples=[

@@ -694,6 +694,9 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # The user's code may raise any exception.
+        if isinstance(error, ModuleNotFoundError) and error.name == module_name:
+            fault = f"name=python:{name}: there is no module {module_name} in {current_folder}"
+            raise InputError(f"{fault}: start the command beside it", "name") from error
         last_call = traceback.extract_tb(error.__traceback__)[-1]
         kind = type(error).__name__
         place = f"line {last_call.lineno} of {last_call.filename}"

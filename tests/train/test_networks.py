@@ -396,6 +396,12 @@ class TestANetworkThatIsPartOfThePackage:
             load_run("pretrained/none")
 
 
+def test_the_folder_of_a_run_is_no_name_of_a_classifier(finished):
+    for path in (finished, finished / "weights.pt"):
+        with pytest.raises(InputError, match=f"belongs to a run: give run:{finished}"):
+            load_network(str(path))
+
+
 @pytest.mark.parametrize("method", ["none", "random", "adversarial"])
 def test_the_published_networks_are_classifiers_of_cifar_100(method):
     classifier = load_network(f"run:{PRETRAINED / method}")

@@ -71,12 +71,24 @@ def load_network(
         InputError: If there is no such network, or the weights are not for it.
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
+    folder = _run_of(Path(name))
+    if folder is not None:
+        raise InputError(f"name={name} belongs to a run: give {RUN}{folder}", "name")
     if name.startswith(RUN):
         require_no_facts(name, as_facts(classes, size, normalization))
         with keyed(run="name"):
             classifier = load_run(name.removeprefix(RUN), weights)
         return classifier.normalizing_light(normalize_light)
     return load_classifier(name, weights, classes, size, normalization, normalize_light)
+
+
+def _run_of(path: Path) -> Path | None:
+    """Return the folder of a run if a path is this folder or its file of weights, else None."""
+    for folder in (path, path.parent):
+        is_named = folder == path or path.name == WEIGHTS
+        if is_named and (folder / BEST).is_file():
+            return folder
+    return None
 
 
 def load_chosen(settings: ClassifierSettings) -> Classifier:
