@@ -1,8 +1,11 @@
 """Read meshes with their colors and textures from files.
 
-Files are read by trimesh. It leaves out an image or a material that it cannot
-read, and only writes a line to its log. It also ignores parts of glTF 2.0. A
-file is refused where this would show a wrong surface.
+The library trimesh reads the files. If it cannot read an image or a material, it
+leaves the image or material out and only writes a line to its log. It also
+ignores some features of glTF 2.0. This module raises an error if the surface
+would be wrong because of this.
+
+A part is a mesh with one material, of which a file may hold several.
 """
 
 import io
@@ -32,59 +35,64 @@ from renderer.io.images import eight_bits
 from renderer.io.skins import skinned, with_skins_as_attributes
 from renderer.validation import as_path, require_flag
 
-# Archives are not read, because the names in them cannot be checked first.
+# Suffixes of archives. trimesh could read them, but this module does not, because the
+# names of the files inside cannot be checked first.
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}
-# Lines of .mtl and .obj files that define and that use a material.
+# Lines of .mtl files that define a material.
 DEFINED = re.compile(rb"^[ \t]*newmtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
+# Lines of .obj files that use a material.
 USED = re.compile(rb"^[ \t]*usemtl[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
-# Lines of trimesh's log that say that it left out a part of the surface. Of .obj,
-# .ply and .dae files, trimesh keeps no other trace of what it left out.
+# Pattern for the messages in trimesh's log that say that trimesh could not read an
+# image, a material or another part of a file. For .obj, .ply and .dae files, the log is
+# the only place where this can be seen.
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")
-# Component type of floating-point numbers in glTF 2.0 (section 3.6.2.2).
+# Number for the type float32 in glTF 2.0 (section 3.6.2.2).
 FLOAT = 5126
-# Modes of a primitive of glTF 2.0 that are triangles (section 5.24.4). trimesh
-# skips fans.
+# Numbers for the kinds of primitives in glTF 2.0 that consist of triangles (section
+# 5.24.4): separate triangles, triangle strips and triangle fans. trimesh skips fans.
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
+# Name of the glTF extension that shifts, scales or rotates a texture.
 TRANSFORM = "KHR_texture_transform"
-# Beginnings of the names of extensions of glTF that move no vertex.
+# First letters of the names of glTF extensions that do not move vertices.
 HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
 
 
 def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     """Read a mesh with its colors and textures from a file.
 
-    All parts of a scene, placed by their nodes, become one mesh. Vertices at one
-    position become one vertex, so moving it opens no seam. Unused vertices are
-    dropped.
+    All parts of a scene become one mesh, in the positions that the scene gives
+    them. Vertices at the same position are merged, so that no seam opens when a
+    vertex is moved. Unused vertices are dropped.
 
-    A color is the product of the material's color, the texture and the vertex or
-    face colors that the file has. It is white where the file has none of them.
-    Alpha, other material properties and the wrap mode of textures are ignored.
-    The colors of glTF other than textures are linear by its standard, and are
-    encoded here. A glTF file with a skin has the pose of its nodes, and the mesh
-    has their joints.
+    The color of a surface is the product of the material color, the texture, and
+    the vertex or face colors, as far as the file has them. Without any of them,
+    the color is white. Alpha, other material properties and the wrap mode of
+    textures are ignored. glTF stores all colors except textures as linear values.
+    They are sRGB-encoded here. If a glTF file has a skin, the mesh gets the pose
+    and the joints of the file.
 
     Args:
         path: A .glb, .gltf, .obj, .ply or .stl file, or another format of
             trimesh.
-        up: "y" turns the y axis to the z axis, "z" leaves the mesh as it is, and
-            "auto" turns glTF files only.
-        gloss: Whether to read roughness, metallic (factors and texture) and
-            `specularFactor` of glTF. Otherwise the mesh is matte, since most
-            files have values that nobody chose. Meshes of other formats are
-            always matte.
+        up: Axis that points up in the file. "y" rotates the y-axis to the
+            z-axis, "z" leaves the mesh as it is, and "auto" means "y" for glTF
+            files and "z" for other files.
+        gloss: True reads the roughness, the metallic value and the specular
+            factor of glTF materials, with the metallic-roughness texture. False
+            makes the mesh matte, because most files contain default values that
+            nobody chose. Meshes of other formats are always matte.
 
     Returns:
-        The mesh.
+        Mesh in the coordinates of the file, with z up.
 
     Raises:
         InputError: If the file does not exist, is damaged or has an unknown
-            format; if a material or an image that it names is missing or
-            unreadable; if it has no faces, no area, coordinates that are not
-            finite, or indices of missing vertices; or if a skin has no weights,
-            weights that do not sum to one, or missing joints.
+            format. If a material or an image of the file is missing or
+            unreadable. If the mesh has no faces, no area, coordinates that are
+            not finite, or indices of missing vertices. If a skin has no weights,
+            weights that do not add up to 1, or missing joints.
 
     Example:
         >>> import norm_balls as nb
@@ -97,57 +105,64 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
     require_flag("gloss", gloss)
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    placed = [transformed(part, matrix) for part, matrix in read_parts(path, is_gltf, gloss)]
-    if not placed:
+    placed_parts = [transformed(part, matrix) for part, matrix in read_parts(path, is_gltf, gloss)]
+    if not placed_parts:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
-    mesh = _merge_vertices(concatenate(placed))
-    # The nodes of a scene may move vertices out of range. NaN fails the comparison.
+    mesh = _merge_vertices(concatenate(placed_parts))
+    # The coordinates were checked in each part, but the matrices of a scene may be
+    # wrong, too. The comparison is also False for NaN.
     if not (np.abs(mesh.vertices) <= MAX_MAGNITUDE).all():
         raise InputError(
             f"{path} has coordinates that are not finite or beyond {MAX_MAGNITUDE:g}: "
-            "export it again"
+            "export the mesh again"
         )
     if not mesh.face_areas().sum() > 0:
         raise InputError(
-            f"{path} has a surface of zero area: give a mesh with faces of some extent"
+            f"the surface of {path} has the area 0: give a mesh whose faces have an area"
         )
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
 
 def _merge_vertices(mesh: Mesh) -> Mesh:
-    """Merge vertices at one position, and drop unused ones.
+    """Return a copy of a mesh in which vertices at the same position are merged.
 
-    Vertices that joints carry in different ways are not merged.
+    Vertices that joints move in different ways are not merged. Vertices without
+    faces are dropped.
     """
-    keys = mesh.vertices
+    # Vertices with equal rows are merged. A row has the position and, with a skin, a
+    # number for the way in which joints move the vertex.
+    vertex_rows = mesh.vertices
     skin = mesh.skin
     if skin is not None:
-        carried, row_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
-        keys = np.column_stack([keys, row_of_vertex.ravel()])
-    keys_of_corners = keys[mesh.faces].reshape(-1, keys.shape[1])
-    merged, vertex_of_corner = np.unique(keys_of_corners, axis=0, return_inverse=True)
+        distinct_carried, carried_of_vertex = np.unique(skin.carried, axis=0, return_inverse=True)
+        vertex_rows = np.column_stack([vertex_rows, carried_of_vertex.ravel()])
+    corner_rows = vertex_rows[mesh.faces].reshape(-1, vertex_rows.shape[1])
+    merged_rows, vertex_of_corner = np.unique(corner_rows, axis=0, return_inverse=True)
     if skin is not None:
-        skin = replace(skin, carried=carried[merged[:, -1].astype(np.int64)])
+        carried_of_merged = merged_rows[:, -1].astype(np.int64)
+        skin = replace(skin, carried=distinct_carried[carried_of_merged])
     faces = vertex_of_corner.reshape(-1, 3)
-    return replace(mesh, vertices=merged[:, :3], faces=faces, skin=skin)
+    return replace(mesh, vertices=merged_rows[:, :3], faces=faces, skin=skin)
 
 
 def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a file and how they are placed.
+    """Read the parts of a mesh file, and the matrices that place them in the scene.
 
     Args:
-        path: The file.
-        linear: Whether the colors of the file, except for textures, are linear.
-        gloss: Whether to read the gloss of glTF.
+        path: File to read.
+        linear: True if the colors of the file, except for textures, are linear.
+        gloss: True reads the specular reflection of glTF materials: roughness,
+            metallic and specular factor. False makes the parts matte.
 
     Returns:
-        The mesh of each part in its own coordinates, with the affine matrix
-        (4, 4) of its node. A part with a skin is placed by the skin, and has the
-        identity matrix.
+        The mesh of each part in its own coordinates, with the affine matrix that
+        places it in the scene, shape (4, 4). A part with a skin is in scene
+        coordinates already and has the identity matrix.
 
     Raises:
-        InputError: See `load_mesh`. Also if the file cannot be read.
+        InputError: If the file does not exist, has an unknown format, or cannot
+            be read.
     """
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
@@ -155,88 +170,127 @@ def read_parts(path: Path, linear: bool, gloss: bool = False) -> list[tuple[Mesh
     if suffix not in formats:
         known = ", ".join(sorted(formats))
         raise InputError(f"{path} has no known mesh format: use one of {known}")
+    # Readers of meshes and images raise almost any exception for a damaged file.
     try:
         return _read_parts(path, suffix, linear, gloss)
     except Exception as error:
-        # Readers of meshes and images raise almost anything for a damaged file.
         raise InputError(f"{path} cannot be read as a mesh: {single_line(error)}") from error
 
 
 def _read_parts(
     path: Path, suffix: str, linear: bool, gloss: bool
 ) -> list[tuple[Mesh, np.ndarray]]:
-    """Read the parts of a file of a known format, or raise any error."""
+    """Read the parts of a file of a known format. See `read_parts`.
+
+    Args:
+        path: File to read.
+        suffix: Suffix of the file in lower case, without the period.
+        linear: True if the colors of the file, except for textures, are linear.
+        gloss: True reads the specular reflection of glTF materials.
+
+    Returns:
+        Mesh of each part, with the affine matrix that places it, shape (4, 4).
+
+    Raises:
+        Exception: Any exception, if the file is damaged or not supported.
+    """
     content = path.read_bytes()
     tree = _gltf_tree(content) if suffix in ("gltf", "glb") else {}
     has_skins = any("skin" in node for node in tree.get("nodes", []))
     if has_skins:
         content = with_skins_as_attributes(content, tree)
     textured_count = _count_textured_parts(tree, gloss)
-    strengths = _strengths(tree) if gloss else {}
+    specular_factors = _specular_factors(tree) if gloss else {}
     if suffix == "obj":
         content = _as_utf8(content)
     scene = _load(content, suffix, _Files(path))
     parts = {}
     for name, geometry in scene.geometry.items():
+        # A file may also contain points and lines.
         if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
             continue
         part = _as_mesh(geometry, linear)
-        parts[name] = _with_gloss(part, geometry.visual, strengths) if gloss else part
+        parts[name] = _with_gloss(part, geometry.visual, specular_factors) if gloss else part
+    # trimesh leaves out a glTF image that it cannot read, without a message.
     if sum(len(part.textures) for part in parts.values()) < textured_count:
         raise ValueError("the image of a texture is missing, or cannot be decoded")
-    placed = []
+    placed_parts = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         if name not in parts:
             continue
         if has_skins:
-            placed.append((skinned(parts[name], node, scene, tree), np.eye(4)))
+            placed_parts.append((skinned(parts[name], node, scene, tree), np.eye(4)))
         else:
-            placed.append((parts[name], matrix))
-    return placed
+            placed_parts.append((parts[name], matrix))
+    return placed_parts
 
 
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
-    """The files beside a mesh file, which it names.
+    """Reader for the files that a mesh file refers to, such as images and .mtl files.
+
+    trimesh calls `get` for each such file.
 
     Attributes:
-        materials: Content of the .mtl file that was read last.
+        materials: Content of the .mtl file that was read last, in UTF-8.
     """
 
     materials = b""
 
     def get(self, name: str) -> bytes:
-        """Read a file of the mesh's folder, or the file in it with the last part of the name.
+        """Read a file that the mesh file refers to.
 
-        A name may have \\ for / and %20 for a blank. Only regular files are
-        read, because reading a pipe would never end.
+        The file is sought at the given path relative to the folder of the mesh
+        file, and then directly in this folder. A name may contain \\ instead of
+        / and %20 instead of a blank.
 
         Args:
-            name: Name of the file, as the mesh file has it.
+            name: Path of the file, as the mesh file writes it.
+
+        Returns:
+            Content of the file.
 
         Raises:
-            FileNotFoundError: If there is no such file.
+            FileNotFoundError: If the file does not exist.
         """
-        plain = unquote(name.strip('" \t')).replace("\\", "/")
-        for file in (Path(self.parent, plain), Path(self.parent, Path(plain).name)):
+        relative_path = unquote(name.strip('" \t')).replace("\\", "/")
+        candidates = (
+            Path(self.parent, relative_path),
+            Path(self.parent, Path(relative_path).name),
+        )
+        for file in candidates:
+            # `is_file` is False for a pipe. Reading a pipe would never end.
             if file.is_file() and file.suffix.lower() == ".mtl":
                 self.materials = _as_utf8(file.read_bytes())
                 return self.materials
             if file.is_file():
                 return file.read_bytes()
-        raise FileNotFoundError(f"it names {name}, which is not there")
+        raise FileNotFoundError(f"the file refers to {name}, which does not exist")
 
 
 def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
-    """Read a scene, or raise `ValueError` if trimesh leaves out a part of the surface."""
+    """Read a scene with trimesh, and check that trimesh read all of the surface.
+
+    Args:
+        content: Content of the mesh file.
+        suffix: Suffix of the file in lower case, without the period.
+        files: Reader for other files that the mesh file refers to.
+
+    Returns:
+        Scene of trimesh.
+
+    Raises:
+        ValueError: If trimesh could not read an image, a material or another
+            part of the file.
+    """
     with _recorded_omissions() as omissions:
         scene = trimesh.load(
             io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False
         )
     if suffix == "obj" and b"mtllib" in content:
-        unknown = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
-        for name in unknown:
-            omissions.append(f"its first .mtl file does not have the material {name.decode()}")
+        undefined = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
+        for name in undefined:
+            omissions.append(f"the .mtl file does not define the material {name.decode()}")
     if omissions:
         raise ValueError(omissions[0])
     return scene
@@ -244,9 +298,13 @@ def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
 
 @contextmanager
 def _recorded_omissions() -> Iterator[list[str]]:
-    """Record what trimesh writes to its log about omissions while a `with` block runs.
+    """Record the messages of trimesh's log about parts of a file that it could not read.
 
-    The list holds a sentence for each omission.
+    Messages are recorded while the `with` block runs. trimesh's log shows no
+    messages during this time.
+
+    Yields:
+        List of the messages, which grows during the block.
     """
     recorder = _OmissionRecorder()
     log = trimesh.util.log
@@ -261,14 +319,28 @@ def _recorded_omissions() -> Iterator[list[str]]:
 
 
 class _OmissionRecorder(logging.Filter):
-    """A filter of a log that records lines about omissions, and shows no line."""
+    """Filter that records messages of a log about parts of a file that could not be read.
+
+    Attributes:
+        omissions: Recorded messages.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.omissions: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Record a line if it matches `OMISSION`, with its error if it has one."""
+        """Record a message that says that a part of a file could not be read.
+
+        The pattern `OMISSION` recognizes such messages. An exception that was
+        logged with the message is appended.
+
+        Args:
+            record: Message of the log.
+
+        Returns:
+            False, so that the log does not show the message.
+        """
         message = record.getMessage()
         if OMISSION.search(message):
             error = record.exc_info[1] if record.exc_info else ""
@@ -277,7 +349,7 @@ class _OmissionRecorder(logging.Filter):
 
 
 def _as_utf8(text: bytes) -> bytes:
-    """Return text in UTF-8. Bytes that are not UTF-8 are taken for Latin-1."""
+    """Convert text to UTF-8. Text that is not valid UTF-8 is assumed to be Latin-1."""
     try:
         text.decode()
     except UnicodeDecodeError:
@@ -286,45 +358,74 @@ def _as_utf8(text: bytes) -> bytes:
 
 
 def _gltf_tree(content: bytes) -> dict[str, Any]:
-    """Return the JSON of a .gltf or .glb file, or raise an error if it is damaged."""
+    """Parse the JSON of a .gltf or .glb file.
+
+    Args:
+        content: Content of the file.
+
+    Returns:
+        Parsed JSON object.
+
+    Raises:
+        ValueError: If the JSON is damaged.
+        struct.error: If a .glb file is too short.
+    """
     if content.startswith(b"glTF"):
-        # A .glb file has a header of 12 bytes. Then comes the length of the JSON,
-        # its type, and the JSON itself from byte 20.
-        (length,) = struct.unpack_from("<I", content, 12)
-        content = content[20 : 20 + length]
-    # JSON has no NaN. `int` raises ValueError for it.
+        # A .glb file begins with a header of 12 bytes. Then come the length of the
+        # JSON (4 bytes), its type (4 bytes), and the JSON itself.
+        (json_length,) = struct.unpack_from("<I", content, 12)
+        content = content[20 : 20 + json_length]
+    # glTF does not allow NaN and Infinity, but Python's parser does. It would pass their
+    # names to `parse_constant`, and `int` raises ValueError for such a name.
     tree: dict[str, Any] = json.loads(content, parse_constant=int)
     return tree
 
 
-def _strengths(tree: dict[str, Any]) -> dict[str | None, float]:
-    """Return the `specularFactor` of the materials of a glTF file, by name.
+def _specular_factors(tree: dict[str, Any]) -> dict[str | None, float]:
+    """Read the specular factor of each material of a glTF file.
 
-    Raises `ValueError` if two materials of a name differ in it, or a material has
-    a texture for it.
+    trimesh does not read the extension KHR_materials_specular.
+
+    Args:
+        tree: JSON object of the file.
+
+    Returns:
+        Specular factors by the names of the materials. The default is 1.
+
+    Raises:
+        ValueError: If two materials with the same name have different specular
+            factors, or if a material has a texture of specular factors.
     """
-    strengths: dict[str | None, float] = {}
+    factor_by_name: dict[str | None, float] = {}
     for material in tree.get("materials", []):
         name = material.get("name")
         specular = material.get("extensions", {}).get("KHR_materials_specular", {})
         if "specularTexture" in specular:
-            raise ValueError(f"its material {name} has a specularTexture, which is not supported")
+            raise ValueError(f"the material {name} has a specularTexture, which is not supported")
         factor = specular.get("specularFactor", 1.0)
-        if strengths.setdefault(name, factor) != factor:
-            raise ValueError(f"materials of the name {name} differ in specularFactor")
-    return strengths
+        if factor_by_name.setdefault(name, factor) != factor:
+            raise ValueError(f"several materials with the name {name} differ in specularFactor")
+    return factor_by_name
 
 
 def _count_textured_parts(tree: dict[str, Any], gloss: bool) -> int:
-    """Return how many parts of a glTF file have an image as their color.
+    """Count the parts of a glTF file whose color is an image, and check for unsupported features.
 
-    Raises `ValueError` if the file has features with which trimesh would read the
-    shape or the texture coordinates wrongly, and `KeyError` or the like if it is
-    damaged.
+    Args:
+        tree: JSON object of the file.
+        gloss: True if the textures of roughness and metallic are read, too.
+
+    Returns:
+        Number of parts.
+
+    Raises:
+        ValueError: If trimesh would read the shape or the texture coordinates
+            wrongly, because of a feature that it does not support.
+        Exception: Any other exception, if the file is damaged.
     """
     for name in tree.get("extensionsRequired", []):
         if not name.startswith(HARMLESS):
-            raise ValueError(f"it needs the extension {name}, which is not supported")
+            raise ValueError(f"the file needs the extension {name}, which is not supported")
     textured_count = 0
     for mesh in tree.get("meshes", []):
         for part in mesh["primitives"]:
@@ -335,13 +436,25 @@ def _count_textured_parts(tree: dict[str, Any], gloss: bool) -> int:
 
 
 def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> None:
-    """Raise `ValueError` if the numbers of a glTF part are stored in an unsupported way."""
+    """Raise `ValueError` if trimesh cannot read the numbers of a glTF part.
+
+    An accessor describes how glTF stores an array, such as the positions.
+
+    Args:
+        tree: JSON object of the file.
+        part: Primitive of glTF.
+
+    Raises:
+        ValueError: If the part is a triangle fan, has a sparse accessor, or has
+            texture coordinates that are no floating-point numbers.
+    """
     attributes = part["attributes"]
     indices = (*attributes.values(), part.get("indices", 0))
     accessors = [tree["accessors"][index] for index in indices]
     if part.get("mode") == FAN or any("sparse" in accessor for accessor in accessors):
         raise ValueError("triangle fans and sparse accessors are not supported")
-    # The positions take the place of missing texture coordinates. They are floats.
+    # If there are no texture coordinates, check the positions, which are always
+    # floating-point numbers.
     uvs = tree["accessors"][attributes.get("TEXCOORD_0", attributes["POSITION"])]
     if uvs["componentType"] != FLOAT:
         raise ValueError(
@@ -350,15 +463,26 @@ def _require_supported_accessors(tree: dict[str, Any], part: dict[str, Any]) -> 
 
 
 def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> bool:
-    """Return whether a glTF part has an image as its color.
+    """Tell whether the color of a glTF part is an image.
 
-    Raises `ValueError` if a texture has unsupported coordinates. The texture of
-    roughness and metallic counts if `gloss` is true.
+    Args:
+        tree: JSON object of the file.
+        part: Primitive of glTF.
+        gloss: True if the texture of roughness and metallic is read, too. Its
+            coordinates are then checked.
+
+    Returns:
+        True if the material of the part has a texture for its color.
+
+    Raises:
+        ValueError: If a texture is transformed, or uses a second set of
+            texture coordinates.
     """
     material = tree["materials"][part["material"]] if "material" in part else {}
     extensions = material.get("extensions", {})
     specular_glossiness = extensions.get("KHR_materials_pbrSpecularGlossiness", {})
     metallic_roughness = material.get("pbrMetallicRoughness", {})
+    # glTF has two material models. Each stores the color texture under its own name.
     candidates = [
         metallic_roughness.get("baseColorTexture"),
         specular_glossiness.get("diffuseTexture"),
@@ -368,28 +492,37 @@ def _is_textured(tree: dict[str, Any], part: dict[str, Any], gloss: bool) -> boo
     if gloss:
         used_textures.append(metallic_roughness.get("metallicRoughnessTexture") or {})
     for texture in used_textures:
+        # "texCoord" is the number of the set of coordinates, which is 0 by default.
         if texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}):
             raise ValueError(
-                "a texture has a second set of coordinates or is transformed, "
+                "a texture is transformed or uses a second set of texture coordinates, "
                 "which is not supported"
             )
     return bool(color_textures)
 
 
 def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
-    """Convert one geometry of a file, in its own coordinates.
+    """Convert a mesh of trimesh to a `Mesh`, without specular reflection.
 
-    `linear` says whether its colors, except for textures, are linear. Damaged
-    contents raise whatever NumPy or Pillow raise.
+    Args:
+        geometry: Mesh of trimesh with V vertices and F faces.
+        linear: True if its colors, except for textures, are linear.
+
+    Returns:
+        Matte mesh in the same coordinates.
+
+    Raises:
+        ValueError: If coordinates or colors are not finite.
+        Exception: Any other exception, if the file is damaged.
     """
     vertices = geometry.vertices
     faces = np.asarray(geometry.faces)
     uvs = getattr(geometry.visual, "uv", None)
     mesh = Mesh.plain(vertices, faces)
     colors, image = _corner_colors(geometry.visual, faces)
-    checked = {"coordinates": vertices, "texture coordinates": uvs, "colors": colors}
-    for name, values in checked.items():
-        # NaN fails the comparison.
+    values_by_name = {"coordinates": vertices, "texture coordinates": uvs, "colors": colors}
+    for name, values in values_by_name.items():
+        # The comparison is also False for NaN.
         if values is not None and not (np.abs(values) <= MAX_MAGNITUDE).all():
             raise ValueError(f"{name} are not finite or beyond {MAX_MAGNITUDE:g}")
     if linear:
@@ -402,9 +535,21 @@ def _as_mesh(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
 
 
 def _with_texture(mesh: Mesh, uvs: np.ndarray | None, texture: np.ndarray) -> Mesh:
-    """Return a copy of a mesh with one texture, given coordinates (V, 2) of its vertices."""
+    """Return a copy of a mesh with V vertices, in which all faces have one texture.
+
+    Args:
+        mesh: Mesh without textures.
+        uvs: Texture coordinates of the vertices, shape (V, 2).
+        texture: sRGB-encoded texture, uint8, shape (H, W, 3).
+
+    Returns:
+        Mesh with the texture.
+
+    Raises:
+        ValueError: If there are no texture coordinates.
+    """
     if uvs is None:
-        raise ValueError("an image has no texture coordinates")
+        raise ValueError("the mesh has a texture, but no texture coordinates")
     return replace(
         mesh,
         corner_uvs=uvs[:, :2].astype(np.float32)[mesh.faces],
@@ -413,32 +558,62 @@ def _with_texture(mesh: Mesh, uvs: np.ndarray | None, texture: np.ndarray) -> Me
     )
 
 
-def _with_gloss(mesh: Mesh, visual: Visuals, strengths: dict[str | None, float]) -> Mesh:
-    """Return a copy of a mesh with the gloss of its glTF material, or the mesh without one.
+def _with_gloss(mesh: Mesh, visual: Visuals, specular_factors: dict[str | None, float]) -> Mesh:
+    """Return a copy of a mesh with the specular reflection of its glTF material.
 
-    Factors that a material leaves out are 1 by the standard: a rough metal.
+    Roughness, metallic and specular factor are 1 if the material does not have
+    them, as the standard of glTF says. This is a rough metal.
+
+    Args:
+        mesh: Mesh with F faces.
+        visual: Appearance of the mesh in trimesh.
+        specular_factors: Specular factors by the names of materials.
+
+    Returns:
+        Mesh with gloss. The given mesh if it has no glTF material.
+
+    Raises:
+        ValueError: If there is a texture, but there are no texture coordinates.
     """
     material = getattr(visual, "material", None)
     if not isinstance(material, PBRMaterial):
         return mesh
-    given = (material.roughnessFactor, material.metallicFactor, strengths.get(material.name))
+    given = (
+        material.roughnessFactor,
+        material.metallicFactor,
+        specular_factors.get(material.name),
+    )
     factors = [1.0 if factor is None else factor for factor in given]
-    row = np.clip(factors, 0, 1).astype(np.float32)
-    mesh = replace(mesh, gloss=row[None].repeat(len(mesh.faces), axis=0))
+    gloss_row = np.clip(factors, 0, 1).astype(np.float32)
+    mesh = replace(mesh, gloss=gloss_row[None].repeat(len(mesh.faces), axis=0))
     if material.metallicRoughnessTexture is None:
         return mesh
     if visual.uv is None:
-        raise ValueError("an image has no texture coordinates")
+        raise ValueError("the mesh has a texture, but no texture coordinates")
     if not mesh.textures:
+        # Gloss textures belong to color textures, so a white color texture is added.
         white = np.full((1, 1, 3), 255, dtype=np.uint8)
         mesh = _with_texture(mesh, visual.uv, white)
     texels = np.array(eight_bits(material.metallicRoughnessTexture).convert("RGB"))
-    # Green is roughness and blue is metallic.
+    # glTF stores roughness in green and metallic in blue.
     return replace(mesh, gloss_textures=(texels[..., 1:],))
 
 
 def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Image.Image | None]:
-    """Return colors (F, 3, 3) in [0, 1] as the file has them, and the texture if there is one."""
+    """Compute the color at the three corners of each of F faces, and find the texture.
+
+    The color is the product of the material color and the vertex or face colors,
+    as far as the file has them. It is linear or encoded, as in the file.
+
+    Args:
+        visual: Appearance of a mesh in trimesh.
+        faces: Vertex indices of the faces, shape (F, 3).
+
+    Returns:
+        A tuple of
+        - the colors in [0, 1], shape (F, 3, 3);
+        - the image of the texture, or None.
+    """
     colors = np.ones((len(faces), 3, 3))
     image = None
     if visual.kind == "vertex":
@@ -454,23 +629,38 @@ def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Imag
 
 
 def _material_color(material: Material) -> tuple[np.ndarray, Image.Image | None]:
-    """Return the color (3,) of a material in [0, 1], and its image if it has one.
+    """Read the color and the texture of a material of trimesh.
 
-    The color is white if the file gives none.
+    Args:
+        material: Material of trimesh.
+
+    Returns:
+        A tuple of
+        - red, green and blue in [0, 1], which are 1 if the file has no color,
+          shape (3,);
+        - the image of the texture, or None.
     """
     if isinstance(material, PBRMaterial):
         factor = material.baseColorFactor
         color = np.ones(3) if factor is None else _unit_rgb(factor)
         return color, material.baseColorTexture
-    # trimesh sets a gray color and a gray image if an .obj file has none. It keeps
-    # the color of the file itself under the name "kd".
+    # If an .obj file has no color or no image, trimesh sets a gray color or a gray
+    # image. It stores a color that the file does have under the name "kd".
     is_placeholder = material.image == empty_material().image
     image = None if is_placeholder else material.image
     return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image
 
 
 def _unit_rgb(colors: np.ndarray) -> np.ndarray:
-    """Return red, green and blue in [0, 1], given such numbers or integers of any width."""
+    """Convert RGB or RGBA colors to red, green and blue in [0, 1].
+
+    Args:
+        colors: Unsigned integers, or numbers in [0, 1], shape (..., 3) or
+            (..., 4).
+
+    Returns:
+        Colors, shape (..., 3).
+    """
     rgb = np.asarray(colors)[..., :3]
     is_integer = rgb.dtype.kind in "ui"
     return rgb / np.iinfo(rgb.dtype).max if is_integer else rgb

@@ -1,10 +1,15 @@
-"""Joints and weights of glTF files (sections 3.7.3 and 5.28 of glTF 2.0).
+"""Read the skins (joints and weights) of glTF files (sections 3.7.3 and 5.28 of glTF 2.0).
 
-trimesh does not read skins, but it reads all attributes whose names begin with
-an underscore. `with_skins_as_attributes` copies the skins of a file to such
-attributes before trimesh reads it, and `skinned` reads them afterwards.
+trimesh does not read skins, but it reads all vertex attributes whose names begin
+with an underscore. `with_skins_as_attributes` copies the skins of a file to such
+attributes before trimesh reads the file. `skinned` reads the attributes
+afterwards.
 
-Morph targets and animations are ignored. The joints have the pose of the nodes.
+Morph targets and animations are ignored. The joints have the pose that the nodes
+of the file have.
+
+Shapes use these letters: a part of a file has V vertices, and all skins of the
+file together have J joints.
 """
 
 import json
@@ -19,33 +24,36 @@ import trimesh
 from renderer.geometry.mesh import Mesh, transformed
 from renderer.geometry.skin import Skin
 
-# Names of the attributes for inverse bind matrices, joints and weights. The
-# number of the set follows the last two, as in _JOINTS_0.
+# Name of the attribute to which the inverse bind matrices of a skin are copied. An
+# inverse bind matrix maps vertices of the mesh to the axes of a joint.
 BIND = "_BIND"
+# First letters of the attributes to which joints and weights are copied. A number
+# follows, as in _JOINTS_0, because each attribute holds four joints per vertex.
 JOINTS = "_JOINTS_"
 WEIGHTS = "_WEIGHTS_"
-# Beginnings of the names of joints and weights in glTF.
+# First letters of the names of joints and weights in glTF.
 JOINTS_OR_WEIGHTS = ("JOINTS", "WEIGHTS")
-# The weights of a vertex may differ from a sum of 1 by this, because weights
-# may have 8 bits.
+# Largest difference from 1 of the sum of a vertex's weights. Weights with 8 bits may
+# differ so much because they are rounded.
 TOLERANCE = 0.01
-# Type of the first chunk of a .glb file: "JSON" as a number.
+# Number that marks the JSON part of a .glb file: the letters "JSON".
 JSON_CHUNK = 0x4E4F534A
-# Bytes before the content of this chunk: the file header and the chunk header.
+# Number of bytes of a .glb file before the JSON: 12 of the file header, and 8 of the
+# header of the JSON part.
 GLB_HEADER_BYTES = 20
 
 
 def with_skins_as_attributes(content: bytes, tree: dict[str, Any]) -> bytes:
-    """Copy the skins of a .gltf or .glb file to attributes that trimesh reads.
+    """Copy the skins in a .gltf or .glb file to vertex attributes that trimesh reads.
 
-    Nodes get their numbers as names.
+    Each node gets its number as a name, so that `skinned` finds the node.
 
     Args:
         content: Content of the file.
-        tree: glTF tree of the file, with skins.
+        tree: JSON object of the file, with skins. It is not changed.
 
     Returns:
-        Content of the changed file.
+        Content of a changed file.
 
     Raises:
         ValueError: If a mesh has two skins, or a skin but no weights.
@@ -58,29 +66,31 @@ def with_skins_as_attributes(content: bytes, tree: dict[str, Any]) -> bytes:
     text = json.dumps(tree).encode()
     if not content.startswith(b"glTF"):
         return text
-    # The length of a chunk is a multiple of 4 bytes.
+    # The length of the JSON part of a .glb file must be a multiple of 4 bytes.
     text += b" " * (-len(text) % 4)
-    version, _, old_length = struct.unpack_from("<III", content, 4)
-    other_chunks = content[GLB_HEADER_BYTES + old_length :]
+    version, _, old_json_length = struct.unpack_from("<III", content, 4)
+    other_chunks = content[GLB_HEADER_BYTES + old_json_length :]
     total_length = GLB_HEADER_BYTES + len(text) + len(other_chunks)
     header = struct.pack("<4sIIII", b"glTF", version, total_length, len(text), JSON_CHUNK)
     return header + text + other_chunks
 
 
 def _copy_skin(mesh: dict[str, Any], skin: int, skins: list[dict[str, Any]]) -> None:
-    """Copy the joints, weights and bind matrices of a mesh in a glTF tree, in place.
+    """Copy the joints, weights and inverse bind matrices of a glTF mesh to attributes, in place.
 
     Args:
-        mesh: Mesh of the tree.
-        skin: Index of its skin.
-        skins: All skins of the tree.
+        mesh: Mesh in the JSON object of a file, changed in place.
+        skin: Index of the skin of the mesh.
+        skins: All skins of the file.
 
     Raises:
         ValueError: If the mesh has another skin already, or has no weights.
     """
+    # Two nodes may show the same mesh. Its entry "extras" stores the skin of the first
+    # node.
     known_skin = mesh.setdefault("extras", {}).setdefault("skin", skin)
     if known_skin != skin:
-        raise ValueError("a mesh with two skins is not supported")
+        raise ValueError("a mesh has two skins, which is not supported")
     bind_matrices = skins[skin].get("inverseBindMatrices")
     for part in mesh["primitives"]:
         attributes = part["attributes"]
@@ -94,16 +104,17 @@ def _copy_skin(mesh: dict[str, Any], skin: int, skins: list[dict[str, Any]]) -> 
 
 
 def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -> Mesh:
-    """Move a part of a file with skins to where its joints carry it.
+    """Move the vertices of a part with the joints of the file, and add the joints to the part.
 
-    A part with a skin is moved by its weights. A part without a skin moves with
-    the nearest joint above its node, if there is one.
+    The weights of a part with a skin say how much each joint moves each vertex.
+    A part without a skin moves with the nearest joint above its node in the
+    scene, if there is one.
 
     Args:
         part: Part as trimesh read it, with V vertices.
-        node: Name of its node in the scene.
+        node: Name of the node that shows the part.
         scene: Scene that trimesh read from the changed file.
-        tree: glTF tree of the original file.
+        tree: JSON object of the original file.
 
     Returns:
         Part in the coordinates of the scene, with its skin.
@@ -115,16 +126,18 @@ def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -
     node_number = int(node.split("_")[0])
     node_matrix, geometry_name = scene.graph[node]
     joint_count = len(skeleton.joints)
+    # Weight of each joint for each vertex.
     weights = np.zeros((len(part.vertices), joint_count))
-    # Matrices by which each joint moves the vertices, shape (J, 4, 4).
+    # For each joint, the matrix from the coordinates of the part to the positions that
+    # vertices have in the scene if only this joint moves them, shape (J, 4, 4).
     matrices = node_matrix[None].repeat(joint_count, axis=0)
     joints_above = skeleton.joints_from(node_number)
     if "skin" in tree["nodes"][node_number]:
         skin = tree["skins"][tree["nodes"][node_number]["skin"]]
-        # Index among all joints of each joint of the skin.
+        # Index among all J joints of each joint of this skin.
         columns = np.array([skeleton.column[joint] for joint in skin["joints"]])
         attributes = scene.geometry[geometry_name].vertex_attributes
-        # glTF stores matrices by columns.
+        # glTF stores matrices column by column, so they are transposed.
         bind = attributes[BIND].swapaxes(1, 2) if BIND in attributes else np.eye(4)
         skin_matrices = skeleton.poses[columns] @ bind
         matrices[columns] = skin_matrices
@@ -133,11 +146,12 @@ def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -
         _normalize_weights(weights)
     elif joints_above:
         weights[:, skeleton.column[joints_above[0]]] = 1
+    # Positions (x, y, z, 1), shape (V, 4).
     homogeneous = np.insert(part.vertices, 3, 1, axis=1)
-    # Positions to which each joint moves each vertex, shape (V, J, 4).
+    # Positions to which each joint would move each vertex, shape (V, J, 4).
     moved = np.einsum("jab,vb->vja", matrices, homogeneous)
     carried = (moved * weights[..., None]).astype(np.float32)
-    # This reverses the faces if the matrix mirrors them.
+    # `transformed` reverses the faces if the matrix mirrors the part.
     placed = transformed(part, node_matrix)
     if weights.any():
         placed = replace(placed, vertices=carried[..., :3].sum(axis=1, dtype=np.float64))
@@ -151,15 +165,21 @@ def skinned(part: Mesh, node: str, scene: trimesh.Scene, tree: dict[str, Any]) -
 
 
 class _Skeleton:
-    """J joints of a glTF file, of all its skins.
+    """The J joints of all skins of a glTF file.
 
     Attributes:
-        joints: Nodes of the joints. Parents come before their children.
-        column: Index in `joints` of each joint, by its node.
+        joints: Number of the node of each joint. Parents come before their
+            children.
+        column: Index in `joints` of each joint, by the number of its node.
         names: Names of the joints.
         parents: Index in `joints` of the parent of each joint, or -1,
             shape (J,).
-        poses: Poses of the joints in the scene, shape (J, 4, 4).
+        poses: Matrix from the axes of each joint to scene coordinates,
+            shape (J, 4, 4).
+
+    Args:
+        tree: JSON object of the file.
+        scene: Scene that trimesh read from the file.
     """
 
     def __init__(self, tree: dict[str, Any], scene: trimesh.Scene) -> None:
@@ -178,59 +198,75 @@ class _Skeleton:
         self.poses = np.stack([scene.graph[str(joint)][0] for joint in self.joints])
 
     def joints_from(self, node: int) -> list[int]:
-        """Return the joints on the way from a node to the root, itself included.
+        """List the joints on the way from a node up to the root of the scene.
+
+        The node itself is included if it is a joint.
 
         Args:
             node: Number of the node.
 
         Returns:
-            Nodes of the joints, the nearest one first.
+            Numbers of the nodes of the joints, the nearest joint first.
         """
-        above = []
+        joints_above = []
         if node in self._parent_node:
-            above = self.joints_from(self._parent_node[node])
-        return [node, *above] if node in self._joint_nodes else above
+            joints_above = self.joints_from(self._parent_node[node])
+        return [node, *joints_above] if node in self._joint_nodes else joints_above
 
     def _parent_column(self, joint: int) -> int:
-        """Return the index of the next joint above a joint, or -1."""
+        """Return the index in `joints` of the next joint above a joint, or -1.
+
+        Args:
+            joint: Number of the node of the joint.
+        """
         ancestors = self.joints_from(joint)[1:]
         return self.column[ancestors[0]] if ancestors else -1
 
 
 def _add_weights(weights: np.ndarray, attributes: dict[str, Any], columns: np.ndarray) -> None:
-    """Add the weights of a skin in place.
+    """Add the weights of a skin to an array with all joints of the file, in place.
 
     Args:
-        weights: Weights of V vertices and all J joints, shape (V, J).
-        attributes: Attributes of the vertices, with joints and weights. Each
-            set holds four joints of each vertex.
-        columns: Index among all joints of each joint of the skin.
+        weights: Weight of each of J joints for each of V vertices, changed in
+            place, shape (V, J).
+        attributes: Vertex attributes with joints and weights. An attribute holds
+            four joints, or four weights, per vertex, shape (V, 4).
+        columns: Index among all J joints of each joint of the skin.
 
     Raises:
         ValueError: If a vertex has a joint that the skin does not have.
     """
-    rows = np.arange(len(weights))[:, None]
+    vertex_rows = np.arange(len(weights))[:, None]
     for name in attributes:
         if not name.startswith(JOINTS):
             continue
         values = attributes[name.replace(JOINTS, WEIGHTS)]
-        # Unsigned integers stand for fractions of their largest value.
+        # Unsigned integers are fractions of the largest value of their type.
         largest = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
         values = values / largest
-        # Entries without weight may have any joint.
+        # If a weight is 0, the joint may be any number, so it is replaced by 0.
         joints = np.where(values == 0, 0, attributes[name])
         if joints.max() >= len(columns):
             raise ValueError(
                 f"a vertex has the joint {joints.max()}, but its skin has {len(columns)} joints"
             )
-        np.add.at(weights, (rows, columns[joints]), values)
+        # Unlike `weights[...] += values`, np.add.at counts a repeated joint twice.
+        np.add.at(weights, (vertex_rows, columns[joints]), values)
 
 
 def _normalize_weights(weights: np.ndarray) -> None:
-    """Divide weights (V, J) by their sums in place. Raise ValueError if a sum is not about 1."""
+    """Divide the weights of each vertex by their sum, in place.
+
+    Args:
+        weights: Weight of each of J joints for each of V vertices, shape (V, J).
+
+    Raises:
+        ValueError: If the sum of a vertex differs from 1 by more than
+            `TOLERANCE`.
+    """
     sums = weights.sum(axis=1)
     deviations = np.abs(sums - 1)
-    # The comparison is False for NaN.
+    # The comparison is also False for NaN.
     if not (deviations <= TOLERANCE).all():
         worst = sums[deviations.argmax()]
         raise ValueError(f"the weights of a vertex add up to {worst:g} instead of 1")

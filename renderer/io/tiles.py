@@ -1,4 +1,8 @@
-"""Sheets of images: tiles with captions in a grid."""
+"""Draw sheets of images with captions.
+
+A sheet is an image with a grid of tiles. A tile is an image with its caption
+below.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,23 +14,24 @@ from torch import Tensor
 
 from renderer.image import to_bytes
 
-# All lengths are in pixels.
-# Distance between neighboring tiles.
+# Distance in pixels between neighboring tiles of a sheet.
 GAP = 12
-# Distance between the tiles and the border of the sheet.
+# Distance in pixels between the tiles and the border of a sheet.
 MARGIN = 24
-# Distance between an image and its caption.
+# Distance in pixels between an image and its caption.
 CAPTION_GAP = 2
-# Font sizes.
+# Font sizes of titles and captions in pixels.
 TITLE_SIZE = 20
 CAPTION_SIZE = 12
-# Heights of a title, and of a line of a caption.
+# Heights of a title and of a line of a caption in pixels.
 TITLE_HEIGHT = 36
 LINE_HEIGHT = 16
 
-# Colors of the background, of text, and of less important text.
+# Color of the background of a sheet.
 PAPER = "white"
+# Color of titles and of the first line of a caption.
 INK = "#1a1a1a"
+# Color of the other lines of a caption.
 FAINT = "#6b6b6b"
 
 
@@ -44,10 +49,11 @@ class Tile:
     caption: tuple[str, ...]
 
     def captioned(self) -> Image.Image:
-        """Draw the image above its caption.
+        """Draw the image with its caption below.
 
         Returns:
-            Image that is as wide as the wider of image and caption.
+            Image of the tile. It is as wide as the image or as the longest line,
+            whichever is wider.
         """
         image = Image.fromarray(self.image)
         line_widths = [_text_width(line, CAPTION_SIZE) for line in self.caption]
@@ -67,15 +73,16 @@ class Tile:
 def tiles_of(
     images: Iterable[Tensor], captions: Iterable[tuple[str, ...]] = repeat(()), side: int = 1
 ) -> list[Tile]:
-    """Create tiles of images, enlarged without smoothing.
+    """Create a tile for each image.
 
-    A tile then shows the pixels that a classifier saw.
+    Small images are enlarged without smoothing, so that a tile shows the pixels
+    that a classifier saw.
 
     Args:
         images: RGB images with values in [0, 1], shape (3, H, W) each.
-        captions: Lines of text below each image. The default is none.
-        side: Smallest width of the tiles in pixels. Images are enlarged by the
-            smallest whole factor that reaches it.
+        captions: Lines of text below each image. The default is no text.
+        side: Smallest width of the enlarged images in pixels. An image is
+            enlarged by the smallest whole factor that makes it so wide.
 
     Returns:
         One tile for each image.
@@ -83,7 +90,7 @@ def tiles_of(
     tiles = []
     for image, caption in zip(images, captions, strict=False):
         pixels = to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy()
-        # Negating before and after the division rounds up.
+        # side / width, rounded up: `//` rounds down, and the two signs reverse this.
         factor = -(-side // image.shape[2])
         enlarged = pixels.repeat(factor, 0).repeat(factor, 1)
         tiles.append(Tile(enlarged, caption))
@@ -95,25 +102,29 @@ def draw_grid(
 ) -> Image.Image:
     """Draw rows of tiles on a sheet.
 
-    Each column and each row is as large as its largest tile.
+    Each column is as wide as its widest tile or title. Each row is as high as its
+    highest tile.
 
     Args:
         rows: Tiles of each row. The last row may be shorter.
-        titles: Title of each column. The default is none.
-        heading: Title of the sheet. The default is none.
+        titles: Title of each column. The default is no titles.
+        heading: Title of the sheet. The default is no title.
 
     Returns:
-        Sheet with a margin of MARGIN pixels.
+        Sheet with a margin of MARGIN pixels on all sides.
     """
     images = [[tile.captioned() for tile in row] for row in rows]
-    heights = [max(image.height for image in row) for row in images]
-    widths = _column_widths(images, titles)
-    lefts = list(accumulate((width + GAP for width in widths), initial=MARGIN))
+    row_heights = [max(image.height for image in row) for row in images]
+    column_widths = _column_widths(images, titles)
+    # Left edge of each column, and the position where a further column would begin.
+    lefts = list(accumulate((width + GAP for width in column_widths), initial=MARGIN))
     title_lines = bool(heading) + bool(titles)
     first_top = MARGIN + TITLE_HEIGHT * title_lines
-    tops = list(accumulate((height + GAP for height in heights), initial=first_top))
+    # Top edge of each row, and the position where a further row would begin.
+    tops = list(accumulate((height + GAP for height in row_heights), initial=first_top))
 
-    # The last entries of both lists lie one gap beyond the last tile.
+    # The last column ends one GAP before a further column would begin, and the last
+    # row ends one GAP before a further row would begin.
     right = max(lefts[-1] - GAP, MARGIN + _text_width(heading, TITLE_SIZE))
     bottom = max(tops[-1] - GAP, first_top)
     sheet = Image.new("RGB", (right + MARGIN, bottom + MARGIN), PAPER)
@@ -129,8 +140,19 @@ def draw_grid(
 
 
 def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str]) -> list[int]:
-    """Return the width of the widest image or title of each column."""
+    """Compute the width of each column of a sheet in pixels.
+
+    Args:
+        images: Images of the tiles of each row. The last row may be shorter.
+        titles: Titles of the columns, possibly fewer than columns.
+
+    Returns:
+        Width of the widest image or of the title of each column, whichever is
+        wider.
+    """
     widths = []
+    # The inner zip_longest turns rows into columns, with None for missing tiles. The
+    # outer one adds None for a missing title or column.
     for column, title in zip_longest(zip_longest(*images), titles):
         title_width = _text_width(title or "", TITLE_SIZE)
         image_widths = [image.width for image in column or () if image]
@@ -139,7 +161,15 @@ def _column_widths(images: Sequence[Sequence[Image.Image]], titles: Sequence[str
 
 
 def _text_width(text: str, size: int) -> int:
-    """Return the width of a line of text in pixels, for a font size."""
+    """Compute the width of a line of text in pixels, rounded up.
+
+    Args:
+        text: Line of text.
+        size: Font size in pixels.
+
+    Returns:
+        Width, or 0 for an empty line.
+    """
     if not text:
         return 0
     return round(ImageFont.load_default(size).getlength(text) + 0.5)

@@ -30,8 +30,8 @@ from renderer.light.harmonics import basis, equirectangular
 # Suffixes of the files that `write_map` writes.
 SUFFIXES = (".npy", ".hdr", ".exr")
 # `read_panorama` raises an error for maps with fewer rows. `harmonics.project` would
-# integrate such a map too coarsely: at 4 rows, a map of uniform radiance would get
-# coefficients of degree 1 or more with 16% of its norm.
+# integrate such a map too coarsely. With 4 rows and degree 6, the coefficients of a
+# uniform map that should be 0 would have 21% of the norm of the first coefficient.
 FEWEST_ROWS = 8
 # `light_radiance` evaluates this many directions at once. Their harmonics fit into
 # the cache of the processor.

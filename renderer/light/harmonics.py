@@ -36,25 +36,34 @@ from renderer.vectors import unit
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
 
-# `quadrature` of degree D has about D² / 2 directions.
+# Largest degree that `quadrature` accepts. A rule of degree D has about D² / 2
+# directions.
 MAX_QUADRATURE = 10**4
-# The largest height and the largest width of an environment map, in texels.
+# Largest height and largest width in texels that `equirectangular` accepts.
 MAX_TEXELS = 10**6
-# `rotate` accepts a matrix R if no entry of R Rᵀ - I is larger. A matrix whose
-# entries were rounded to four digits passes.
+# `rotate` accepts a matrix R if no entry of R Rᵀ - I is larger than this. A rotation
+# matrix whose entries are rounded to four digits fulfills this.
 ORTHONORMAL = 1e-3
-# Diffuse shading ignores the bands above this degree. They change the
-# irradiance under a parallel beam by at most 0.015 of the beam's irradiance.
+# Diffuse shading ignores harmonics above this degree. They change the irradiance
+# under a parallel beam of light by at most 0.015 times the irradiance of the beam.
 DIFFUSE_DEGREE = 20
+# Type of the result of a function that `per_degree` caches.
 Constant = TypeVar("Constant")
+# Indices of the axes in tensors.
 X_AXIS, Y_AXIS, Z_AXIS = range(3)
 
 
 def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
-    """Cache the results of a function of a degree and other hashable arguments.
+    """Decorate a function of a degree and other hashable arguments, so that its results are cached.
 
-    The function runs outside of torch's inference mode, because a tensor that
-    is made in inference mode cannot be used in training later.
+    The decorated function runs outside of torch's inference mode. A cached tensor
+    that was created in inference mode could not be used in training later.
+
+    Args:
+        function: Function to decorate.
+
+    Returns:
+        Function with a cache.
     """
     return cache(torch.inference_mode(False)(function))
 
@@ -80,7 +89,14 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
 
 
 def _degree_of_rows(coefficients: Tensor) -> int | None:
-    """Return the degree of coefficients ((degree + 1)², channels), or None for another shape."""
+    """Find the degree of a light from the number of its SH coefficients.
+
+    Args:
+        coefficients: SH coefficients, shape ((degree + 1)², channels).
+
+    Returns:
+        Degree, or None if the tensor does not have such a shape.
+    """
     if coefficients.ndim != 2 or len(coefficients) == 0:
         return None
     degree = math.isqrt(len(coefficients)) - 1
@@ -92,14 +108,15 @@ def basis(
 ) -> Float[Tensor, "*batch coefficients"]:
     """Evaluate the real spherical harmonics of all bands up to a degree.
 
-    The values are computed in float64 and can be differentiated once by the
-    directions. The Legendre recurrences are those of the paper's appendix B.1,
-    except that the factor sin^m θ moves from P_l^m to Re and Im of (x + iy)^m.
+    The values are computed in float64 and can be differentiated once with
+    respect to the directions. The Legendre recurrences are those of the paper's
+    appendix B.1, but the factor sin^m θ is part of the powers (x + iy)^m instead
+    of the Legendre functions P_l^m.
 
     Args:
         directions: Finite vectors of any length, shape (..., 3). Only their
-            direction counts. A zero vector has none: its values are finite and
-            their gradient is zero.
+            direction counts. At a zero vector, the values are finite and the
+            gradient is zero.
         degree: Highest band, from 0 to `MAX_DEGREE`.
 
     Returns:
@@ -121,86 +138,105 @@ def basis(
 
 
 def require_degree(degree: int) -> None:
-    """Check that a degree of lights is a whole number from 0 to `MAX_DEGREE`.
+    """Check that the degree of a light is a whole number from 0 to `MAX_DEGREE`.
+
+    Args:
+        degree: Degree to check.
 
     Raises:
-        InputError: If the degree is not.
+        InputError: If the degree is not whole or out of range.
     """
     require_whole("degree", degree)
     require_range("degree", degree, 0, MAX_DEGREE)
 
 
 def select_rows(directions: Tensor, indices: Iterable[int]) -> list[Tensor]:
-    """Evaluate single harmonics, without checks, for inner loops.
+    """Evaluate harmonics with given indices, without checks of the arguments.
 
     Args:
-        directions: Unit vectors, components first, shape (3, ...).
-        indices: Indices l² + l + m of the harmonics.
+        directions: Unit vectors, with the three components along the first axis,
+            shape (3, ...).
+        indices: Indices l² + l + m of the harmonics of band l and order m.
 
     Returns:
-        The values of each of the harmonics, shape (...), in the order of the
-        indices without repetitions.
+        Values of each harmonic, shape (...), in the order of the indices.
+        Repeated indices count once.
     """
     x, y, z = directions
+    # A dictionary keeps the order and removes repetitions.
     wanted = dict.fromkeys(indices)
-    rows = {}
+    values_by_index = {}
     degree = math.isqrt(max(wanted, default=0))
-    # Re and Im of (x + iy)^m, times √2 if m > 0.
-    cosine = torch.ones_like(z)
-    sine = torch.zeros_like(z)
+    # Real and imaginary part of (x + iy)^m, times √2 if m > 0.
+    real_power = torch.ones_like(z)
+    imaginary_power = torch.zeros_like(z)
     for m in range(degree + 1):
-        of_bands = zip(range(m, degree + 1), _legendre(z, m, degree), strict=True)
-        for l, legendre in of_bands:
-            middle = l * l + l
-            if middle + m in wanted:
-                rows[middle + m] = cosine * legendre
-            if m and middle - m in wanted:
-                rows[middle - m] = sine * legendre
+        bands_and_functions = zip(range(m, degree + 1), _legendre(z, m, degree), strict=True)
+        for l, legendre in bands_and_functions:
+            # Index of the harmonic of order 0 in band l.
+            order_zero = l * l + l
+            if order_zero + m in wanted:
+                values_by_index[order_zero + m] = real_power * legendre
+            if m and order_zero - m in wanted:
+                values_by_index[order_zero - m] = imaginary_power * legendre
         if m == degree:
             break
         if m == 0:
-            cosine = cosine * math.sqrt(2)
-        next_cosine = torch.addcmul(x * cosine, y, sine, value=-1)
-        sine = torch.addcmul(x * sine, y, cosine)
-        cosine = next_cosine
-    return [rows[index] for index in wanted]
+            real_power = real_power * math.sqrt(2)
+        # Multiply the power by x + iy.
+        next_real_power = torch.addcmul(x * real_power, y, imaginary_power, value=-1)
+        imaginary_power = torch.addcmul(x * imaginary_power, y, real_power)
+        real_power = next_real_power
+    return [values_by_index[index] for index in wanted]
 
 
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
-    """Yield the orthonormal associated Legendre functions P_l^m / sin^m θ for l = m to degree.
+    """Evaluate the orthonormal associated Legendre functions P_l^m / sin^m θ of one order m.
 
-    They are polynomials in z. The first one is a constant, which is yielded as
-    a number because that is faster than a tensor of equal entries.
+    The functions are polynomials in z = cos θ.
+
+    Args:
+        z: Cosine of the polar angle θ, any shape.
+        m: Order, at least 0.
+        degree: Largest l.
+
+    Yields:
+        Values for l = m, m + 1, ..., degree, in the shape of `z`. The first
+        function is constant and is yielded as a number, because multiplying by a
+        number is faster than by a tensor.
     """
     ratios = [(2 * k + 1) / (2 * k) for k in range(1, m + 1)]
     constant = math.sqrt(math.prod(ratios) / (4 * math.pi))
     yield constant
-    previous = z.new_tensor(constant)
-    value = z * math.sqrt(2 * m + 3) * constant
+    # The functions of l - 2 and l - 1 give the function of l.
+    before_previous = z.new_tensor(constant)
+    previous = z * math.sqrt(2 * m + 3) * constant
     for l in range(m + 1, degree + 1):
         if l > m + 1:
             a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
             b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
-            following = torch.addcmul(previous * (-a * b), z, value, value=a)
-            previous = value
-            value = following
-        yield value
+            # a (z P_(l-1) - b P_(l-2)).
+            current = torch.addcmul(before_previous * (-a * b), z, previous, value=a)
+            before_previous = previous
+            previous = current
+        yield previous
 
 
 @per_degree
 def gradient_matrices(degree: int) -> Tensor:
-    """Compute the matrices that differentiate harmonics by x, y and z.
+    """Compute the matrices that differentiate spherical harmonics by x, y and z.
 
-    Here r is the length of (x, y, z), and r^l Y_k is a polynomial for an index
-    k in band l. Its derivative by the coordinate d is a sum over the indices j
-    of band l - 1: ∂(r^l Y_k)/∂x_d = Σ_j M[d, j, k] r^(l-1) Y_j. These are the
+    Let r be the length of (x, y, z). For a harmonic Y_k of band l, r^l Y_k is a
+    polynomial. Its derivative by the coordinate x_d is a sum over the harmonics
+    Y_j of band l - 1: ∂(r^l Y_k)/∂x_d = Σ_j M[d, j, k] r^(l-1) Y_j. These are the
     ladder operators of solid harmonics in real form.
 
     Args:
         degree: Highest band.
 
     Returns:
-        The matrices M, shape (3, (degree + 1)², (degree + 1)²), float64.
+        Matrices M for the three coordinates, float64,
+        shape (3, (degree + 1)², (degree + 1)²).
     """
     size = (degree + 1) ** 2
     matrices = torch.zeros(3, size, size, dtype=torch.float64)
@@ -211,130 +247,159 @@ def gradient_matrices(degree: int) -> Tensor:
 
 
 def _set_gradients(matrices: Tensor, l: int, m: int) -> None:
-    """Set the columns of Y_lm and Y_l,-m, for m ≥ 0, of `gradient_matrices`."""
+    """Set the columns of the harmonics Y_lm and Y_l,-m in `gradient_matrices`, in place.
+
+    Args:
+        matrices: Matrices, shape (3, K, K) for K harmonics.
+        l: Band, at least 1.
+        m: Order, at least 0.
+    """
     norm = (2 * l + 1) / (2 * l - 1)
+    # Factors for harmonics of the orders m - 1 and m + 1 in band l - 1.
     down = math.sqrt(norm * (l + m) * (l + m - 1)) / 2 * (math.sqrt(2) if m == 1 else 1)
     up = math.sqrt(norm * (l - m) * (l - m - 1)) / 2 * (math.sqrt(2) if m == 0 else 1)
-    # The row of m = 0 in band l - 1, and the columns of m and -m in band l.
-    below = (l - 1) * l
-    cosine = l * l + l + m
-    sine = l * l + l - m
+    # Row of the harmonic of order 0 in band l - 1.
+    row = (l - 1) * l
+    # Columns of the orders m and -m in band l, which contain cos mφ and sin mφ.
+    cosine_column = l * l + l + m
+    sine_column = l * l + l - m
     if m < l:
-        along_z = math.sqrt(norm * (l * l - m * m))
-        matrices[Z_AXIS, below + m, cosine] = along_z
-        matrices[Z_AXIS, below - m, sine] = along_z
+        z_factor = math.sqrt(norm * (l * l - m * m))
+        matrices[Z_AXIS, row + m, cosine_column] = z_factor
+        matrices[Z_AXIS, row - m, sine_column] = z_factor
     if m + 1 < l:
-        matrices[X_AXIS, below + m + 1, cosine] = -up
-        matrices[Y_AXIS, below - m - 1, cosine] = -up
+        matrices[X_AXIS, row + m + 1, cosine_column] = -up
+        matrices[Y_AXIS, row - m - 1, cosine_column] = -up
     if m + 1 < l and m > 0:
-        matrices[X_AXIS, below - m - 1, sine] = -up
-        matrices[Y_AXIS, below + m + 1, sine] = up
+        matrices[X_AXIS, row - m - 1, sine_column] = -up
+        matrices[Y_AXIS, row + m + 1, sine_column] = up
     if m > 0:
-        matrices[X_AXIS, below + m - 1, cosine] = down
-        matrices[Y_AXIS, below + m - 1, sine] = down
+        matrices[X_AXIS, row + m - 1, cosine_column] = down
+        matrices[Y_AXIS, row + m - 1, sine_column] = down
     if m > 1:
-        matrices[X_AXIS, below - m + 1, sine] = down
-        matrices[Y_AXIS, below - m + 1, cosine] = -down
+        matrices[X_AXIS, row - m + 1, sine_column] = down
+        matrices[Y_AXIS, row - m + 1, cosine_column] = -down
 
 
 @per_degree
 def homogeneous_gradients(degree: int) -> Tensor:
-    """Compute the matrices that differentiate homogeneous polynomials of a degree.
+    """Compute the matrices that differentiate the homogeneous polynomials r^degree Y_k.
 
-    For an index k in a band of the degree's parity, r^degree Y_k is a
-    homogeneous polynomial, and ∂(r^degree Y_k)/∂x_d = Σ_j M[d, j, k]
-    r^(degree - 1) Y_j. By Euler's theorem, the product of this gradient with
-    (x, y, z) is `degree` times the polynomial, so one sum over j gives both the
-    value and the gradient.
+    Let r be the length of (x, y, z), and Y_k a harmonic of a band l with the
+    same parity as `degree`. Then r^degree Y_k is a homogeneous polynomial, with
+    ∂(r^degree Y_k)/∂x_d = Σ_j M[d, j, k] r^(degree - 1) Y_j. By Euler's theorem,
+    the product of this gradient and (x, y, z) is `degree` times the polynomial.
+    The sum over j therefore gives the gradient and the value.
 
     Args:
         degree: Degree of the polynomials.
 
     Returns:
-        The matrices M, shape (3, (degree + 1)², (degree + 1)²), float64.
-        Columns of bands of the other parity have no meaning.
+        Matrices M for the three coordinates, float64,
+        shape (3, (degree + 1)², (degree + 1)²). Columns of bands of the other
+        parity have no meaning.
     """
-    # The product x_d Y_k of a harmonic in band l has a part in band l - 1,
-    # ∂(r^l Y_k)/∂x_d / (2l + 1). By symmetry, its part in band l + 1 has the
-    # transposed matrix.
-    solid = gradient_matrices(degree)
+    # Write r^degree Y_k as r^(degree - l) (r^l Y_k) and apply the product rule. The
+    # derivative of the first factor leads to x_d Y_k. This product has a part in
+    # band l - 1, ∂(r^l Y_k)/∂x_d / (2l + 1). By symmetry, its part in band l + 1 has
+    # the transposed matrix.
+    solid_gradients = gradient_matrices(degree)
     band_of_column = bands(degree)
-    down = solid / (2 * band_of_column + 1)
-    return solid + (degree - band_of_column) * (down + down.mT)
+    lower_part = solid_gradients / (2 * band_of_column + 1)
+    product = lower_part + lower_part.mT
+    return solid_gradients + (degree - band_of_column) * product
 
 
 @per_degree
 def monomial_coefficients(degree: int) -> Tensor:
-    """Express harmonics by monomials x^a y^b z^c with a + b + c = degree.
+    """Compute the matrix that expresses harmonics by monomials x^a y^b z^c, a + b + c = degree.
 
-    For an index k in a band of the degree's parity, r^degree Y_k = Σ_j M[j, k]
-    monomial_j, in the order of `monomials`.
+    Let r be the length of (x, y, z). For a harmonic Y_k of a band with the same
+    parity as `degree`, r^degree Y_k = Σ_j M[j, k] monomial_j. The monomials are
+    in the order of `monomials`.
 
     Args:
         degree: Degree of the monomials.
 
     Returns:
-        The matrix M, shape ((degree + 1)(degree + 2) / 2, (degree + 1)²),
-        float64. Columns of bands of the other parity have no meaning.
+        Matrix M, float64, shape ((degree + 1) (degree + 2) / 2, (degree + 1)²).
+        Columns of bands of the other parity have no meaning.
     """
     if degree == 0:
         return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
-    # The coefficient of x^a y^b z^c is that of x^(a-1) y^b z^c in the
-    # polynomial's derivative by x, divided by a; likewise by y where a = 0, and
-    # by z where a = b = 0.
-    below = monomial_coefficients(degree - 1)
-    along_x, along_y, along_z = below @ homogeneous_gradients(degree)[:, : below.shape[1]]
-    powers = torch.tensor(
+    # A polynomial follows from its derivatives. The coefficient of x^a y^b z^c is the
+    # coefficient of x^(a-1) y^b z^c in the derivative by x, divided by a. If a = 0,
+    # the derivative by y is used, and if a = b = 0, the derivative by z.
+    lower_coefficients = monomial_coefficients(degree - 1)
+    lower_gradients = homogeneous_gradients(degree)[:, : lower_coefficients.shape[1]]
+    along_x, along_y, along_z = lower_coefficients @ lower_gradients
+    # The divisor of each monomial: a, or b if a = 0, or c = degree if a = b = 0.
+    divisors = torch.tensor(
         [a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)]
     )
+    # The last `degree` monomials of the derivative by y have no factor x, and the last
+    # monomial of the derivative by z has no factors x and y.
     derivatives = torch.cat([along_x, along_y[-degree:], along_z[-1:]])
-    return derivatives / powers[:, None]
+    return derivatives / divisors[:, None]
 
 
 def monomials(vectors: Tensor, degree: int) -> Tensor:
     """Evaluate all monomials x^a y^b z^c with a + b + c = degree.
 
     Args:
-        vectors: Vectors, components first, shape (3, N).
+        vectors: Vectors (x, y, z), with the three components along the first
+            axis, shape (3, N).
         degree: Degree of the monomials.
 
     Returns:
-        The values, shape ((degree + 1)(degree + 2) / 2, N), from x^degree to
-        z^degree: first by decreasing power of x, then of y.
+        Values of the monomials, shape ((degree + 1) (degree + 2) / 2, N). They
+        are sorted from x^degree to z^degree, by falling power of x and then by
+        falling power of y.
     """
     x, y, z = vectors
-    products = torch.ones_like(vectors[:1])
+    values = torch.ones_like(vectors[:1])
     for power in range(1, degree + 1):
-        lower = products
-        count = len(lower)
-        products = vectors.new_empty(count + power + 1, vectors.shape[1])
-        torch.mul(lower, x, out=products[:count])
-        without_x = lower[count - power :]
-        torch.mul(without_x, y, out=products[count:-1])
-        torch.mul(lower[-1], z, out=products[-1])
-    return products
+        # Monomials of degree `power` are monomials of the degree below times x, y or z.
+        lower_values = values
+        lower_count = len(lower_values)
+        values = vectors.new_empty(lower_count + power + 1, vectors.shape[1])
+        torch.mul(lower_values, x, out=values[:lower_count])
+        # The last `power` monomials of the degree below have no factor x.
+        without_x = lower_values[lower_count - power :]
+        torch.mul(without_x, y, out=values[lower_count:-1])
+        torch.mul(lower_values[-1], z, out=values[-1])
+    return values
 
 
 @per_degree
 def bands(degree: int) -> Int[Tensor, " coefficients"]:
-    """Return the band l of each coefficient, shape ((degree + 1)²,): 0, 1, 1, 1, 2 and so on."""
-    return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
-
-
-@per_degree
-def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
-    """Return the factor A_l by which a diffuse surface keeps each coefficient of a light.
-
-    A light with coefficients U_lm has the irradiance Σ A_l U_lm Y_lm(n) at the
-    normal n. The factors A_0, A_1, ... = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...
-    are those of the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
+    """Return the band l of each SH coefficient up to a degree: 0, 1, 1, 1, 2, ...
 
     Args:
         degree: Highest band.
 
     Returns:
-        Factors, shape ((degree + 1)²,), float64. Those of the bands above
-        `DIFFUSE_DEGREE` are set to zero.
+        Band of each coefficient, int64, shape ((degree + 1)²,).
+    """
+    # Band l has 2 l + 1 harmonics.
+    return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
+
+
+@per_degree
+def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
+    """Compute the factor A_l of each SH coefficient of a light in the irradiance.
+
+    A light with coefficients U_lm has the irradiance Σ A_l U_lm Y_lm(n) on a
+    surface with the normal n. The factors A_0, A_1, ... = π, 2π/3, π/4, 0, -π/24,
+    0, π/64, ... are the coefficients of the clamped cosine (Ramamoorthi and
+    Hanrahan 2001, equation 8).
+
+    Args:
+        degree: Highest band.
+
+    Returns:
+        Factor of each coefficient, float64, shape ((degree + 1)²,). Factors of
+        bands above `DIFFUSE_DEGREE` are set to 0.
     """
     factors = [math.pi, 2 * math.pi / 3, *[0.0] * (degree - 1)]
     for l in range(2, min(degree, DIFFUSE_DEGREE) + 1, 2):
@@ -346,9 +411,15 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
 
 @per_degree
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
-    """Return the indices of the coefficients that change the irradiance of a diffuse surface.
+    """Return the indices of the SH coefficients that change the irradiance of a diffuse surface.
 
-    Of the 49 coefficients of degree 6, these are 31.
+    At degree 6, these are 31 of the 49 coefficients.
+
+    Args:
+        degree: Degree of the light.
+
+    Returns:
+        Ascending indices, int64, shape (K,).
     """
     return torch.nonzero(lambertian_factors(degree)).squeeze(1)
 
@@ -356,20 +427,21 @@ def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
 def irradiance_error(
     lights: Float[Tensor, "*batch K channels"], given: Float[Tensor, "*batch J channels"]
 ) -> Tensor:
-    """Compute the relative error of the irradiance of approximate lights.
+    """Compute the relative error of the irradiance of lights that approximate other lights.
 
-    The error is the rms difference of irradiance over all normals and channels,
-    divided by the rms irradiance of the given lights.
+    The error is the root mean square difference of the irradiance over all
+    normals and channels, divided by the root mean square irradiance of the given
+    lights.
 
     Args:
-        lights: Coefficients of the approximate lights, shape
-            (..., (degree + 1)², C).
-        given: Coefficients of the lights that they approximate, with the same
-            number of channels. The degree may be another one.
+        lights: SH coefficients of the approximate lights,
+            shape (..., (degree + 1)², C) with C channels.
+        given: SH coefficients of the given lights, with the same number of
+            channels. Their degree may differ.
 
     Returns:
-        Relative errors of shape (...), float64. The error is 0 if both lights
-        are dark.
+        Relative errors, float64, shape (...). The error is 0 if both lights are
+        dark.
     """
     # Harmonics are orthonormal, so the mean square over all normals is in proportion
     # to the sum of the squared coefficients of the irradiance.
@@ -383,45 +455,62 @@ def irradiance_error(
 
 
 def _pad_bands(lights: Tensor, size: int) -> Tensor:
-    """Return lights (..., K, C) with zeros appended up to `size` coefficients."""
+    """Append zeros to the coefficients of lights.
+
+    Args:
+        lights: SH coefficients, shape (..., K, C).
+        size: Number of coefficients after the padding.
+
+    Returns:
+        SH coefficients, shape (..., size, C).
+    """
     return F.pad(lights, (0, 0, 0, size - lights.shape[-2]))
 
 
 def _norm_over_coefficients(lights: Tensor) -> Tensor:
-    """Return the L2 norms (...) of lights (..., K, C)."""
+    """Compute the L2 norm of each light over its coefficients and channels.
+
+    Args:
+        lights: SH coefficients, shape (..., K, C).
+
+    Returns:
+        Norms, shape (...).
+    """
     return lights.square().sum((-2, -1)).sqrt()
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
-    """Return a quadrature rule on the sphere that is exact for polynomials of a degree.
+    """Compute a quadrature rule on the sphere that is exact for polynomials up to a degree.
 
-    The rule is Gauss-Legendre in z with equal steps in azimuth.
+    The rule is Gauss-Legendre quadrature in z, with equal steps in azimuth.
 
     Args:
         degree: Highest degree that is integrated exactly, from 0 to
             `MAX_QUADRATURE`.
 
     Returns:
-        Unit directions, shape (N, 3), and weights that sum to 4π, shape (N,),
-        both float64. N is (degree // 2 + 1)(degree + 1).
+        A tuple of
+        - N = (degree // 2 + 1) (degree + 1) unit vectors, float64, shape (N, 3);
+        - their weights, which add up to 4π, float64, shape (N,).
 
     Raises:
         InputError: If the degree is out of range.
     """
     require_whole("degree", degree)
     require_range("degree", degree, 0, MAX_QUADRATURE)
-    z, weights_of_z = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    z, z_weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     radius = np.sqrt(1 - z**2)[:, None]
+    # Shape (values of z, azimuths).
     x = radius * np.cos(azimuth)
     y = radius * np.sin(azimuth)
     directions = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
-    weights = np.repeat(weights_of_z * 2 * np.pi / len(azimuth), len(azimuth))
+    weights = np.repeat(z_weights * 2 * np.pi / len(azimuth), len(azimuth))
     return torch.from_numpy(directions.reshape(-1, 3)), torch.from_numpy(weights)
 
 
 def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Return the directions and solid angles of the texels of an environment map.
+    """Compute the directions and the solid angles of the texels of an environment map.
 
     Row 0 faces up (+z). The middle column faces +x, and azimuth grows to the
     left, as seen from inside the sphere.
@@ -431,8 +520,10 @@ def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
         width: Number of columns, from 1 to `MAX_TEXELS`.
 
     Returns:
-        Unit directions, shape (height, width, 3), and solid angles in
-        steradians, shape (height, width), both float64.
+        A tuple of
+        - unit vectors from the origin to the texels, float64,
+          shape (height, width, 3);
+        - solid angles in steradians, float64, shape (height, width).
 
     Raises:
         InputError: If the height or the width is out of range.
@@ -440,8 +531,9 @@ def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
     for name, count in (("height", height), ("width", width)):
         require_whole(name, count)
         require_range(name, count, 1, MAX_TEXELS)
+    # z at the upper and lower edges of the rows, shape (height + 1,).
     row_edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
-    # This is the mean of z over the solid angle of a row.
+    # Mean of z over the solid angle of each row.
     z = (row_edges[:-1] + row_edges[1:]) / 2
     azimuth = math.pi - 2 * math.pi * (torch.arange(width, dtype=torch.float64) + 0.5) / width
     radius = (1 - z**2).sqrt()[:, None]
@@ -457,19 +549,21 @@ def project(
     degree: int,
     quadrature_degree: int = 128,
 ) -> Float64[Tensor, "coefficients channels"]:
-    """Compute the SH coefficients of light that is given as radiance on the sphere.
+    """Compute the SH coefficients of a light from its radiance.
 
     Args:
-        radiance: An environment map in the layout of `equirectangular`, shape
-            (height, width, channels). Or a function from unit directions
-            (N, 3), float64, to radiance (N, channels), which is integrated by
+        radiance: Environment map in the layout of `equirectangular`,
+            shape (height, width, channels). Or a function that takes float64
+            unit directions, shape (N, 3), and returns the radiance from these
+            directions, shape (N, channels). A function is integrated with
             `quadrature`.
         degree: Degree of the result, from 0 to `MAX_DEGREE`.
         quadrature_degree: Degree of the quadrature for a function. The result
-            is exact for polynomials of degree `quadrature_degree - degree`.
+            is exact if the function is a polynomial of at most the degree
+            `quadrature_degree - degree`.
 
     Returns:
-        Coefficients, shape ((degree + 1)², channels), float64.
+        SH coefficients, float64, shape ((degree + 1)², channels).
 
     Raises:
         InputError: If a degree is out of range, a map does not have three
@@ -485,36 +579,51 @@ def project(
 
 
 def _project_map(radiance: Tensor, degree: int) -> Tensor:
-    """Integrate an environment map, shape (height, width, channels), against the harmonics."""
+    """Compute the SH coefficients of an environment map with the midpoint rule.
+
+    Args:
+        radiance: Environment map, shape (height, width, channels).
+        degree: Degree of the result.
+
+    Returns:
+        SH coefficients, float64, shape ((degree + 1)², channels).
+
+    Raises:
+        InputError: If the map does not have three axes, or holds NaN or
+            infinity.
+    """
     if radiance.ndim != 3:
         shape = tuple(radiance.shape)
         raise InputError(f"radiance has shape {shape}: give a map (height, width, channels)")
     require_finite(radiance=radiance)
     directions, solid_angles = equirectangular(*radiance.shape[:2])
-    # A map may have 10⁸ texels, so the harmonics are evaluated row by row.
+    # A map may have 10⁸ texels, so the harmonics are evaluated row by row to save
+    # memory.
     rows = zip(directions, solid_angles, radiance, strict=True)
     return sum(
-        basis(directions_of_row, degree).T @ (weights[:, None] * texels.to(directions_of_row))
-        for directions_of_row, weights, texels in rows
+        basis(row_directions, degree).T @ (weights[:, None] * texels.to(row_directions))
+        for row_directions, weights, texels in rows
     )
 
 
 def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     """Rotate a light about the origin.
 
-    The rotated light is u'(ω) = u(Rᵀω). The result is exact up to rounding,
-    because the light is a polynomial.
+    If u(ω) is the radiance of the light from the direction ω, the radiance of the
+    rotated light is u(Rᵀ ω). The result is exact up to rounding, because the
+    radiance is a polynomial.
 
     Args:
-        coefficients: Coefficients of the light, shape ((degree + 1)², channels).
+        coefficients: SH coefficients of the light,
+            shape ((degree + 1)², channels).
         rotation: Orthonormal matrix R, shape (3, 3).
 
     Returns:
-        Coefficients of the rotated light, with the same shape and dtype.
+        SH coefficients of the rotated light, in the same shape and dtype.
 
     Raises:
-        InputError: If an argument holds NaN, no degree has this number of
-            coefficients, or the matrix is not orthonormal.
+        InputError: If an argument holds NaN, if no degree has this number of
+            coefficients, or if the matrix is not orthonormal.
     """
     coefficients = as_tensor("coefficients", coefficients)
     rotation = as_tensor("rotation", rotation)
@@ -524,9 +633,10 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
         shape = tuple(coefficients.shape)
         raise InputError(f"coefficients has shape {shape}: give ((degree + 1)², channels)")
     if not _is_orthonormal(rotation):
-        raise InputError("rotation is no rotation: give an orthonormal matrix (3, 3)")
+        raise InputError("rotation is not orthonormal: give an orthonormal matrix (3, 3)")
 
     def rotated_radiance(directions: Tensor) -> Tensor:
+        # Row vectors times R are the vectors Rᵀ ω.
         turned_back = directions @ rotation.to(directions)
         return basis(turned_back, degree) @ coefficients.to(directions)
 
@@ -534,7 +644,7 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
 
 
 def _is_orthonormal(matrix: Tensor) -> bool:
-    """Return whether a matrix is (3, 3) and its product with its transpose is the identity."""
+    """Tell whether a matrix has the shape (3, 3), and R Rᵀ is the identity up to ORTHONORMAL."""
     if matrix.shape != (3, 3):
         return False
     identity = torch.eye(3).to(matrix)

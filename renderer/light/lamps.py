@@ -21,28 +21,31 @@ from renderer.settings import require_field_types
 from renderer.validation import as_array, as_tensor
 from renderer.vectors import tangent_axes
 
-# Neighboring samples cast rays to different points of a disc: to one of SETS
-# sets, of RAYS points each.
+# A surface point casts rays to RAYS points of a disc lamp. There are SETS different
+# sets of such points. Neighboring surface points use different sets, which makes the
+# edges of soft shadows smoother.
 SETS, RAYS = 4, 8
 
 
 @dataclass(frozen=True)
 class Lamps(LocalBasis):
-    """Lamps at fixed positions, of which each has one coefficient.
+    """Lamps with given positions and one RGB coefficient per lamp.
 
-    The coefficient of a lamp is its irradiance at normal incidence at distance
-    1. The irradiance falls with the squared distance.
+    The coefficient of a lamp is the irradiance of a surface at distance 1 that
+    faces the lamp. The irradiance falls with the squared distance.
 
     Attributes:
-        positions: Position (x, y, z) of each lamp, none at the origin.
-        power: The largest coefficient. The smallest is 0.
-        radius: Radius of discs that face the origin. They emit to the front as
-            diffuse surfaces do, with the cosine of the angle off their axis. Their
-            coefficient is that of a point that is as bright from afar. With 0, the
-            lamps are points, which shine all around.
+        positions: Position (x, y, z) of each lamp in world axes. No lamp may be
+            at the origin.
+        power: Largest coefficient. The smallest coefficient is 0.
+        radius: Radius of the lamps in world units. With 0, the lamps are points
+            that emit in all directions. Otherwise, the lamps are discs that face
+            the origin and emit like diffuse surfaces, with the cosine of the
+            angle to their axis. A distant disc is as bright as a point with the
+            same coefficient.
 
     Raises:
-        InputError: If there is no position, or one at the origin.
+        InputError: If there is no position, or if a lamp is at the origin.
 
     Example:
         >>> import norm_balls as nb
@@ -62,7 +65,8 @@ class Lamps(LocalBasis):
         positions = as_array("positions", self.positions)
         if positions.shape[1:] != (3,) or not all(map(any, positions)):
             raise InputError(
-                f"lamps.positions={self.positions}: give [x, y, z] of lamps, none at the origin"
+                f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
+                "each lamp, and no lamp at the origin"
             )
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_field_types(self, "positions")
@@ -82,13 +86,17 @@ class Lamps(LocalBasis):
         except InputError:
             raise
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            remedy = "give positions [x, y, z], and a number or [r, g, b]s as start"
-            raise InputError(f"lamps: {remedy} ({error})") from error
+            raise InputError(
+                f"positions or start of lamps cannot be read ({error}): give positions [x, y, z], "
+                "and as start a number or a list with [r, g, b] for each lamp"
+            ) from error
         lamps = cls(positions, settings.power, settings.radius)
-        # NaN is not in the range, either.
+        # The comparison is also False for NaN.
         if not ((start >= 0) & (start <= settings.power)).all():
             limit = f"power={settings.power:g}"
-            raise InputError(f"start={settings.start}: give powers from 0 to {limit}")
+            raise InputError(
+                f"start={settings.start} is out of range: give coefficients from 0 to {limit}"
+            )
         return lamps, lamps.project_nonnegative(start)
 
     def __str__(self) -> str:
@@ -108,16 +116,23 @@ class Lamps(LocalBasis):
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
         positions = points.new_tensor(self.positions) if positions is None else positions
-        # Shape (sets, L, rays, 3). A point has one set of one ray.
+        # Points on the L lamps, shape (SETS, L, RAYS, 3). A lamp without extent has
+        # the shape (1, L, 1, 3).
         sources = self._disc_points(positions) if self.radius else positions[None, :, None]
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
+        # First find the paths that arrive at the front of a surface, without a graph.
         with torch.no_grad():
-            toward = sources[set_of_point] - points[:, None, None]
-            received = self._irradiance(toward, normals[:, None, None], positions[:, None])
-            point, lamp, ray = torch.nonzero(received > 0, as_tuple=True)
+            # Shape (S, L, RAYS, 3).
+            to_lamp = sources[set_of_point] - points[:, None, None]
+            irradiance = self._irradiance(to_lamp, normals[:, None, None], positions[:, None])
+            point, lamp, ray = torch.nonzero(irradiance > 0, as_tuple=True)
+        # Then compute the irradiance of these E paths again, with a graph.
         source = sources[set_of_point[point], lamp, ray]
-        received = self._irradiance(source - points[point], normals[point], positions[lamp])
-        return LightPaths(point, lamp, source, received / sources.shape[2])
+        irradiance = self._irradiance(source - points[point], normals[point], positions[lamp])
+        rays_per_lamp = sources.shape[2]
+        return LightPaths(
+            point=point, function=lamp, source=source, irradiance=irradiance / rays_per_lamp
+        )
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
         intensities = math.pi * albedo_scale * coefficients
@@ -128,52 +143,90 @@ class Lamps(LocalBasis):
         ]
 
     def _disc_points(self, positions: Tensor) -> Tensor:
-        """Return points (SETS, L, RAYS, 3) that divide each disc at positions (L, 3) equally.
+        """Choose points on disc lamps, to which rays are cast.
 
-        They lie on Vogel's spiral (1979), which is turned in each set.
+        The points of a set divide a disc into equal areas. They lie on Vogel's
+        spiral (1979), which is turned in each set.
+
+        Args:
+            positions: Centers of the L discs in world axes, shape (L, 3).
+
+        Returns:
+            Points in world axes, shape (SETS, L, RAYS, 3).
         """
-        number, ray = torch.meshgrid(torch.arange(SETS), torch.arange(RAYS), indexing="ij")
-        distance = self.radius * ((ray + (number + 0.5) / SETS) / RAYS).sqrt()
-        angle = ray * math.pi * (3 - math.sqrt(5)) + number * 2 * math.pi / SETS
-        across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
+        # Index of the set and index of the point in the set, shape (SETS, RAYS).
+        set_index, ray = torch.meshgrid(torch.arange(SETS), torch.arange(RAYS), indexing="ij")
+        distance = self.radius * ((ray + (set_index + 0.5) / SETS) / RAYS).sqrt()
+        # π (3 - √5) is the golden angle.
+        angle = ray * math.pi * (3 - math.sqrt(5)) + set_index * 2 * math.pi / SETS
+        # Positions in the plane of a disc, shape (SETS, RAYS, 2).
+        in_plane = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2)
+        in_plane = in_plane.to(positions)
+        # Unit vector from the origin to each disc, which is the axis of the disc.
         x, y, z = F.normalize(positions, dim=1).unbind(1)
-        # The axes jump where a disc faces 30° off straight down.
+        # With the sign -1, `tangent_axes` is not singular for discs below the origin.
         sign = torch.where(z < -0.5, -1.0, 1.0).to(z)
-        axes = [torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)]
-        offsets = torch.einsum("sra,laj->slrj", across, torch.stack(axes, dim=1))
+        plane_axes = [torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)]
+        # The indices are set s, ray r, plane axis a, lamp l and coordinate j.
+        offsets = torch.einsum("sra,laj->slrj", in_plane, torch.stack(plane_axes, dim=1))
         return positions[:, None] + offsets
 
-    def _irradiance(self, toward: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
-        """Return the irradiance (...) of surfaces from lamps with a coefficient of 1.
+    def _irradiance(self, to_lamp: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
+        """Compute the irradiance of surface points from lamps with a coefficient of 1.
 
-        The arguments are the vectors from surface to lamp, the unit normals of
-        the surface and the positions of the lamps, (..., 3) each. The result is
-        not above 0 behind a surface or a disc.
+        Args:
+            to_lamp: Vectors from the surface points to points on the lamps,
+                shape (..., 3).
+            normals: Unit normals of the surface, shape (..., 3).
+            positions: Centers of the lamps, shape (..., 3).
+
+        Returns:
+            Irradiance, shape (...). It is 0 or negative if a surface faces away
+            from the lamp, or if the point is behind a disc.
         """
-        squared = toward.square().sum(-1)
-        received = (toward * normals).sum(-1) / squared**1.5
+        squared_distance = to_lamp.square().sum(-1)
+        irradiance = (to_lamp * normals).sum(-1) / squared_distance**1.5
         if not self.radius:
-            return received
-        cosine = (toward * F.normalize(positions, dim=-1)).sum(-1) / squared.sqrt()
-        return received * cosine.clamp(min=0)
+            return irradiance
+        # A disc faces the origin, so its emission has the cosine between the vector
+        # to the lamp and the position of the lamp.
+        disc_axis = F.normalize(positions, dim=-1)
+        cosine_at_disc = (to_lamp * disc_axis).sum(-1) / squared_distance.sqrt()
+        return irradiance * cosine_at_disc.clamp(min=0)
 
     def _mitsuba_point(
         self, position: tuple[float, float, float], intensity: list[float]
     ) -> dict[str, Any]:
-        """Describe a lamp without extent for Mitsuba."""
+        """Create the Mitsuba entry of a point lamp.
+
+        Args:
+            position: Position in world axes.
+            intensity: Radiant intensity in red, green and blue.
+
+        Returns:
+            Entry of a Mitsuba scene.
+        """
         color = {"type": "rgb", "value": intensity}
         return {"type": "point", "position": list(position), "intensity": color}
 
     def _mitsuba_disc(
         self, position: tuple[float, float, float], intensity: list[float]
     ) -> dict[str, Any]:
-        """Describe a disc for Mitsuba, whose disks have radius 1 and shine along +z.
+        """Create the Mitsuba entry of a disc lamp.
 
-        The radiance is that of a far point's intensity on the disc's area.
+        Args:
+            position: Center of the disc in world axes.
+            intensity: Radiant intensity of the disc, seen from the front and from
+                afar, in red, green and blue.
+
+        Returns:
+            Entry of a Mitsuba scene.
         """
         x, y, z = position
         polar = math.degrees(math.atan2(math.hypot(x, y), z))
         azimuth = math.degrees(math.atan2(y, x))
+        # A Mitsuba disk has radius 1 and emits along its +z axis. A camera at the
+        # center of the disc that looks at the origin has the pose of the disc.
         camera = PerspectiveCamera(polar, azimuth, 1.0, distance=math.hypot(x, y, z))
         area = math.pi * self.radius**2
         radiance = {"type": "rgb", "value": [channel / area for channel in intensity]}

@@ -1,28 +1,30 @@
-"""Projections of lights onto those that something could emit.
+"""Projections of environment light onto lights without negative radiance.
 
-A physical light has non-negative radiance in every direction ω. With the
-harmonics Y(ω) of that direction, shape (K,), and the coefficients x of one
-channel, the constraint is Y(ω) · x ≥ 0. Both public functions solve quadratic
-programs with this constraint for every direction.
+In this module, a light is an array of K SH coefficients of one color channel. A
+physical light has non-negative radiance in every direction ω. With the harmonics
+Y(ω) of this direction, shape (K,), and the coefficients x, the constraint is
+Y(ω) · x ≥ 0. Both public functions solve quadratic programs with this constraint
+for every direction. A dip of a light is a local minimum of its radiance with a
+negative value.
 
-`project_nonnegative` keeps the mean, x₀ = v₀, of the given light v. It minimizes
-the error of the irradiance, Σ A_l² (x − v)², with the factors A_l of
-`lambertian_factors`. Bands that do not reach a diffuse surface have a small
-weight instead of A_l = 0 (see `window.irradiance_weights`), so the nearest of
-the lights with the same irradiance is chosen. The program is solved for the
-directions of a grid and of the dips (local minima of negative radiance) that
-are found. Dips that are left after a few solutions are filled by mixing in the
-light times `nonnegative_window`, which is physical if the given light is the
-projection of a physical one. Without a fixed mean, the nearest coefficients
-would brighten the whole sky to fill the dips beside a bright source.
+`project_nonnegative` keeps the mean of the given light v, so x₀ = v₀. It
+minimizes the error of the irradiance, Σ A_l² (x − v)², with the factors A_l of
+`lambertian_factors`. Coefficients with A_l = 0 get a small weight instead (see
+`window.irradiance_weights`), so of all lights with the same irradiance, the
+nearest one is chosen. The program is solved for the directions of a grid and of
+the dips that are found. If dips are left after a few solutions, the light times
+`nonnegative_window` is mixed in to fill them. This windowed light is
+non-negative if the given light is a physical light that was cut off at a degree.
+Without a fixed mean, the nearest coefficients would brighten the whole sky to
+fill the dips beside a bright source.
 
-`nearest_nonnegative` is the projection of an attack's step. Of coefficients v
-(K,), it solves
+`nearest_nonnegative` is used after each step of an attack. For coefficients v,
+it solves
 
     min |x − v|² / 2   such that   R x ≥ 0,
 
-optionally with low ≤ x ≤ high (a ball in the maximum norm). The rows of R are
-the harmonics of finitely many directions. With multipliers μ ≥ 0, the
+optionally with low ≤ x ≤ high (a ball in the maximum norm). Each row of R holds
+the harmonics of one of finitely many directions. With multipliers μ ≥ 0, the
 Karush-Kuhn-Tucker conditions are
 
     x = v + Rᵀ μ,    R x ≥ 0,    μ · R x = 0.
@@ -36,12 +38,10 @@ projection, without the ball, of c + t (v − c) with t = 1 / (1 + λ). As long 
 the rows with positive multipliers stay the same, x is affine in t. Newton steps
 on t therefore find |x − c| = r.
 
-Both use the exchange method (Hettich and Kortanek 1993, "Semi-infinite
-programming", section 7). It adds the directions at the bottoms of the dips of
-the current solution until the solution has no dips. Dips are found on a grid
-and refined by Newton's method on the sphere.
-
-In this module, "light" means one channel of a light: an array of K coefficients.
+Both functions use the exchange method (Hettich and Kortanek 1993, "Semi-infinite
+programming", section 7). The method adds the directions at the bottoms of the
+dips of the current solution, and solves again, until the solution has no dips.
+Dips are found on a grid and refined by Newton's method on the sphere.
 """
 
 import math
@@ -64,70 +64,79 @@ from renderer.vectors import tangent_axes
 
 Array = NDArray[Any]
 
-# Results may be below zero by this fraction of the light's largest radiance.
+# The radiance of results is at least minus this fraction of their largest radiance.
 TOLERANCE = 1e-4
 
-# Both functions search for dips of this depth. It is smaller than TOLERANCE,
-# because a flat valley may be deeper between two dips that were found.
+# Smallest depth of a dip that `_find_dips` reports, as a fraction of the largest
+# radiance. It is smaller than TOLERANCE, because a flat valley may be deeper between
+# two dips than at the dips.
 _MIN_DIP_DEPTH = TOLERANCE / 10
-# Radiance counts as zero below this fraction of the norm of the light: there,
-# a dip is the rounding error of the input.
+# A channel counts as dark if its radiance is nowhere above this fraction of the norm
+# of its coefficients. The dips of a dark channel are only rounding errors.
 _DARK_FRACTION = 1e-6
-# Exchange steps of both functions. Seven are usual.
+# Largest number of rounds of the exchange method in both public functions. Seven are
+# usual.
 _MAX_ROUNDS = 50
-# `project_nonnegative` solves its program this many times before it fills dips.
+# `project_nonnegative` solves its program at most this many times. Dips that are left
+# are filled by mixing in a windowed light.
 _MAX_SOLUTIONS = 4
-# Relative error of the distance |x - c| from the radius of a ball.
+# A solution x counts as lying on the sphere |x - c| = r if |x - c| differs from r by
+# at most this fraction of r.
 _RADIUS_TOLERANCE = 1e-7
-# Newton steps on t. Two are usual.
+# Largest number of Newton steps on t in `_Program.add`. Two are usual.
 _MAX_RADIUS_STEPS = 10
-# The smallest denominator, which avoids a division by zero.
+# Smallest denominator of divisions in this module. It avoids a division by 0.
 _TINY = 1e-300
-# The grid of directions is an icosphere. Its nodes are 0.07 radians apart with the
-# coarse number of subdivisions, which is used for lights up to the degree
-# _COARSE_GRID_DEGREE. The nodes of the fine grid are half as far apart.
+# Dips are sought on the vertices of an icosphere. Lights up to the degree
+# _COARSE_GRID_DEGREE use _COARSE_SUBDIVISIONS, with which neighboring vertices are
+# 0.07 radians apart. Other lights use _FINE_SUBDIVISIONS, with half this distance.
 _COARSE_SUBDIVISIONS = 4
 _FINE_SUBDIVISIONS = 5
 _COARSE_GRID_DEGREE = 10
-# The longest Newton step on the sphere, in radians.
+# Longest Newton step in `_step_down`, in radians.
 _MAX_ANGLE = 0.1
-# Newton steps on the sphere from a node of the grid to the bottom of a dip.
+# Number of Newton steps from a vertex of the grid to the bottom of a dip.
 _BOTTOM_STEPS = 2
 
 
 @dataclass(frozen=True)
 class _NodeLimits:
-    """Limits for the nodes of the grid from which a dip is sought.
+    """Conditions under which the search for a dip starts from a node of the grid.
 
-    Both are fractions of the light's largest radiance. A node is a candidate if
-    its radiance is below `above_zero` and exceeds that of no neighbor by more
-    than `above_neighbors`.
+    The limits are fractions of the largest radiance of the light.
+
+    Attributes:
+        above_zero: The radiance at the node is below this limit.
+        above_neighbors: The radiance at the node is above the radiance at each
+            neighbor by at most this limit.
     """
 
     above_zero: float
     above_neighbors: float
 
 
+# Conditions of `nearest_nonnegative`, under which few dips are missed.
 _ALL_CANDIDATES = _NodeLimits(above_zero=0.04, above_neighbors=1e-3)
-# Limits under which a candidate must be lower than all its neighbors. They are
-# faster. Dips that they miss are found by the next exchange step.
+# Conditions of `project_nonnegative`, under which the search only starts from nodes
+# that are lower than all neighbors. The search is faster, and the next round of the
+# exchange method finds the missed dips.
 _LOWEST_NODES = _NodeLimits(above_zero=0.04, above_neighbors=0.0)
 
 
 def project_nonnegative(lights: Tensor) -> Tensor:
-    """Project lights onto the non-negative lights with the same mean radiance.
+    """Replace lights by the non-negative lights with the same mean and the closest irradiance.
 
-    The result has the irradiance closest to that of the given light. The
-    channels of a light are projected separately, in float64, without a graph.
+    The channels of a light are projected separately, in float64. The result has
+    no gradient.
 
     Args:
-        lights: Coefficients, shape (..., (degree + 1)², C).
+        lights: SH coefficients, shape (..., (degree + 1)², C) with C channels.
 
     Returns:
-        Coefficients of the same shape and dtype. The radiance of a channel is
+        SH coefficients in the same shape and dtype. The radiance of a channel is
         at least -`TOLERANCE` times its largest radiance. The first coefficient
-        is unchanged, or zero if it was negative. A channel whose radiance is
-        non-negative everywhere keeps its bits.
+        is unchanged, or 0 if it was negative. A channel without negative
+        radiance keeps its bits.
 
     Example:
         >>> import norm_balls as nb
@@ -135,17 +144,27 @@ def project_nonnegative(lights: Tensor) -> Tensor:
         >>> physical.shape
         torch.Size([49, 3])
     """
-    channels, channel_of_light = np.unique(_by_channel(lights)[:, 0], axis=0, return_inverse=True)
-    owners, _ = _find_dips(channels, _dark_radiance(channels), _LOWEST_NODES)
-    physical = lights.detach().mT.flatten(0, -2).clone()
-    for channel in np.unique(owners):
-        projected = torch.from_numpy(_project_with_mean(channels[channel])).to(physical)
-        physical[torch.from_numpy(channel_of_light.reshape(-1) == channel)] = projected
-    return physical.view(lights.mT.shape).mT
+    # Equal channels, such as those of a gray light, are projected once.
+    channels, row_to_channel = np.unique(_by_channel(lights)[:, 0], axis=0, return_inverse=True)
+    dip_to_channel, _ = _find_dips(channels, _dark_radiance(channels), _LOWEST_NODES)
+    # One row of K coefficients for each channel of each light.
+    rows = lights.detach().mT.flatten(0, -2).clone()
+    for channel in np.unique(dip_to_channel):
+        projected = torch.from_numpy(_project_with_mean(channels[channel])).to(rows)
+        has_channel = torch.from_numpy(row_to_channel.reshape(-1) == channel)
+        rows[has_channel] = projected
+    return rows.view(lights.mT.shape).mT
 
 
 def _project_with_mean(light: Array) -> Array:
-    """Return the non-negative light (K,) with the mean of a light and the closest irradiance."""
+    """Find the non-negative light with the same mean as a light and the closest irradiance.
+
+    Args:
+        light: SH coefficients of one channel, shape (K,).
+
+    Returns:
+        SH coefficients, shape (K,).
+    """
     mean = light[0]
     dark = _dark_radiance(light[None])
     uniform = np.concatenate([[max(mean, 0.0)], 0 * light[1:]])
@@ -154,52 +173,64 @@ def _project_with_mean(light: Array) -> Array:
     degree = math.isqrt(len(light)) - 1
     weights = irradiance_weights(degree).numpy()
     window = nonnegative_window(degree).numpy()
-    rows = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
+    # Harmonics of the directions in which the radiance is constrained.
+    direction_rows = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
     nearest = light
     for number in range(_MAX_ROUNDS):
-        _, bottoms = _find_dips(nearest[None], dark, _LOWEST_NODES)
-        if not len(bottoms):
+        _, dip_rows = _find_dips(nearest[None], dark, _LOWEST_NODES)
+        if not len(dip_rows):
             break
         if number < _MAX_SOLUTIONS:
-            rows = np.concatenate([rows, bottoms])
-            change = shortest(rows[:, 1:] / weights[1:], -rows @ light)
-            nearest = np.concatenate([[mean], light[1:] + change / weights[1:]])
+            direction_rows = np.concatenate([direction_rows, dip_rows])
+            # The length of the weighted change is the error of the irradiance.
+            weighted_change = shortest(direction_rows[:, 1:] / weights[1:], -direction_rows @ light)
+            nearest = np.concatenate([[mean], light[1:] + weighted_change / weights[1:]])
         else:
-            # The windowed light is made non-negative with uniform light, and
-            # then fills the dips of the last solution.
-            windowed = _mix_to_nonnegative(window * light, uniform, rows)
-            windowed = _mix_to_nonnegative(windowed, uniform, bottoms)
-            nearest = _mix_to_nonnegative(nearest, windowed, bottoms)
+            # Uniform light fills the dips of the windowed light. The windowed light
+            # fills the dips of the last solution.
+            windowed = _mix_to_nonnegative(window * light, uniform, direction_rows)
+            windowed = _mix_to_nonnegative(windowed, uniform, dip_rows)
+            nearest = _mix_to_nonnegative(nearest, windowed, dip_rows)
     return nearest
 
 
-def _mix_to_nonnegative(light: Array, brighter: Array, rows: Array) -> Array:
-    """Mix a light (K,) with a brighter one, so that it is non-negative in R directions.
+def _mix_to_nonnegative(light: Array, filler: Array, direction_rows: Array) -> Array:
+    """Mix as little of a second light into a light as makes it non-negative in D directions.
 
-    The result is light + s (brighter - light) with the smallest possible s ≥ 0.
-    The rows (R, K) are the harmonics of the directions.
+    The result is light + s (filler - light) with the smallest possible s ≥ 0.
+
+    Args:
+        light: SH coefficients of the light, shape (K,).
+        filler: SH coefficients of the second light, which is brighter in the
+            directions in which the light is negative, shape (K,).
+        direction_rows: Harmonics of the directions, shape (D, K).
+
+    Returns:
+        SH coefficients of the mixture, shape (K,).
     """
-    radiance = rows @ light
-    added = rows @ (brighter - light)
+    radiance = direction_rows @ light
+    difference = direction_rows @ (filler - light)
     is_negative = radiance < 0
-    share = (-radiance[is_negative] / added[is_negative]).max(initial=0)
-    return light + (brighter - light) * share
+    share = (-radiance[is_negative] / difference[is_negative]).max(initial=0)
+    return light + (filler - light) * share
 
 
 def nearest_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
-    """Project lights onto the non-negative lights with the nearest coefficients.
+    """Replace lights by the non-negative lights with the nearest coefficients.
 
-    Distances are Euclidean. The mean radiance changes, and often rises if a
-    light has deep dips. The computation is in float64, without a graph.
+    The distance between two lights is the Euclidean distance of their
+    coefficients. The mean radiance changes, and often rises if a light has deep
+    dips. The computation uses float64. The result has no gradient.
 
     Args:
-        lights: Coefficients, shape (..., (degree + 1)², C).
-        within: Ball in which the result lies, for lights (A, (degree + 1)², C).
-            Its centers must be non-negative lights. The norm "l2" is taken over
-            all channels of a light together. None for no ball.
+        lights: SH coefficients, shape (..., (degree + 1)², C) with C channels.
+        within: Ball in which the result must lie. The lights then have the shape
+            (A, (degree + 1)², C). The centers must be non-negative lights. The
+            norm "l2" is taken over all channels of a light together. None for no
+            ball.
 
     Returns:
-        Coefficients of the same shape and dtype. The radiance of a channel is
+        SH coefficients in the same shape and dtype. The radiance of a channel is
         at least -`TOLERANCE` times its largest radiance. A channel that
         satisfies the constraints keeps its bits.
     """
@@ -208,14 +239,15 @@ def nearest_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
     for _ in range(_MAX_ROUNDS):
         nearest = np.concatenate([program.nearest for program in unsolved])
         original = np.concatenate([program.original for program in unsolved])
-        owners, rows = _find_dips(nearest, _dark_radiance(original), _ALL_CANDIDATES)
-        channel_count = len(nearest) // len(unsolved)
-        indices = np.unique(owners // channel_count)
-        for index in indices:
-            first = index * channel_count
-            channels = range(first, first + channel_count)
-            unsolved[index].add([rows[owners == channel] for channel in channels])
-        unsolved = [unsolved[index] for index in indices]
+        dip_to_channel, dip_rows = _find_dips(nearest, _dark_radiance(original), _ALL_CANDIDATES)
+        # All programs have the same number of channels.
+        channels_per_program = len(nearest) // len(unsolved)
+        with_dips = np.unique(dip_to_channel // channels_per_program)
+        for index in with_dips:
+            first_channel = index * channels_per_program
+            channels = range(first_channel, first_channel + channels_per_program)
+            unsolved[index].add([dip_rows[dip_to_channel == channel] for channel in channels])
+        unsolved = [unsolved[index] for index in with_dips]
         if not unsolved:
             break
     nearest = np.concatenate([program.nearest for program in programs])
@@ -223,13 +255,23 @@ def nearest_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
 
 
 def _programs(lights: Tensor, within: Ball | None) -> "list[_Program]":
-    """Return one program per light if the ball has the norm "l2", or else one per channel."""
+    """Create the quadratic programs whose solutions are the nearest non-negative lights.
+
+    Args:
+        lights: SH coefficients, shape (..., K, C), or (A, K, C) with a ball.
+        within: Ball in which the results must lie, or None.
+
+    Returns:
+        One program per light for a ball of the norm "l2", which couples the C
+        channels of a light. Otherwise, one program per channel.
+    """
     original = _by_channel(lights)
     if within is None:
-        return [_Program(light) for light in original]
+        return [_Program(channel) for channel in original]
     if within.norm == "linf":
         low, high = map(_by_channel, within.ends)
         return [_Program(*arguments) for arguments in zip(original, low, high, strict=True)]
+    # (A, K, C) becomes (A, C, K).
     shape = (len(lights), lights.shape[2], lights.shape[1])
     centers = _by_channel(within.center).reshape(shape)
     pairs = zip(original.reshape(shape), centers, strict=True)
@@ -237,25 +279,48 @@ def _programs(lights: Tensor, within: Ball | None) -> "list[_Program]":
 
 
 def _dark_radiance(channels: Array) -> Array:
-    """Return the largest radiance (R,) that counts as zero, for channels (R, K)."""
+    """Compute the largest radiance that counts as zero, because of rounding errors.
+
+    Args:
+        channels: SH coefficients of R channels, shape (R, K).
+
+    Returns:
+        Radiance for each channel, shape (R,).
+    """
     return _DARK_FRACTION * np.linalg.norm(channels, axis=1)
 
 
 def _by_channel(lights: Tensor) -> Array:
-    """Return the channels of lights (..., K, C) as an array (channels, 1, K) of float64."""
+    """Convert lights to an array with one row for each channel of each light.
+
+    Args:
+        lights: SH coefficients, shape (..., K, C).
+
+    Returns:
+        SH coefficients of the R channels of all lights, float64, shape (R, 1, K).
+        The axis of length 1 is the number of channels in a `_Program`.
+    """
     return lights.detach().mT.flatten(0, -2)[:, None].cpu().double().numpy()
 
 
 class _Program:
-    """The nearest non-negative light of C channels, for a growing set of directions.
+    """Quadratic program for the non-negative light that is nearest to a light of C channels.
 
-    It has either bounds or a ball in the L2 norm. In the notation of the
-    module's docstring, v is `original`, c is `_center`, r is `_radius` and
+    The radiance is only constrained in directions that were added. The light also
+    has either bounds for each coefficient, or lies in an L2 ball. In the notation
+    of the module docstring, v is `original`, c is `_center`, r is `_radius` and
     v - c is `_offset`.
 
     Attributes:
-        original: The given light, shape (C, K).
-        nearest: The solution for the directions that were added, shape (C, K).
+        original: SH coefficients of the given light, shape (C, K).
+        nearest: SH coefficients of the solution, shape (C, K).
+
+    Args:
+        original: SH coefficients of the given light, shape (C, K).
+        low: Lower bounds of the coefficients, shape (C, K) or a number.
+        high: Upper bounds of the coefficients, shape (C, K) or a number.
+        center: Center of the ball, shape (C, K) or a number.
+        radius: Radius of the ball. Infinity for no ball.
     """
 
     def __init__(
@@ -272,31 +337,38 @@ class _Program:
         self._offset = original - center
         self._low = np.broadcast_to(low, original.shape)
         self._high = np.broadcast_to(high, original.shape)
-        # The t that brings the light without constraints onto the sphere.
-        # Constraints only shorten the distance, so no smaller t is needed.
+        # With this t, c + t (v - c) lies on the sphere |x - c| = r. The constraints
+        # only shorten the distance from c, so t never needs to be smaller.
         distance = float(np.linalg.norm(self._offset))
         self._min_t = min(radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
         self.nearest = self._target().clip(low, high)
-        # A channel has the harmonics (M, K) of the M directions whose multipliers
-        # are positive.
+        # For each channel, the harmonics of the M active directions, shape (M, K).
+        # A direction is active if its multiplier μ is positive. At first, there are
+        # no directions.
         self._active_rows = [original[:0]] * len(original)
 
     def _target(self) -> Array:
-        """Return c + t (v - c), shape (C, K)."""
+        """Compute c + t (v - c) for the current t, shape (C, K)."""
         return self.original if self._t == 1 else self._center + self._t * self._offset
 
-    def add(self, rows: Sequence[Array]) -> None:
-        """Add directions, given by their harmonics (M, K) for each channel, and solve again.
+    def add(self, new_rows: Sequence[Array]) -> None:
+        """Constrain the radiance in additional directions, and solve the program again.
 
-        Directions whose multiplier is zero are dropped. The loop takes Newton
-        steps on t until the solution x is on the sphere |x − c| = r, or inside
-        of it with t = 1.
+        Directions that are not active, because their multiplier is zero, are
+        dropped. The loop takes Newton steps on t. It ends if the solution x lies
+        on the sphere |x − c| = r, or inside of the sphere with t = 1.
+
+        Args:
+            new_rows: For each of the C channels, the harmonics of M new
+                directions, shape (M, K).
         """
-        rows = [np.concatenate(pair) for pair in zip(self._active_rows, rows, strict=True)]
+        rows_by_channel = [
+            np.concatenate(pair) for pair in zip(self._active_rows, new_rows, strict=True)
+        ]
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._target()
-            nearest, self._active_rows = self._project(target, rows)
+            nearest, self._active_rows = self._project(target, rows_by_channel)
             displacement = nearest - self._center
             distance = float(np.linalg.norm(displacement))
             missing = self._radius - distance
@@ -306,96 +378,146 @@ class _Program:
                 break
             # The constraints moved each channel by Rᵀ μ.
             moved_by_constraints = nearest - target
+            # Derivatives of the solution by t, for each channel.
             motions = list(map(_motion, self._offset, moved_by_constraints, self._active_rows))
-            direction = np.stack([motion.light for motion in motions])
+            velocity = np.stack([motion.light for motion in motions])
+            # r² - |x - c|².
             missing_squared = missing * (self._radius + distance)
-            step = self._step_to_sphere(direction, displacement, missing_squared)
+            step = self._step_to_sphere(velocity, displacement, missing_squared)
             self._t += step
             if all(motion.keeps_rows(step) for motion in motions):
-                # The solution is affine in t up to here, so the step is exact.
-                displacement = displacement + step * direction
+                # The same directions stay active, so the solution is affine in t, and
+                # the step is exact.
+                displacement = displacement + step * velocity
                 break
+        # Rounding may leave the solution slightly outside of the ball.
         scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
         self.nearest = self._center + displacement * scale
 
-    def _project(self, target: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the projections (C, K) of all channels, and the active rows of each channel."""
-        solved = map(_least_distance, target, rows, self._low, self._high)
-        nearest, active_rows = zip(*solved, strict=True)
+    def _project(
+        self, target: Array, rows_by_channel: Sequence[Array]
+    ) -> tuple[Array, list[Array]]:
+        """Project each channel onto the lights that fulfill the constraints, without the ball.
+
+        Args:
+            target: Light to project, shape (C, K).
+            rows_by_channel: For each channel, the harmonics of the M constrained
+                directions, shape (M, K).
+
+        Returns:
+            The projections, shape (C, K), and for each channel, the rows with
+            positive multipliers.
+        """
+        solutions = map(_least_distance, target, rows_by_channel, self._low, self._high)
+        nearest, active_rows = zip(*solutions, strict=True)
         return np.stack(nearest), list(active_rows)
 
     def _step_to_sphere(
-        self, direction: Array, displacement: Array, missing_squared: float
+        self, velocity: Array, displacement: Array, missing_squared: float
     ) -> float:
-        """Return the step on t after which |displacement + step direction| is the radius.
+        """Find the step on t that brings the solution onto the sphere |x - c| = r.
 
-        This is the root of a quadratic equation. `missing_squared` is the squared
-        radius minus the squared displacement. The step keeps t between its
-        minimum and 1.
+        The step s solves the quadratic equation |displacement + s velocity| = r.
+        It is clipped so that t stays between its minimum and 1.
+
+        Args:
+            velocity: Derivative of the solution x by t, shape (C, K).
+            displacement: Current x - c, shape (C, K).
+            missing_squared: r² - |x - c|².
+
+        Returns:
+            The step s.
         """
-        speed = float((direction * direction).sum())
-        slope = float((direction * displacement).sum())
-        root = math.sqrt(max(slope**2 + speed * missing_squared, 0))
-        step = (root - slope) / max(speed, _TINY)
+        squared_speed = float((velocity * velocity).sum())
+        slope = float((velocity * displacement).sum())
+        root = math.sqrt(max(slope**2 + squared_speed * missing_squared, 0))
+        step = (root - slope) / max(squared_speed, _TINY)
         return min(max(step, self._min_t - self._t), 1 - self._t)
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """Derivatives of a channel of the solution by t while the same rows stay active.
+    """Derivatives by t of one channel of a solution, while the same M directions stay active.
 
-    `light` (K,) is the derivative of the solution by t, `multipliers` (M,) are
-    those of the active rows, and `changes` (M,) are their derivatives by t.
+    Attributes:
+        light: Derivative of the solution by t, shape (K,).
+        multipliers: Multiplier μ of each active direction, shape (M,).
+        multiplier_changes: Derivatives of the multipliers by t, shape (M,).
     """
 
     light: Array
     multipliers: Array
-    changes: Array
+    multiplier_changes: Array
 
     def keeps_rows(self, step: float) -> bool:
-        """Return whether all multipliers are non-negative after a step of t."""
-        return bool(np.all(self.multipliers + step * self.changes >= 0))
+        """Tell whether all active directions stay active if t changes by `step`."""
+        return bool(np.all(self.multipliers + step * self.multiplier_changes >= 0))
 
 
-def _motion(offset: Array, added: Array, rows: Array) -> _Motion:
-    """Return the motion of a channel with the offset v − c (K,) and the active rows (M, K).
+def _motion(offset: Array, moved_by_constraints: Array, active_rows: Array) -> _Motion:
+    """Compute the derivatives by t of one channel of a solution.
 
-    `added` (K,) is Rᵀ μ, from which the multipliers μ are recovered.
+    The solution is c + t (v − c) + Rᵀ μ with R x = 0 for the active directions.
+    The derivative of μ solves the least squares problem Rᵀ μ' ≈ −(v − c).
+
+    Args:
+        offset: v − c, shape (K,).
+        moved_by_constraints: Rᵀ μ, shape (K,). The multipliers μ are computed
+            from it.
+        active_rows: Matrix R, the harmonics of the M active directions,
+            shape (M, K).
+
+    Returns:
+        Derivatives by t, and multipliers.
     """
-    solution = np.linalg.lstsq(rows.T, np.stack([-offset, added], axis=1))[0]
-    changes, multipliers = solution.T
-    return _Motion(offset + rows.T @ changes, multipliers, changes)
+    right_sides = np.stack([-offset, moved_by_constraints], axis=1)
+    solution = np.linalg.lstsq(active_rows.T, right_sides)[0]
+    multiplier_changes, multipliers = solution.T
+    return _Motion(
+        light=offset + active_rows.T @ multiplier_changes,
+        multipliers=multipliers,
+        multiplier_changes=multiplier_changes,
+    )
 
 
 def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the x (K,) nearest to a light with rows · x ≥ 0 and low ≤ x ≤ high.
-
-    The second result holds the rows with positive multipliers.
+    """Find the light that is nearest to a light, with rows · x ≥ 0 and low ≤ x ≤ high.
 
     All constraints together are G d ≥ h for the difference d = x - original.
     Algorithm LDP of Lawson and Hanson finds the shortest d. It solves a problem of
     non-negative least squares: the u ≥ 0 that minimizes |E u − f|, with the rows
     of Gᵀ and then hᵀ in E, and f = (0, ..., 0, 1). With the residual
     r = E u − f of size K + 1, the result is d_j = −r_j / r_(K+1).
+
+    Args:
+        original: SH coefficients of the light, shape (K,).
+        rows: Harmonics of the M constrained directions, shape (M, K).
+        low: Lower bounds, shape (K,). Minus infinity for no bound.
+        high: Upper bounds, shape (K,).
+
+    Returns:
+        The nearest light x, shape (K,), and the rows with positive multipliers.
     """
     if not len(rows):
         return original, rows
     size = len(original)
+    # Dividing h by the norm of the light divides d by the norm, too.
     scale = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
-    # These are G and h. Dividing h by the norm of the light divides d by it, too.
+    # G and h.
     left_sides = np.concatenate([rows, axes, -axes])
     from_low = (low - original)[is_bounded]
     from_high = (original - high)[is_bounded]
     right_sides = np.concatenate([-rows @ original, from_low, from_high])
-    dual = np.concatenate([left_sides.T, right_sides[None] / scale])
+    # E and f.
+    dual_matrix = np.concatenate([left_sides.T, right_sides[None] / scale])
     last_unit_vector = np.eye(size + 1)[size]
-    multipliers, _ = nnls(dual, last_unit_vector)
-    residual = dual @ multipliers
+    multipliers, _ = nnls(dual_matrix, last_unit_vector)
+    residual = dual_matrix @ multipliers
     residual[size] -= 1
     if residual[size] > -(_MIN_DIP_DEPTH**2):
-        # The bounds leave no room beyond rounding.
+        # Up to rounding, only one point fulfills the constraints.
         return original.clip(low, high), rows
     nearest = original - residual[:size] / residual[size] * scale
     is_active = multipliers[: len(rows)] > 0
@@ -403,85 +525,127 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
 
 
 def _find_dips(lights: Array, dark: Array, limits: _NodeLimits) -> tuple[Array, Array]:
-    """Find the local minima of lights (R, K) at which radiance is negative.
+    """Find the local minima with negative radiance (dips) of R lights.
 
-    `dark` (R,) is the largest radiance that counts as zero. Returns, for each
-    of D dips, the index (D,) of the light, and the harmonics (D, K) of the
-    direction at the bottom.
+    Args:
+        lights: SH coefficients, shape (R, K).
+        dark: Largest radiance of each light that counts as zero, shape (R,). A
+            light without larger radiance has no dips.
+        limits: Conditions for nodes of the grid from which a search starts.
+
+    Returns:
+        A tuple of
+        - the index of the light of each of D dips, shape (D,);
+        - the harmonics of the direction at the bottom of each dip,
+          shape (D, K).
     """
     degree = math.isqrt(lights.shape[1]) - 1
     is_coarse = degree <= _COARSE_GRID_DEGREE
     grid = _grid(degree, _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS)
+    # Radiance of each light at each node of the grid, shape (R, N).
     radiance = lights @ grid.harmonics
     largest = np.abs(radiance).max(1)
-    below = np.where(largest > dark, limits.above_zero * largest, -np.inf)
-    owners, nodes = np.nonzero(radiance < below[:, None])
+    upper_limit = np.where(largest > dark, limits.above_zero * largest, -np.inf)
+    # Pairs of a light and a node from which a search may start.
+    light_index, node = np.nonzero(radiance < upper_limit[:, None])
     margin = limits.above_neighbors * largest
+    # Each row of `neighbors` has one neighbor of each node.
     for neighbors in grid.neighbors:
-        neighbor_radiance = radiance[owners, neighbors[nodes]]
-        is_lower = radiance[owners, nodes] <= neighbor_radiance + margin[owners]
-        owners = owners[is_lower]
-        nodes = nodes[is_lower]
-    expansions = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[owners]
-    bottoms = grid.directions[nodes]
+        neighbor_radiance = radiance[light_index, neighbors[node]]
+        is_lower = radiance[light_index, node] <= neighbor_radiance + margin[light_index]
+        light_index = light_index[is_lower]
+        node = node[is_lower]
+    # SH coefficients of 3 first and 9 second derivatives, shape (D, 12, K).
+    derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
+    bottoms = grid.directions[node]
     for _ in range(_BOTTOM_STEPS):
-        bottoms = _step_down(bottoms, expansions)
-    rows = _harmonics(bottoms, degree)
-    is_deep = (rows * lights[owners]).sum(1) < -_MIN_DIP_DEPTH * largest[owners]
-    return owners[is_deep], rows[is_deep]
+        bottoms = _step_down(bottoms, derivatives)
+    dip_rows = _harmonics(bottoms, degree)
+    bottom_radiance = (dip_rows * lights[light_index]).sum(1)
+    is_deep = bottom_radiance < -_MIN_DIP_DEPTH * largest[light_index]
+    return light_index[is_deep], dip_rows[is_deep]
 
 
-def _step_down(directions: Array, expansions: Array) -> Array:
-    """Take one Newton step from unit directions (D, 3) towards lower radiance on the sphere.
+def _step_down(directions: Array, derivatives: Array) -> Array:
+    """Take one Newton step on the sphere toward lower radiance, from D directions.
 
-    The step is taken along the principal axes of the radiance's curvature.
-    `expansions` (D, 3 + 9, K) are the coefficients of the first and second
-    derivatives of each direction's light by x, y and z.
+    Args:
+        directions: Unit vectors, shape (D, 3).
+        derivatives: SH coefficients of the derivatives of the light of each
+            direction: 3 first and 9 second derivatives by x, y and z,
+            shape (D, 12, K).
+
+    Returns:
+        Unit vectors after the step, shape (D, 3).
     """
-    degree = math.isqrt(expansions.shape[2]) - 1
-    derivatives = expansions @ _harmonics(directions, degree)[..., None]
-    gradient = derivatives[:, :3]
-    hessian = derivatives[:, 3:].reshape(-1, 3, 3)
+    degree = math.isqrt(derivatives.shape[2]) - 1
+    # Values of the derivatives at the directions, shape (D, 12, 1).
+    values = derivatives @ _harmonics(directions, degree)[..., None]
+    gradient = values[:, :3]
+    hessian = values[:, 3:].reshape(-1, 3, 3)
     x, y, z = directions.T
-    # Shape (D, 2, 3): two unit tangents of the sphere for each direction.
+    # Two unit tangents of the sphere for each direction, shape (D, 2, 3).
     tangents = np.array(tangent_axes(x, y, z, np.copysign(1, z))).transpose(2, 0, 1)
-    radial = directions[:, None] @ gradient
-    curvature, turn = np.linalg.eigh(tangents @ hessian @ tangents.mT - radial * np.eye(2))
-    axes = turn.mT @ tangents
-    slope = (axes @ gradient)[..., 0]
-    # A larger curvature shortens the step: no step is longer than _MAX_ANGLE.
-    limit = np.linalg.norm(slope, axis=1, keepdims=True) / _MAX_ANGLE
-    steepness = np.maximum(np.abs(curvature), limit)
-    step = (slope / np.maximum(steepness, _TINY))[:, None] @ axes
+    # On the sphere, the second derivatives also contain the radial derivative.
+    radial_derivative = directions[:, None] @ gradient
+    sphere_hessian = tangents @ hessian @ tangents.mT - radial_derivative * np.eye(2)
+    curvature, eigenvectors = np.linalg.eigh(sphere_hessian)
+    # Along these two axes, the second derivatives are the two curvatures.
+    principal_axes = eigenvectors.mT @ tangents
+    slope = (principal_axes @ gradient)[..., 0]
+    # A Newton step is the slope divided by the curvature. The absolute value makes
+    # it lead downward, and the second limit keeps it shorter than _MAX_ANGLE.
+    smallest_divisor = np.linalg.norm(slope, axis=1, keepdims=True) / _MAX_ANGLE
+    divisor = np.maximum(np.abs(curvature), smallest_divisor)
+    step = (slope / np.maximum(divisor, _TINY))[:, None] @ principal_axes
     moved = directions - step[:, 0]
     return moved / np.linalg.norm(moved, axis=1, keepdims=True)
 
 
 def _harmonics(directions: Array, degree: int) -> Array:
-    """Return the harmonics (D, K) of a few unit directions (D, 3), faster than `select_rows`.
+    """Evaluate all harmonics up to a degree, faster than `select_rows` for few directions.
 
-    On the unit sphere, they are polynomials that are homogeneous of the degree
-    or of the degree below, because x² + y² + z² = 1.
+    On the unit sphere, x² + y² + z² = 1. A harmonic is therefore a homogeneous
+    polynomial of degree `degree` or `degree` - 1.
+
+    Args:
+        directions: Unit vectors, shape (D, 3).
+        degree: Largest degree of the harmonics.
+
+    Returns:
+        K = (degree + 1)² harmonics, shape (D, K).
     """
     exponents, coefficients = _polynomials(degree)
+    # Powers 0 to degree of the components, shape (degree + 1, 3, D).
     powers = np.ones((degree + 1, *directions.T.shape))
     for power in range(degree):
         powers[power + 1] = powers[power] * directions.T
-    x, y, z = powers.transpose(1, 0, 2)
-    return (x[exponents[0]] * y[exponents[1]] * z[exponents[2]]).T @ coefficients
+    x_powers, y_powers, z_powers = powers.transpose(1, 0, 2)
+    # Shape (J, D).
+    monomials = x_powers[exponents[0]] * y_powers[exponents[1]] * z_powers[exponents[2]]
+    return monomials.T @ coefficients
 
 
 @per_degree
 def _polynomials(degree: int) -> tuple[Array, Array]:
-    """Return the exponents (3, J) of x, y and z in J monomials, and the harmonics' coefficients.
+    """Express K = (degree + 1)² harmonics on the unit sphere by J monomials.
 
-    The coefficients have the shape (J, K).
+    The monomials x^a y^b z^c have a + b + c = degree or degree - 1.
+
+    Args:
+        degree: Largest degree of the harmonics.
+
+    Returns:
+        A tuple of
+        - the exponents a, b and c of the monomials, shape (3, J);
+        - the coefficients of the harmonics, shape (J, K).
     """
     exponents = []
     coefficients = []
     for total in range(degree, max(degree - 2, -1), -1):
         for a in range(total, -1, -1):
             exponents += [(a, b, total - a - b) for b in range(total - a, -1, -1)]
+        # Harmonics of the other parity belong to the other set of monomials.
         has_parity = (bands(total) - total) % 2 == 0
         homogeneous = monomial_coefficients(total) * has_parity
         coefficients.append(F.pad(homogeneous, (0, (degree + 1) ** 2 - homogeneous.shape[1])))
@@ -490,7 +654,16 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
 
 @per_degree
 def _derivatives(degree: int) -> Array:
-    """Return the matrix (K, (3 + 9) K) that differentiates lights once and twice by x, y and z."""
+    """Compute the matrix that maps SH coefficients to those of all first and second derivatives.
+
+    Args:
+        degree: Degree of the light, which has K = (degree + 1)² coefficients.
+
+    Returns:
+        Matrix, shape (K, 12 K). Its columns give 3 first and 9 second
+        derivatives by x, y and z, with K coefficients each.
+    """
+    # Shapes (3, K, K) and (9, K, K).
     first = gradient_matrices(degree)
     second = (first[:, None] @ first).flatten(0, 1)
     return torch.cat([first, second]).flatten(0, 1).T.contiguous().numpy()
@@ -498,13 +671,13 @@ def _derivatives(degree: int) -> Array:
 
 @dataclass(frozen=True)
 class _Grid:
-    """The N vertices of an icosphere.
+    """Directions at the N vertices (nodes) of an icosphere.
 
     Attributes:
         directions: Unit vectors, shape (N, 3).
-        harmonics: Harmonics of each vertex, shape (K, N).
-        neighbors: Indices of the six neighbors of each vertex, shape (6, N).
-            Twelve vertices have five neighbors, of which one occurs twice.
+        harmonics: K harmonics in each direction, shape (K, N).
+        neighbors: Indices of the six neighbors of each node, shape (6, N).
+            Twelve nodes have only five neighbors. One of these occurs twice.
     """
 
     directions: Array
@@ -514,8 +687,16 @@ class _Grid:
 
 @per_degree
 def _grid(degree: int, subdivisions: int) -> _Grid:
-    """Build the grid of directions on which dips are sought."""
-    # Importing trimesh takes half a second.
+    """Create the grid of directions on which dips are sought.
+
+    Args:
+        degree: Largest degree of the harmonics.
+        subdivisions: Number of subdivisions of the icosphere.
+
+    Returns:
+        Grid with the harmonics in all directions.
+    """
+    # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 
     sphere = icosphere(subdivisions)

@@ -1,4 +1,4 @@
-"""A solver for least distance programs: the shortest vector that satisfies linear inequalities."""
+"""Solver for least distance programs: the shortest vector that satisfies linear inequalities."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,20 @@ from scipy.linalg import cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 
-# `shortest` stops if the errors of the inequalities and of the duality gap, the sum
-# of the products of slacks and multipliers, are at most this fraction.
+# `shortest` stops if the inequalities hold up to this error, relative to the largest
+# magnitude of their right sides, and if the duality gap is at most this fraction of the
+# squared length of y. The gap is the sum of the products of slacks and multipliers.
 _TOLERANCE = 1e-9
-# It also requires that y = sidesᵀ multipliers holds up to this relative error.
+# For `shortest` to stop, y = sidesᵀ multipliers must also hold up to this error,
+# relative to the length of y.
 _STATIONARITY_TOLERANCE = 1e-6
-# Steps of the method. 15 to 40 are usual.
+# Largest number of steps of `shortest`. 15 to 40 are usual.
 _MAX_STEPS = 80
-# A step goes this fraction of the way to where a slack or a multiplier is zero.
+# A step goes this fraction of the way to the point at which a slack or a multiplier
+# becomes 0.
 _FRACTION_TO_BOUNDARY = 0.99
-# Every slack and the mean multiplier start at about this value.
+# Start value of the slacks (at least this), and approximate start value of the products
+# of multipliers and squared rows of `sides`.
 _START = 0.1
 
 
@@ -25,10 +29,11 @@ def shortest(sides: Array, least: Array) -> Array:
     """Find the shortest vector y with `sides` y ≥ `least`.
 
     This is a convex quadratic program. With slacks s = sides y - least and
-    multipliers μ, its conditions of optimality are y = sidesᵀ μ, s ≥ 0, μ ≥ 0
-    and s μ = 0. They are solved by the predictor-corrector method (Mehrotra
-    1992, "On the implementation of a primal-dual interior point method"). Its
-    time does not depend on how many inequalities hold with equality.
+    multipliers μ, the vector y is optimal if y = sidesᵀ μ, s ≥ 0, μ ≥ 0, and
+    s_i μ_i = 0 for each inequality i. The predictor-corrector method solves
+    these conditions (Mehrotra 1992, "On the implementation of a primal-dual
+    interior point method"). The computing time does not depend on how many
+    inequalities hold with equality.
 
     Args:
         sides: Left sides of M ≥ 1 inequalities, shape (M, n).
@@ -52,15 +57,21 @@ def shortest(sides: Array, least: Array) -> Array:
         try:
             iterate.step()
         except np.linalg.LinAlgError:
-            # Near the optimum, the ratios of multipliers and slacks may differ
-            # by more than rounding allows, so that no step can be computed.
+            # Near the optimum, multipliers divided by slacks may differ so much in
+            # magnitude that rounding errors prevent another step.
             break
     return iterate.y * scale
 
 
 @dataclass(frozen=True)
 class _Change:
-    """Changes of y (n,), of the slacks (M,) and of the multipliers (M,)."""
+    """Changes of the vectors of an `_Iterate` in one step of length 1.
+
+    Attributes:
+        y: Change of y, shape (n,).
+        slacks: Change of the slacks, shape (M,).
+        multipliers: Change of the multipliers, shape (M,).
+    """
 
     y: Array
     slacks: Array
@@ -68,15 +79,19 @@ class _Change:
 
 
 class _Iterate:
-    """The vectors of the method, and the residuals of the conditions at them.
+    """Current vectors of the predictor-corrector method, and how far they are from optimal.
 
     Attributes:
-        y: The vector that is sought, shape (n,).
-        slacks: Positive slacks, shape (M,).
-        multipliers: Positive multipliers, shape (M,).
+        y: Approximation of the shortest vector, shape (n,).
+        slacks: Positive slack of each of the M inequalities, shape (M,).
+        multipliers: Positive multiplier of each inequality, shape (M,).
         dual_residual: y - sidesᵀ multipliers, shape (n,).
         primal_residual: sides y - slacks - least, shape (M,).
         gap: Sum of the products of slacks and multipliers.
+
+    Args:
+        sides: Left sides of the inequalities sides y ≥ least, shape (M, n).
+        least: Right sides, shape (M,).
     """
 
     def __init__(self, sides: Array, least: Array):
@@ -88,13 +103,13 @@ class _Iterate:
         self._compute_residuals()
 
     def _compute_residuals(self) -> None:
-        """Compute the residuals and the gap at the current vectors."""
+        """Compute `dual_residual`, `primal_residual` and `gap` from the current vectors."""
         self.dual_residual = self.y - self._sides.T @ self.multipliers
         self.primal_residual = self._sides @ self.y - self.slacks - self._least
         self.gap = self.slacks @ self.multipliers
 
     def is_optimal(self) -> bool:
-        """Return whether all conditions hold up to their tolerances."""
+        """Tell whether all conditions of optimality hold up to their tolerances."""
         limit = _STATIONARITY_TOLERANCE * np.linalg.norm(self.y)
         is_gap_closed = self.gap < _TOLERANCE * (self.y @ self.y)
         is_stationary = np.linalg.norm(self.dual_residual) < limit
@@ -102,51 +117,70 @@ class _Iterate:
         return bool(is_gap_closed and is_stationary and is_feasible)
 
     def step(self) -> None:
-        """Take a predictor-corrector step.
+        """Change y, the slacks and the multipliers by one predictor-corrector step.
 
-        The predictor aims at products of slacks and multipliers of zero. The
-        corrector aims at equal products, which are smaller the further the
-        predictor could go. It also removes the predictor's second-order error.
+        The predictor is a Newton step toward products of slacks and multipliers
+        that are 0. The corrector is a Newton step toward products that are equal
+        and positive. The longer the predictor could be, the smaller these
+        products are. The corrector also removes the second-order error of the
+        predictor.
 
         Raises:
             LinAlgError: If the linear system is not positive definite.
         """
-        weighted = self._sides * np.sqrt(self.multipliers / self.slacks)[:, None]
-        matrix = weighted.T @ weighted + np.eye(len(self.y))
+        # Cholesky factor of I + sidesᵀ diag(multipliers / slacks) sides.
+        weighted_sides = self._sides * np.sqrt(self.multipliers / self.slacks)[:, None]
+        matrix = weighted_sides.T @ weighted_sides + np.eye(len(self.y))
         factor = cho_factor(matrix, overwrite_a=True, check_finite=False)
+
         products = self.slacks * self.multipliers
         predictor = self._newton_change(factor, products)
-        length = self._longest_step(predictor)
-        predicted_slacks = self.slacks + length * predictor.slacks
-        predicted_multipliers = self.multipliers + length * predictor.multipliers
+        predictor_length = self._longest_step(predictor)
+        predicted_slacks = self.slacks + predictor_length * predictor.slacks
+        predicted_multipliers = self.multipliers + predictor_length * predictor.multipliers
         predicted_gap = predicted_slacks @ predicted_multipliers
+
+        # Target of all products for the corrector.
         centering = (predicted_gap / self.gap) ** 3 * self.gap / len(self._sides)
         second_order = predictor.slacks * predictor.multipliers
-        change = self._newton_change(factor, products + second_order - centering)
-        length = min(_FRACTION_TO_BOUNDARY * self._longest_step(change), 1)
-        self.y = self.y + length * change.y
-        self.slacks = self.slacks + length * change.slacks
-        self.multipliers = self.multipliers + length * change.multipliers
+        corrector = self._newton_change(factor, products + second_order - centering)
+        length = min(_FRACTION_TO_BOUNDARY * self._longest_step(corrector), 1)
+        self.y = self.y + length * corrector.y
+        self.slacks = self.slacks + length * corrector.slacks
+        self.multipliers = self.multipliers + length * corrector.multipliers
         self._compute_residuals()
 
     def _newton_change(self, factor: tuple[Array, bool], products: Array) -> _Change:
-        """Return the changes that make both residuals and the products (M,) zero to first order.
+        """Compute a Newton step that makes the residuals zero and reduces products.
 
-        `factor` is the Cholesky factor of
-        I + sidesᵀ diag(multipliers / slacks) sides.
+        To first order, the step makes `dual_residual` and `primal_residual` zero,
+        and reduces the products of slacks and multipliers by `products`.
+
+        Args:
+            factor: Cholesky factor of
+                I + sidesᵀ diag(multipliers / slacks) sides, from cho_factor.
+            products: Numbers by which the products are reduced, shape (M,).
+
+        Returns:
+            Changes of y, the slacks and the multipliers.
         """
-        weighted = (self.multipliers * self.primal_residual + products) / self.slacks
-        right_side = -self.dual_residual - self._sides.T @ weighted
-        change_of_y = cho_solve(factor, right_side, check_finite=False)
-        change_of_slacks = self._sides @ change_of_y + self.primal_residual
-        change_of_multipliers = -(products + self.multipliers * change_of_slacks) / self.slacks
-        return _Change(change_of_y, change_of_slacks, change_of_multipliers)
+        eliminated = (self.multipliers * self.primal_residual + products) / self.slacks
+        right_side = -self.dual_residual - self._sides.T @ eliminated
+        y_change = cho_solve(factor, right_side, check_finite=False)
+        slack_change = self._sides @ y_change + self.primal_residual
+        multiplier_change = -(products + self.multipliers * slack_change) / self.slacks
+        return _Change(y=y_change, slacks=slack_change, multipliers=multiplier_change)
 
     def _longest_step(self, change: _Change) -> float:
-        """Return the longest step at which no slack and no multiplier is negative.
+        """Compute the longest step along a change at which no slack or multiplier is negative.
 
-        The result is at most 1 / _FRACTION_TO_BOUNDARY.
+        Args:
+            change: Change of the vectors in a step of length 1.
+
+        Returns:
+            Length of the step, at most 1 / _FRACTION_TO_BOUNDARY.
         """
-        of_slacks = (-change.slacks / self.slacks).max()
-        of_multipliers = (-change.multipliers / self.multipliers).max()
-        return 1 / max(of_slacks, of_multipliers, _FRACTION_TO_BOUNDARY)
+        # Largest decrease of a slack, and of a multiplier, relative to its value.
+        slack_decrease = (-change.slacks / self.slacks).max()
+        multiplier_decrease = (-change.multipliers / self.multipliers).max()
+        return 1 / max(slack_decrease, multiplier_decrease, _FRACTION_TO_BOUNDARY)

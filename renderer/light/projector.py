@@ -16,25 +16,28 @@ from renderer.io.mitsuba_entries import pose_of, projector
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.settings import require_field_types
 
-MAX_PIXELS = 256  # The largest number of pixels per side.
+# Largest number of pixels along one side of a projected pattern.
+MAX_PIXELS = 256
 
 
 @dataclass(frozen=True)
 class Projector(LocalBasis):
-    """A projector that aims at the origin, with a coefficient for each of its pixels² pixels.
+    """Projector that aims at the origin, with one RGB coefficient for each pixel of its pattern.
 
-    The pixels follow row by row from the top left, as a screen shows them. A
-    coefficient of 1 gives a white surface at the origin that faces the projector
-    the radiance 1. The light falls with the squared distance and is even on a
-    flat screen.
+    The pattern has `pixels`² pixels. Their coefficients are in row-major order
+    from the top left, as a screen would show the pattern. A white surface at the
+    origin that faces the projector gets the radiance 1 from a coefficient of 1.
+    The light falls with the squared distance. A pattern with equal coefficients
+    lights a flat screen at the origin uniformly.
 
     Attributes:
-        pixels: Pixels per side, at most 256.
-        polar: Angle of the position off +z, in degrees.
-        azimuth: Angle of the position off +x toward +y, in degrees.
-        distance: Distance from the origin, at least 2.
-        fov: Angle between opposite sides of the pattern, in degrees, from 0.05 to 172.
-        power: The largest coefficient. The smallest is 0.
+        pixels: Number of pixels along one side of the pattern, at most 256.
+        polar: Angle between +z and the position of the projector, in degrees.
+        azimuth: Azimuth of the projector in degrees, measured from +x toward +y.
+        distance: Distance from the origin in world units, at least 2.
+        fov: Angle between opposite sides of the pattern, in degrees, from 0.05
+            to 172.
+        power: Largest coefficient. The smallest coefficient is 0.
 
     Raises:
         InputError: If an attribute is out of range.
@@ -86,41 +89,58 @@ class Projector(LocalBasis):
         return self.pixels**2
 
     def picture(self, coefficients: Tensor) -> Tensor:
-        """Return coefficients (size, 3) as an image (pixels, pixels, 3). Its 1 is the power."""
+        """Convert coefficients to an image of the pattern.
+
+        Args:
+            coefficients: RGB coefficients, shape (pixels², 3).
+
+        Returns:
+            Image in [0, 1], in which 1 is a coefficient of `power`,
+            shape (pixels, pixels, 3).
+        """
         return coefficients.view(self.pixels, self.pixels, 3) / self.power
 
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find one path for each point within the pattern.
+        """Find the path from the projector to each surface point within the pattern.
 
         Args:
-            points: Points of surfaces, shape (N, 3).
+            points: N surface points in world axes, shape (N, 3).
             normals: Unit normals at the points, shape (N, 3).
             positions: Not used, because a projector cannot be moved.
 
         Returns:
-            Paths from pixels of the pattern to points.
+            One path for each point that the pattern lights, without regard to
+            shadows.
         """
+        # A camera at the projector has the axes right, up and back of the pattern.
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]
         right, up, back = ((points - source) @ axes.T).unbind(1)
         depth = -back
-        edge = math.tan(math.radians(self.fov) / 2)
-        column = ((1 + right / (depth * edge)) / 2 * self.pixels).floor()
-        row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
-        # The cosine at the surface over that of the angle from the axis.
-        cosine = ((source - points) * normals).sum(1) / depth
+        # Half the width of the pattern at depth 1.
+        half_width = math.tan(math.radians(self.fov) / 2)
+        column = ((1 + right / (depth * half_width)) / 2 * self.pixels).floor()
+        row = ((1 - up / (depth * half_width)) / 2 * self.pixels).floor()
+        # Cosine at the surface divided by the cosine to the axis of the projector. The
+        # distance to the point is the depth divided by the second cosine.
+        cosine_ratio = ((source - points) * normals).sum(1) / depth
         in_rows = (row >= 0) & (row < self.pixels)
         in_columns = (column >= 0) & (column < self.pixels)
-        is_lit = in_rows & in_columns & (depth > 0) & (cosine > 0)
-        point = torch.nonzero(is_lit).squeeze(1)
-        irradiance = cosine * (self.distance / depth) ** 2
-        function = (row * self.pixels + column)[point].long()
-        return LightPaths(point, function, source.expand(len(point), 3), irradiance[point])
+        is_lit = in_rows & in_columns & (depth > 0) & (cosine_ratio > 0)
+        lit_point = torch.nonzero(is_lit).squeeze(1)
+        irradiance = cosine_ratio * (self.distance / depth) ** 2
+        pattern_pixel = (row * self.pixels + column)[lit_point].long()
+        return LightPaths(
+            point=lit_point,
+            function=pattern_pixel,
+            source=source.expand(len(lit_point), 3),
+            irradiance=irradiance[lit_point],
+        )
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
-        # The radiance of Mitsuba's projector is over π already.
+        # Mitsuba's `projector` divides by π itself, so no factor π is needed.
         texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(self.polar, self.azimuth, 1.0, distance=self.distance)
