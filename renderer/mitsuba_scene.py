@@ -48,19 +48,19 @@ from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shading.lobes import coat_mean
 from renderer.surface.texture_bake import with_added_albedo
 
-# Name of the scene file in its folder.
+# Name of the scene file that `write_mitsuba_scene` writes.
 SCENE = "scene.xml"
-# Number of samples per pixel, which are spread evenly. The noise in smooth
-# lighting is then below 1/255.
+# Number of samples per pixel in Mitsuba. With so many, the noise under smooth lighting
+# is below 1/255.
 SAMPLES = 256
-# Default variant of Mitsuba. It needs no LLVM, and renders the same bits on any
+# Default variant of Mitsuba. It needs no LLVM, and renders the same bits with any
 # number of threads.
 VARIANT = "scalar_rgb"
-# Variant of Mitsuba that computes gradients.
+# Variant of Mitsuba that computes gradients. It needs LLVM.
 DIFFERENTIABLE = "llvm_ad_rgb"
-# XML tag of each type of value in a scene file.
+# XML tag for each Python type of a value in a scene file.
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
-# XML tag of each plugin in a scene file.
+# XML tag for each plugin of Mitsuba in a scene file.
 PLUGIN_TAGS = {
     "path": "integrator",
     "direct": "integrator",
@@ -84,16 +84,19 @@ PLUGIN_TAGS = {
     "box": "rfilter",
     "multijitter": "sampler",
 }
-# Smallest albedo scale by which the specular_factor of a coat is divided.
+# `_PartWriter` divides specular factors by the albedo scale, or by this number if the
+# albedo scale is smaller.
 SMALLEST_SCALE = 1e-6
-# Smallest parameter `specular`. Without any, metals of `principled` reflect
-# nothing. F0 is then 8e-6.
+# Smallest parameter `specular` of the plugin `principled`. With 0, metals would reflect
+# nothing. With this value, the reflectance at normal incidence is 8e-6.
 SMALLEST_SPECULAR = 1e-4
 
 
 @contextmanager
 def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
-    """Give the module of Mitsuba with a variant, and restore the previous variant at the end.
+    """Import Mitsuba, and set its variant for a `with` block.
+
+    The previous variant is restored at the end of the block.
 
     Args:
         variant: Variant of Mitsuba, such as VARIANT or DIFFERENTIABLE.
@@ -109,15 +112,16 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
         import drjit
         import mitsuba as module
     except ImportError as error:
-        raise InputError("Mitsuba is not installed: pip install '.[lab]'") from error
+        raise InputError("Mitsuba is not installed: run pip install '.[lab]'") from error
     previous = module.variant()
     try:
         module.set_variant(variant)
     except ImportError as error:
         raise InputError(
-            f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})"
+            f"the variant {variant} of Mitsuba needs LLVM, which was not found ({error}): install "
+            "libllvm19, or set DRJIT_LIBLLVM_PATH"
         ) from error
-    # Mitsuba waits forever for an .exr file if it has a single thread.
+    # With a single thread, Mitsuba would wait forever when it reads an .exr file.
     drjit.set_thread_count(max(2, drjit.thread_count()))
     try:
         yield module
@@ -127,17 +131,19 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
-    """Create the Mitsuba object of a dictionary.
+    """Create a Mitsuba object from an entry of a scene.
 
     Args:
         module: Module of Mitsuba.
-        scene: Dictionary of the object, with arrays for transforms and images.
+        scene: Entry of the object, with arrays for transforms and images (see
+            `renderer.io.mitsuba_entries`).
 
     Returns:
         Object of Mitsuba.
     """
     converted = dict(scene)
     for name, value in scene.items():
+        # Mitsuba itself converts dictionaries of colors.
         if isinstance(value, dict) and value["type"] != "rgb":
             converted[name] = load(module, value)
         elif isinstance(value, np.ndarray):
@@ -173,7 +179,15 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 
 
 def _as_square(image: np.ndarray) -> torch.Tensor:
-    """Return an image (H, W, C) as (C, W, W), which stretches pixels that are not square."""
+    """Move the channels to the front, and stretch an image to a square.
+
+    Args:
+        image: Image, shape (H, W, C). H differs from W if the camera has pixels
+            that are not square.
+
+    Returns:
+        Image, shape (C, W, W).
+    """
     channels = torch.from_numpy(image).permute(2, 0, 1)
     height, width = channels.shape[1:]
     if height == width:
@@ -182,10 +196,11 @@ def _as_square(image: np.ndarray) -> torch.Tensor:
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
-    """Evaluate lighting at the texels of an environment map of Mitsuba.
+    """Compute the environment map of a light for Mitsuba.
 
-    The first and the last row of its maps are the poles. With 256 rows, the
-    texels of `to_map` would make the light 0.2% dimmer.
+    In Mitsuba, the first and the last row of a map are the poles. In our maps,
+    the poles are the edges of these rows. Our map with 256 rows would make the
+    light 0.2% dimmer in Mitsuba.
 
     Args:
         coefficients: Spherical-harmonic coefficients of the lighting,
@@ -195,7 +210,7 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
     Returns:
         Radiance, float64, shape (height, 2 · height, 3).
     """
-    # The single row lies on the equator, at z = 0.
+    # A map with a single row has directions in the plane z = 0.
     horizontal, _ = equirectangular(1, 2 * height)
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
     up = torch.tensor([0.0, 0.0, 1.0])
@@ -205,18 +220,20 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Part:
-    """F faces of a mesh with one texture and one gloss.
+    """F faces of a mesh that have the same texture and the same gloss.
 
     Attributes:
-        positions: Positions of the corners, shape (F, 3, 3).
-        normals: Normals of the corners, shape (F, 3, 3).
+        positions: Positions of the three corners of each face in world axes,
+            shape (F, 3, 3).
+        normals: Unit normals of the corners, shape (F, 3, 3).
         uvs: Texture coordinates of the corners as in `Mesh`, shape (F, 3, 2).
         colors: Linear colors of the corners, shape (F, 3, 3).
-        texture: Texture, uint8, shape (H, W, 3). None if there is none.
-        gloss: Roughness, metallic and specular factor, shape (3,). None if the mesh
-            has none.
-        factors: Gloss texture with roughness and metallic, uint8,
-            shape (H, W, 2). None if there is none.
+        texture: Texture, uint8, shape (H, W, 3). None for faces without a
+            texture.
+        gloss: Roughness, metallic and specular factor, shape (3,). None for a
+            matte mesh.
+        factors: Texture with factors for roughness and metallic, uint8,
+            shape (H, W, 2). None for faces without such a texture.
     """
 
     positions: np.ndarray
@@ -229,10 +246,11 @@ class Part:
 
 
 def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
-    """Split a mesh into parts with one texture and one gloss each.
+    """Split a mesh into parts, each of which has one texture and one gloss.
 
-    Mitsuba cannot multiply a texture by corner colors. If textured corners are
-    not white, the textures are painted anew.
+    Mitsuba cannot multiply a texture by corner colors. If a face with a texture
+    has corners that are not white, new textures that contain the colors are
+    computed.
 
     Args:
         mesh: Mesh with F faces.
@@ -246,7 +264,8 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
     if (textured_colors != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    # One row for each face. Faces with equal rows are one part.
+    # One row for each face, with the texture and the gloss. Faces with equal rows
+    # become one part.
     keys = mesh.texture_ids[:, None]
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
@@ -367,7 +386,13 @@ def write_mitsuba_scene(
 
 
 def _append(parent: xml.Element, name: str, value: Any) -> None:
-    """Append an entry of a scene dictionary to an XML element, without a name if it is empty."""
+    """Append a value of a scene to an XML element.
+
+    Args:
+        parent: XML element.
+        name: Name of the value, or an empty string for no name.
+        value: Number, flag, string, list of numbers, array or entry of a scene.
+    """
     named = {"name": name} if name else {}
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", named)
@@ -386,7 +411,7 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
 
 
 def _as_text(value: Any) -> str:
-    """Write a number, a flag, a string or a list of numbers as in a scene file."""
+    """Convert a number, a flag, a string or a list of numbers to the text of a scene file."""
     if isinstance(value, list):
         return " ".join(map(str, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -395,16 +420,16 @@ def _as_text(value: Any) -> str:
 def _local_emitters(
     folder: Path, lights: Sequence[tuple[LocalBasis, torch.Tensor]], albedo_scale: float
 ) -> list[Scene]:
-    """Return the emitters of local lights, and write their patterns as .exr files.
+    """Create the entries of local lights, and write the patterns of projectors as .exr files.
 
     Args:
         folder: Folder for the files.
         lights: Local lights with their coefficients, shape (N, 3) each.
-        albedo_scale: Factor for the albedo of the mesh, which the lights
-            contain.
+        albedo_scale: Factor for the albedo of the mesh. The lights are multiplied
+            by it, because the materials do not contain it.
 
     Returns:
-        Dictionary of each emitter, with names of files instead of bitmaps.
+        Entry of each emitter, with file names instead of images.
     """
     emitters: list[Scene] = []
     for basis, coefficients in lights:
@@ -419,19 +444,20 @@ def _local_emitters(
 
 
 class _PartWriter:
-    """Writer of the files of one part: part_0.ply, texture_0.png, and so on."""
+    """Writer for the files of one part of a mesh, such as part_0.ply and texture_0.png."""
 
     def __init__(
         self, folder: Path, number: int, part: Part, encoding: str, albedo_scale: float
     ) -> None:
-        """Prepare to write a part.
+        """Store the arguments, and compute how much of the albedo a glossy part keeps.
 
         Args:
             folder: Folder for the files.
-            number: Number of the part in their names.
+            number: Number of the part in the names of the files.
             part: Part to write.
-            encoding: Encoding of its texture, "linear" or "srgb".
-            albedo_scale: Factor for the albedo, which the lights contain.
+            encoding: Encoding of the texture, "linear" or "srgb".
+            albedo_scale: Factor for the albedo of the mesh. The lights are
+                multiplied by it, not the materials.
         """
         self._folder = folder
         self._number = number
@@ -441,14 +467,14 @@ class _PartWriter:
         is_glossy = part.gloss is not None and bool(part.gloss[1:].any())
         # A part without metallic and specular factor is matte.
         self._gloss = part.gloss if is_glossy else None
-        # Fraction of the albedo that the surface keeps below its coat.
+        # Factor for the albedo, because less light is reflected below a coat.
         self._kept = 1.0 if self._gloss is None else _kept_fraction(self._gloss)
 
     def write(self) -> Scene:
         """Write the files of the part.
 
         Returns:
-            Dictionary of the shape.
+            Entry of the shape with its material.
         """
         mesh_file = self._write_mesh()
         albedo = self._albedo()
@@ -459,18 +485,23 @@ class _PartWriter:
         return {"type": "ply", "filename": mesh_file, "flip_tex_coords": True, "bsdf": bsdf}
 
     def _write_mesh(self) -> str:
-        """Write the .ply file, in which each corner is a vertex, and return its name."""
+        """Write the .ply file, in which each corner of a face is a vertex.
+
+        Returns:
+            Name of the file.
+        """
         import trimesh
 
         part = self._part
-        values = np.concatenate([part.uvs, self._kept * part.colors], axis=-1)
-        corners = values.reshape(-1, 5).astype(np.float32)
+        # u, v, red, green and blue of each corner, shape (3 F, 5).
+        corner_values = np.concatenate([part.uvs, self._kept * part.colors], axis=-1)
+        corner_values = corner_values.reshape(-1, 5).astype(np.float32)
         surface = trimesh.Trimesh(
             part.positions.reshape(-1, 3),
-            np.arange(len(corners)).reshape(-1, 3),
+            np.arange(len(corner_values)).reshape(-1, 3),
             vertex_normals=part.normals.reshape(-1, 3),
-            # Texture coordinates (u, v) and colors (r, g, b) of the .ply file.
-            vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
+            # The attributes of the .ply file have the names u, v, r, g and b.
+            vertex_attributes=dict(zip("uvrgb", corner_values.T, strict=True)),
             process=False,
         )
         name = f"part_{self._number}.ply"
@@ -478,7 +509,11 @@ class _PartWriter:
         return name
 
     def _albedo(self) -> Scene:
-        """Write the texture, if there is one, and return the dictionary of the albedo."""
+        """Write the texture as an image if the part has one.
+
+        Returns:
+            Entry of the albedo, which is the image or the vertex colors.
+        """
         texture = self._part.texture
         if texture is None:
             return {"type": "mesh_attribute", "name": "vertex_color"}
@@ -489,11 +524,21 @@ class _PartWriter:
         return {"type": "bitmap", "filename": name, "raw": self._encoding == "linear"}
 
     def _glossy_material(self, gloss: np.ndarray, albedo: Scene) -> Scene:
-        """Write the gloss texture, if there is one, and return the dictionary of the material."""
-        # The metallic part of the color is scaled like the diffuse part.
+        """Write roughness and metallic as images if the part has a gloss texture.
+
+        Args:
+            gloss: Roughness, metallic and specular factor, shape (3,).
+            albedo: Entry of the albedo.
+
+        Returns:
+            Entry of the material.
+        """
+        # The albedo was multiplied by `_kept`. Metals need the full albedo, so metallic
+        # is divided by it.
         roughness, metallic, specular_factor = (gloss / [1, self._kept, 1]).tolist()
-        # F0 is 0.08 · specular, and 0.04 for a refractive index of 1.5. The
-        # lights contain the albedo scale, which the coat must not have.
+        # In `principled`, the reflectance at normal incidence is 0.08 · specular. It is
+        # 0.04 for our refractive index of 1.5. The lights were multiplied by the albedo
+        # scale, but the coat must not be brighter, so its reflectance is divided by it.
         specular = specular_factor / 2 / max(self._albedo_scale, SMALLEST_SCALE)
         return {
             "type": "principled",
@@ -504,15 +549,15 @@ class _PartWriter:
         }
 
     def _gloss_value(self, name: str, factor: float, minimum: float) -> Scene | float:
-        """Return roughness or metallic as a number, or write it as an image.
+        """Describe roughness or metallic as a number, or write it as an image.
 
         Args:
             name: "roughness" or "metallic".
-            factor: Value, or factor for the gloss texture.
+            factor: Value for all faces, or factor for the gloss texture.
             minimum: Smallest value that the renderer uses.
 
         Returns:
-            Number, or dictionary of a bitmap.
+            Number, or entry of an image.
         """
         factors = self._part.factors
         if factors is None:
@@ -525,9 +570,10 @@ class _PartWriter:
 
 
 def _kept_fraction(gloss: np.ndarray) -> float:
-    """Compute the fraction of uniform lighting times albedo that a glossy surface reflects.
+    """Compute which fraction of its albedo a glossy surface reflects under uniform light.
 
-    A metal reflects all of it, and a dielectric reflects what passes its coat.
+    A metal reflects all of the albedo. A dielectric reflects the albedo times the
+    fraction of the light that passes its coat.
 
     Args:
         gloss: Roughness, metallic and specular factor, shape (3,).

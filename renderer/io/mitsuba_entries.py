@@ -12,24 +12,28 @@ import numpy as np
 
 from renderer.camera import Camera, PerspectiveCamera
 
+# Type of an entry of a Mitsuba scene.
 Scene = dict[str, Any]
 
-# Turns Mitsuba's environment maps, whose y is up and whose +z is in the middle.
+# Matrix from the axes of Mitsuba's environment maps to world axes. Mitsuba's maps have
+# y up, and +z is in the middle column. In our maps, z is up, and +x is in the middle.
 TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
-    """Describe how light is followed.
+    """Create the entry of an integrator, which says how Mitsuba follows light.
 
     Args:
-        bounces: Number of bounces between surfaces. With 0, light is direct: rays
-            leave surfaces by the cosine.
-        emitter_samples: Rays from a surface to emitters, for direct light.
+        bounces: Number of bounces between surfaces. With 0, only light that comes
+            directly from emitters is rendered.
+        emitter_samples: Number of rays from a surface point to emitters if
+            `bounces` is 0. One more ray has a random direction.
 
     Returns:
-        A "path" or a "direct" integrator.
+        Entry of the type "path" or "direct".
     """
     if bounces:
+        # Mitsuba also counts the emitter and the surface that the camera sees.
         depth = bounces + 2
         return {"type": "path", "max_depth": depth, "rr_depth": depth, "hide_emitters": True}
     samples = {"emitter_samples": emitter_samples, "bsdf_samples": 1}
@@ -37,31 +41,33 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
 
 
 def environment(radiance: Scene, scale: float = 1.0) -> Scene:
-    """Describe an environment map.
+    """Create the entry of an environment map.
 
     Args:
-        radiance: Its entry "bitmap" or "filename", laid out as in
-            `renderer.light.environment`.
-        scale: Factor of the radiance.
+        radiance: Image of the map in the layout of `renderer.light.environment`,
+            as {"bitmap": array} or {"filename": name}.
+        scale: Factor for the radiance.
 
     Returns:
-        An "envmap" emitter.
+        Entry of the emitter "envmap".
     """
     return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
 def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
-    """Describe a projector.
+    """Create the entry of a projector.
 
     Args:
-        pose: Projector to world, shape (4, 4), as `pose_of` returns it.
-        fov: Angle between opposite sides of the pattern, in degrees.
-        pattern: Its entry "bitmap" or "filename".
-        scale: Factor of the pattern. A white surface that faces the projector at
-            distance 1 has the radiance pattern · scale.
+        pose: Matrix from the axes of the projector to world axes, from `pose_of`,
+            shape (4, 4).
+        fov: Angle between opposite sides of the pattern in degrees.
+        pattern: Image of the pattern, as {"bitmap": array} or
+            {"filename": name}, with other options of the texture.
+        scale: Factor for the pattern. A white surface that faces the projector
+            at distance 1 has the radiance pattern · scale.
 
     Returns:
-        A "projector" emitter.
+        Entry of the emitter "projector".
     """
     irradiance = {"type": "bitmap", **pattern, "raw": True}
     lens = {"fov": fov, "scale": scale, "to_world": pose}
@@ -76,21 +82,25 @@ def sensor(
     film_center: tuple[float, float] = (0.0, 0.0),
     pixel_aspect: float = 1.0,
 ) -> Scene:
-    """Describe a camera.
+    """Create the entry of a camera.
 
     Args:
-        pose: Camera to world, shape (4, 4), as `pose_of` returns it.
-        size: Pixels per side.
-        fov: Angle between the image's sides, in degrees. Without perspective, the
-            image spans [-1, 1] in x and y under the pose.
-        pixel_format: Mitsuba's name of the channels.
-        film_center: Position of the center of the film of a perspective camera,
-            right of and below the principal point, in units of the film's sides.
-        pixel_aspect: Vertical over horizontal focal length in pixels. Mitsuba's
-            pixels are square, so that the film has another number of rows.
+        pose: Matrix from the axes of the camera to world axes, from `pose_of`,
+            shape (4, 4).
+        size: Number of pixels along one side of the image.
+        fov: Angle between opposite sides of the image in degrees. None for a
+            camera without perspective, whose image shows [-1, 1] in the x and y
+            of the pose.
+        pixel_format: Channels of the image, such as "rgba".
+        film_center: Center of the image of a perspective camera, to the right of
+            the principal point and below it, divided by the width and the height
+            of the image.
+        pixel_aspect: Vertical focal length divided by the horizontal one, both
+            in pixels. Mitsuba has square pixels, so the image gets another number
+            of rows instead.
 
     Returns:
-        A "perspective" or an "orthographic" sensor.
+        Entry of the sensor "perspective" or "orthographic".
     """
     film = {
         "type": "hdrfilm",
@@ -109,15 +119,15 @@ def sensor(
 
 
 def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
-    """Describe a camera of the renderer, see `sensor`.
+    """Convert a camera of the renderer to an entry of a Mitsuba scene.
 
     Args:
-        camera: Camera to describe.
-        size: Pixels per side of the image.
+        camera: Camera to convert.
+        size: Number of pixels along one side of the image.
         pixel_format: Channels of the image, such as "rgba".
 
     Returns:
-        The sensor as a dictionary for Mitsuba.
+        Entry of the sensor, see `sensor`.
     """
     if isinstance(camera, PerspectiveCamera):
         film_center = (-camera.principal_right / 2, camera.principal_up / 2)
@@ -128,31 +138,34 @@ def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
 
 
 def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
-    """Compute the pose of a camera, or of a projector in its place.
+    """Compute the pose of a camera, or of a projector at the same place, for Mitsuba.
 
-    Mitsuba's cameras and projectors look along +z and have x to the left.
+    Mitsuba's cameras and projectors look along +z, and x points to the left. Our
+    cameras look along -z, and x points to the right.
 
     Args:
-        camera: The camera.
-        scale: World units per unit along x and y.
+        camera: Camera of the renderer.
+        scale: Number of world units per unit along x and y.
 
     Returns:
-        Camera to world, shape (4, 4).
+        Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     pose = camera.pose()
+    # The first three columns are the axes x, y and z.
     pose[:3] *= [-scale, scale, -1, 1]
     return pose
 
 
 def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Compute the pose of a camera or projector at a point that looks at another, with z up.
+    """Compute the pose of a Mitsuba camera or projector that looks at a point, with z up.
 
     Args:
-        origin: Where it stands, shape (3,).
-        target: What it looks at, shape (3,), not above or below the origin.
+        origin: Position of the camera in world axes, shape (3,).
+        target: Point at which the camera looks, shape (3,). It must not lie
+            exactly above or below the camera.
 
     Returns:
-        Camera to world, shape (4, 4).
+        Matrix from the axes of Mitsuba's camera to world axes, shape (4, 4).
     """
     ahead = (target - origin) / np.linalg.norm(target - origin)
     left = np.cross([0, 0, 1], ahead)

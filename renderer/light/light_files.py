@@ -1,4 +1,4 @@
-"""Files of lights: a basis and its coefficients as JSON."""
+"""Read and write .json files of lights. A file has a basis and its coefficients."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from renderer.io.images import write_image
 from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.validation import as_path, as_tensor, require_kind
 
-# Errors that reading a damaged or foreign .json file can raise.
+# Exceptions that are raised if a .json file is damaged, or does not describe a light.
 _DAMAGED_FILE_ERRORS = (
     KeyError,
     ValueError,
@@ -28,6 +28,7 @@ _DAMAGED_FILE_ERRORS = (
     RecursionError,
     OSError,
 )
+# Type of the basis that `read_light` returns.
 LightBasis = TypeVar("LightBasis", bound=Harmonics | LocalBasis)
 
 
@@ -65,7 +66,10 @@ def save_light(
     require_bounded(coefficients=coefficients)
     if coefficients.shape != (basis.size, 3):
         shape = tuple(coefficients.shape)
-        raise InputError(f"coefficients {shape} are not of {basis}: give {(basis.size, 3)}")
+        raise InputError(
+            f"coefficients has shape {shape}, but {basis} needs the shape {(basis.size, 3)}: "
+            "give coefficients of this shape"
+        )
     description = {"basis": basis.name, **vars(basis), "coefficients": coefficients.tolist()}
     if any(name in description for name in ANGLES):
         description[ANGLE_UNIT] = DEGREES
@@ -104,17 +108,21 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
         name = description.pop("basis")
         if name not in kind_of_name:
             known = " or ".join(kind_of_name)
-            raise InputError(f"its basis is {name!r}, give one of {known}")
+            raise InputError(f"the basis of the file is {name!r}, but {known} is needed")
         description = angles_in_degrees(description, description.pop(ANGLE_UNIT, None))
         basis = kind_of_name[name](**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except _DAMAGED_FILE_ERRORS as error:
-        raise InputError(f"{path} does not describe a light ({error}): write it again") from error
-    # NaN fails the comparison.
+        raise InputError(
+            f"{path} does not describe a light ({error}): write the file again"
+        ) from error
+    # The comparison is also False for NaN.
     is_bounded = bool((coefficients.abs() <= MAX_SCALE).all())
     if coefficients.shape != (basis.size, 3) or not is_bounded:
         shape = tuple(coefficients.shape)
-        advice = f"give {basis.size} rows [r, g, b] of finite numbers, no larger than {MAX_SCALE:g}"
-        raise InputError(f"{path} has coefficients {shape}: {advice}")
+        raise InputError(
+            f"{path} has coefficients of shape {shape}, or values that are not finite: "
+            f"give {basis.size} rows [r, g, b] of numbers with magnitudes up to {MAX_SCALE:g}"
+        )
     return basis, coefficients

@@ -1,8 +1,9 @@
 """Named lights, lights from files, and random perturbations of lights.
 
-A light has SH coefficients (49, 3), or (K, 3) with K = (degree + 1)² for
-another degree. They are linear RGB radiance, in world axes (z up) and in the
-order of `renderer.light.harmonics`.
+A light is a tensor of SH coefficients, shape (K, 3) with K = (degree + 1)² and
+three color channels. The default degree is 6, with 49 coefficients. The
+coefficients describe linear RGB radiance in world axes (z up), in the order of
+`renderer.light.harmonics`.
 """
 
 import math
@@ -67,11 +68,13 @@ _PUBLISHED_PROBES = {
         (-0.08, -0.03, 0.00),
     ],
 }
+# Names of the light probes.
 PROBES = tuple(_PUBLISHED_PROBES)
+# Name of light with the same radiance from all directions.
 UNIFORM = "uniform"
-# Environment maps are scaled to the mean luminance of this probe.
+# `load_light` scales environment maps to the mean luminance of this probe.
 _REFERENCE_PROBE = "grace"
-# Luminance of linear Rec. 709 red, green and blue.
+# Weights of linear red, green and blue (Rec. 709) in the luminance.
 _LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 
 
@@ -139,13 +142,14 @@ def load_light(
 
 
 def probe(name: str) -> Tensor:
-    """Return a published light probe, turned from y up to z up.
+    """Return a published light probe, rotated from y up to z up.
 
     Args:
-        name: One of `PROBES`.
+        name: Name of the probe, one of `PROBES`.
 
     Returns:
-        SH coefficients, shape (49, 3), float32. Bands 3 to 6 are zero.
+        SH coefficients, float32, shape (49, 3). Coefficients of degree 3 to 6
+        are 0.
     """
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
     coefficients = torch.zeros(COEFFICIENTS, 3)
@@ -155,12 +159,12 @@ def probe(name: str) -> Tensor:
 
 
 def ambient(color: Tensor) -> Tensor:
-    """Return light of the same radiance from every direction.
+    """Create light with the same radiance from every direction.
 
-    Its irradiance is π times the radiance.
+    The irradiance of a surface is π times the radiance.
 
     Args:
-        color: Radiance, linear RGB, shape (3,).
+        color: Linear RGB radiance, shape (3,).
 
     Returns:
         SH coefficients, shape (49, 3).
@@ -172,15 +176,15 @@ def ambient(color: Tensor) -> Tensor:
 
 
 def directional(direction: Tensor, color: Tensor, degree: int = DEGREE) -> Tensor:
-    """Return parallel light from one direction.
+    """Create parallel light from one direction.
 
-    Truncated at degree 6, the irradiance has an error of at most 0.043 of the
-    irradiance of a surface that faces the light.
+    At degree 6, the error of the irradiance is at most 0.043 times the irradiance
+    of a surface that faces the light.
 
     Args:
-        direction: Unit vector towards the light, shape (..., 3).
-        color: Irradiance of a surface that faces the light, linear RGB, shape
-            (3,).
+        direction: Unit vectors toward the light, shape (..., 3).
+        color: Linear RGB irradiance of a surface that faces the light,
+            shape (3,).
         degree: Degree of the result.
 
     Returns:
@@ -195,16 +199,16 @@ def perturb(
 ) -> Tensor:
     """Draw random lights around a light.
 
-    Every coefficient is changed by a uniform random number, as in the paper's
-    random mode, whose amplitude is 0.5.
+    A uniform random number in [-amplitude, amplitude] is added to each
+    coefficient, as in the random mode of the paper (amplitude 0.5).
 
     Args:
         light: SH coefficients, shape (K, 3) with K = (degree + 1)².
         count: Number of lights to draw.
         amplitude: Largest change of a coefficient.
-        radius: L2 norm to which the change of the coefficients that reach a
-            diffuse surface is scaled. The other coefficients stay then. None to
-            change all of them without scaling.
+        radius: If given, only coefficients that reach a diffuse surface are
+            changed, and their change is scaled to this L2 norm. None changes all
+            coefficients and does not scale the change.
         generator: Source of the random numbers.
 
     Returns:
@@ -221,15 +225,31 @@ def perturb(
 
 
 def mean_luminance(coefficients: Tensor) -> float:
-    """Return the mean luminance of a light over the sphere, times √4π.
+    """Compute the mean luminance of a light over the sphere, times √(4π).
 
-    The coefficients have the shape (K, 3). Only the first one counts.
+    Args:
+        coefficients: SH coefficients, shape (K, 3). Only the first row counts.
+
+    Returns:
+        Luminance.
     """
     return float(coefficients[0].cpu().double() @ _LUMINANCE)
 
 
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
-    """Read the coefficients ((degree + 1)², 3) of a map, at the luminance of the grace probe."""
+    """Read an environment map, and scale it to the mean luminance of the grace probe.
+
+    Args:
+        path: File of the map.
+        degree: Degree of the result.
+        roughness: Roughness of the smoothest surface, see `load_light`.
+
+    Returns:
+        SH coefficients, float32, shape ((degree + 1)², 3).
+
+    Raises:
+        InputError: If the map cannot be read, or if it is black.
+    """
     coefficients = project(read_panorama(path), degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]

@@ -1,26 +1,32 @@
-"""Gradients of images by the positions of surfaces and silhouettes in them.
+"""Gradients of images with respect to the positions of surfaces and silhouettes in the image.
 
-`renderer.shading.shading` differentiates the shading of samples and holds fixed which
-face a sample shows. This module adds the gradient that is missing there: of an
-image by where the surfaces lie in it.
+`renderer.shading.shading` differentiates the shading of samples, but holds fixed
+which face a sample shows. This module adds the gradient that is missing: how the
+image changes if the surfaces move in it.
 
-At a fixed position of the image, the radiance L changes by -v · ∇L as the
-surface there moves with velocity v. Between neighboring samples i and j, ∇L is
-the difference of their radiances, whether they show one surface or two
+At a fixed position of the image, the radiance L changes by -v · ∇L if the surface
+there moves with velocity v. Between neighboring samples i and j, ∇L is the
+difference of their radiances, no matter whether they show one surface or two
 (Pidhorskyi et al. 2024, "Rasterized edge gradients"). If the surface moves by δ
-samples from i toward j, a pixel of s² samples gains δ (L_i - L_j) / s². If i
-and j lie in two pixels, each pixel gains half of this.
+samples from i toward j, a pixel of s² samples gains δ (L_i - L_j) / s². If i and
+j lie in two pixels, each pixel gains half of this.
 
 If a silhouette lies between i and j, δ is the movement of the silhouette (Li et
-al. 2018), not of the surface beside it. When a ball turns, its points move but
-its silhouette does not. Silhouette edges are the edges of the mesh whose faces
-all lie on one side of them in the image. They are cut where they cross rows and
-columns of samples. A line with unit normal n that moves by v moves along a row
-by n · v / n_x. Cuts of rows have the weight n_x² and cuts of columns the weight
-n_y², so that all cuts together have the length of the line.
+al. 2018), not of the surface beside it. For example, when a ball rotates, its
+points move but its silhouette does not. Silhouette edges are edges of the mesh
+whose faces all lie on one side of the edge in the image. The module finds the
+crossings, which are the places where silhouette edges cross rows and columns of
+samples. A line with unit normal n that moves by v moves along a row by n · v / n_x.
+Crossings with rows have the weight n_x², and crossings with columns the weight
+n_y². All crossings of a line together then have its length as their weight.
 
 The light is fixed: edges of shadows and of projected patterns stay on the
 surface on which they lie.
+
+Shapes use these letters: a view has S covered samples in P pixels, s² samples
+per pixel, and shows G faces. The mesh has V vertices and F faces. Homogeneous
+positions are (x w, y w, w) for the image position (x, y). The number w is
+proportional to the depth, and 1 without perspective.
 """
 
 from __future__ import annotations
@@ -42,26 +48,27 @@ from renderer.visibility.rasterizers.numpy import SUBSAMPLES, to_fixed_point
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# A silhouette is visible if it lies behind the surface beside it by at most
-# this fraction of the depth of the mesh. An object that stands on another
-# surface touches it there, and by rounding, or as it was modeled, the object's
-# edge may lie slightly below this surface.
+# A silhouette counts as visible if it is at most this fraction of the mesh's depth
+# range behind the surface beside it. For example, an object that stands on a table
+# touches the table. By rounding, or because of how the object was modeled, its edge
+# may then lie slightly below the table.
 NEAR = 1e-3
 
-# Index of samples that show no mesh.
+# Index of a sample that shows no mesh, instead of an index of a covered sample.
 NOT_COVERED = -1
 
-# Axes of the image. Neighbors in a row differ along X.
+# Axes of the image. Neighboring samples in a row differ along X, and neighbors in a
+# column along Y.
 X = 0
 Y = 1
 
 
 class Crossings(NamedTuple):
-    """K places where a visible silhouette edge passes between two neighboring samples.
+    """K crossings: places where a visible silhouette edge passes between two neighboring samples.
 
-    If several silhouettes pass between the same two samples, only the one next
-    to the sample that shows the farther surface is kept. No other silhouette
-    hides it.
+    If several silhouettes pass between the same two samples, only one is kept.
+    This is the silhouette next to the sample that shows the farther surface,
+    because it is the boundary of this surface's visible part.
 
     Attributes:
         ends: Vertices at both ends of each edge, shape (2, K).
@@ -93,41 +100,44 @@ def moving_outlines(
     radiance: Float[Tensor, "3 S"],
     background: Float[Tensor, "3 pixels"],
 ) -> tuple[Int[Tensor, " E"], Float[Tensor, "3 P_E"]]:
-    """Return zeros whose gradient is the gradient of an image by the positions of surfaces.
+    """Create zeros whose gradient says how an image changes if surfaces move in it.
 
-    The zeros are to be added to the linear values of the P covered pixels and
-    of E uncovered pixels into which silhouettes may move. The gradient reaches
-    the vertices, and fields of the camera that are tensors.
+    Adding the zeros to an image adds the missing gradient, and does not change
+    the values. Besides the P covered pixels, E uncovered pixels beside silhouettes
+    have a gradient. The gradient reaches the vertices, and fields of the camera
+    that are tensors.
 
     Args:
-        fragments: Covered samples of the view.
+        fragments: The S covered samples of the view.
         camera: Camera of the view.
-        vertices: Vertices in world axes, shape (V, 3).
+        vertices: Vertex positions in world axes, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
         radiance: Linear radiance at the covered samples, shape (3, S).
         background: Linear background of all pixels, shape (3, size²).
 
     Returns:
         A tuple of
-        - row-major indices of the E uncovered pixels, shape (E,);
-        - zeros for the P covered pixels and the E uncovered pixels,
-          shape (3, P + E).
+        - the row-major indices of the E uncovered pixels, shape (E,);
+        - zeros to add to the linear values of the P covered pixels and then of
+          the E uncovered pixels, shape (3, P + E).
     """
     positions, nearness = camera.homogeneous(vertices.double())
     sample_indices = torch.arange(len(fragments.sample), dtype=torch.int32, device=vertices.device)
+    # Index of the covered sample at each sample of the image.
     sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
-    on_cpu = _find_crossings(
+    crossings_on_cpu = _find_crossings(
         fragments.to("cpu"),
         _to_numpy(positions),
         _to_numpy(nearness),
         faces=_to_numpy(faces),
         sample_grid=_to_numpy(sample_grid),
     )
-    crossings = Crossings(*(values.to(sample_grid.device) for values in on_cpu))
-    is_touched = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
-    is_touched.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
-    is_touched.index_fill_(0, fragments.pixels, False)
-    uncovered_pixels = is_touched.nonzero().squeeze(1)
+    crossings = Crossings(*(values.to(sample_grid.device) for values in crossings_on_cpu))
+    # Uncovered pixels with a sample beside a crossing.
+    is_uncovered = torch.zeros(fragments.size**2, dtype=torch.bool, device=sample_grid.device)
+    is_uncovered.index_fill_(0, _pixels_of_cells(crossings.cells, fragments).flatten(), True)
+    is_uncovered.index_fill_(0, fragments.pixels, False)
+    uncovered_pixels = is_uncovered.nonzero().squeeze(1)
     view = _MovingView(
         fragments=fragments,
         crossings=crossings,
@@ -140,22 +150,23 @@ def moving_outlines(
 
 
 def _to_numpy(tensor: Tensor) -> np.ndarray:
-    """Return the values of a tensor as a NumPy array."""
+    """Convert a tensor to a NumPy array, without its graph."""
     return tensor.detach().cpu().numpy()
 
 
 class _ZerosWithGradient(torch.autograd.Function):
-    """Zeros (3, P + E) with a gradient by the homogeneous positions (V, 3) of the vertices."""
+    """Zeros with a gradient by the homogeneous positions of the vertices, see `moving_outlines`."""
 
     @staticmethod
     def forward(ctx: Any, positions: Tensor, view: _MovingView) -> Tensor:
-        """Return zeros and store what the gradient needs.
+        """Create the zeros, and store the view and the positions for the gradient.
 
         Args:
             ctx: Context of autograd.
-            positions: Homogeneous positions (x w, y w, w) of the vertices in
+            positions: Homogeneous positions (x w, y w, w) of the V vertices in
                 the image, shape (V, 3).
-            view: View whose gradient `backward` computes.
+            view: View with P covered and E uncovered pixels, whose gradient
+                `backward` computes.
 
         Returns:
             Zeros, shape (3, P + E).
@@ -172,16 +183,18 @@ class _ZerosWithGradient(torch.autograd.Function):
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the linear values of the pixels,
-                shape (3, P + E).
+            upstream: Gradient by the linear values of the P covered and E
+                uncovered pixels, shape (3, P + E).
 
         Returns:
-            Gradient, shape (V, 3), and None for the view.
+            Gradient by the homogeneous positions, shape (V, 3), and None for the
+            view.
         """
         (positions,) = ctx.saved_tensors
         view: _MovingView = ctx.view
-        # A length of 2 is the width of the image, which has size · s samples.
-        # A sample has 1 / s² of the area of its pixel.
+        # Movements are in image coordinates, in which the image has the width 2. A
+        # movement by 1 is size · s / 2 samples, and a sample has the weight 1 / s² in
+        # its pixel. The factor 1/2 shares the difference of two samples between both.
         upstream = upstream * (view.fragments.size / 4 / view.fragments.samples)
         gradient = view.gradient_by_surface(positions, upstream)
         ends, gradient_by_ends = view.gradient_by_silhouettes(positions, upstream)
@@ -190,15 +203,15 @@ class _ZerosWithGradient(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _MovingView:
-    """View whose image is differentiated by the positions of surfaces.
+    """View whose image is differentiated by the positions of surfaces in it.
 
     Attributes:
         fragments: The S covered samples in P pixels.
-        crossings: Places where silhouettes pass between samples.
-        sample_grid: Index of the covered sample at each sample of the image,
-            or NOT_COVERED, shape (size · s, size · s).
-        uncovered_pixels: Row-major indices of the E other pixels whose values
-            change, shape (E,).
+        crossings: Places where visible silhouettes pass between samples.
+        sample_grid: Index of the covered sample at each sample of the image, or
+            NOT_COVERED, shape (size · s, size · s).
+        uncovered_pixels: Row-major indices of the E uncovered pixels into which
+            silhouettes may move, shape (E,).
         radiance: Linear radiance at the covered samples, shape (3, S).
         background: Linear background of all pixels, shape (3, size²).
     """
@@ -211,52 +224,65 @@ class _MovingView:
     background: Tensor
 
     def gradient_by_surface(self, positions: Tensor, upstream: Tensor) -> Tensor:
-        """Compute the gradient by the positions of surfaces, without silhouettes.
+        """Compute the gradient by the movement of surfaces, without silhouettes.
 
-        A force is the gradient by the position of a sample in the image.
+        In this class, the force at a sample is the gradient by the position of
+        the surface point at this sample in the image.
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient by the linear values of pixels, shape (3, P + E).
+            upstream: Gradient by the linear values of the P covered and E
+                uncovered pixels, shape (3, P + E).
 
         Returns:
             Gradient by the homogeneous positions, shape (V, 3).
         """
         fragments = self.fragments
-        at_samples = upstream.index_select(1, fragments.pixel)
-        weighted = (self.radiance * at_samples).sum(0)
-        weighted_image = fragments.image_of_samples(weighted, torch.nan)
-        right = self._forces_along(X, weighted_image, at_samples)
-        down = self._forces_along(Y, weighted_image, at_samples)
+        upstream_at_samples = upstream.index_select(1, fragments.pixel)
+        # Radiance times upstream gradient, summed over the channels, shape (S,).
+        weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
+        weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
+        force_right = self._forces_along(X, weighted_image, upstream_at_samples)
+        force_down = self._forces_along(Y, weighted_image, upstream_at_samples)
         # Most samples have neighbors of the same color, and therefore no force.
-        moving = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
-        part = fragments.select(moving)
-        forces = torch.stack([right.index_select(0, moving), -down.index_select(0, moving)]).T
+        has_force = (force_right != 0) | (force_down != 0)
+        samples = torch.nonzero(has_force).squeeze(1)
+        part = fragments.select(samples)
+        # The y-axis of image positions points up.
+        forces = torch.stack(
+            [force_right.index_select(0, samples), -force_down.index_select(0, samples)]
+        ).T
         if fragments.depths is not None:
             depth = part.interpolate(positions[:, 2:][part.corners])
             forces = _by_homogeneous(forces, part.positions(), depth)
-        # Shape (2 or 3, 3 G), for the coordinates and the corners of seen faces.
-        by_corners = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
+        # Distribute the forces to the corners of the seen faces. Shape (2 or 3, 3 G),
+        # for the coordinates and the corners.
+        corner_gradients = part.distribute(forces).permute(2, 1, 0).flatten(1).double()
         gradient = positions.new_zeros(positions.shape[::-1])
-        gradient[: forces.shape[1]].index_add_(1, part.corners.T.flatten(), by_corners)
+        coordinate_count = forces.shape[1]
+        gradient[:coordinate_count].index_add_(1, part.corners.T.flatten(), corner_gradients)
         return gradient.T
 
-    def _forces_along(self, axis: int, weighted_image: Tensor, at_samples: Tensor) -> Tensor:
-        """Compute the gradient by the positions of samples along one axis of the image.
+    def _forces_along(
+        self, axis: int, weighted_image: Tensor, upstream_at_samples: Tensor
+    ) -> Tensor:
+        """Compute the gradient by movements of the surface at each sample, along one image axis.
 
         Args:
             axis: X for movements to the right, or Y for movements down.
-            weighted_image: Radiance times upstream gradient, summed over
-                channels, as an image of samples, NaN for samples that show no
-                mesh, shape (size · s, size · s).
-            at_samples: Upstream gradient at the covered samples, shape (3, S).
+            weighted_image: Radiance times upstream gradient, summed over the
+                channels, for each sample of the image. NaN for samples that show
+                no mesh. Shape (size · s, size · s).
+            upstream_at_samples: Upstream gradient of the pixel of each covered
+                sample, shape (3, S).
 
         Returns:
-            Gradient by the position of each covered sample, shape (S,).
+            Gradient for each covered sample, shape (S,).
         """
+        # Columns are dimension 1 of the image, and rows dimension 0.
         dim = 1 - axis
         steps = len(self.sample_grid) - 1
-        # Difference of each sample and the next one along the axis.
+        # Value of each sample minus the value of the next sample along the axis.
         jump = torch.zeros_like(weighted_image)
         torch.sub(
             weighted_image.narrow(dim, 0, steps),
@@ -265,89 +291,127 @@ class _MovingView:
         )
         # The difference is NaN if one of the two samples shows no mesh.
         jump.nan_to_num_(0)
-        self._correct_borders(dim, jump, at_samples)
-        # Silhouettes have a gradient of their own.
+        self._correct_pixel_borders(dim, jump, upstream_at_samples)
+        # `gradient_by_silhouettes` handles the jumps across silhouettes.
         is_along_axis = self.crossings.horizontal == (axis == X)
         jump.view(-1).index_fill_(0, self.crossings.cells[0, is_along_axis], 0)
-        # Each sample gets the jumps to both of its neighbors.
+        # The force at a sample is the sum of the jumps before and after the sample.
         force = jump.clone()
         force.narrow(dim, 1, steps).add_(jump.narrow(dim, 0, steps))
         return self.fragments.of_image(force)
 
-    def _correct_borders(self, dim: int, jump: Tensor, at_samples: Tensor) -> None:
-        """Replace the jumps across borders of pixels in place.
+    def _correct_pixel_borders(self, dim: int, jump: Tensor, upstream_at_samples: Tensor) -> None:
+        """Replace the jumps between samples of two neighboring pixels, in place.
 
-        The upstream gradient differs between the two pixels. The difference of
-        the radiances is multiplied by the mean of both.
+        The two pixels have different upstream gradients. The right jump is the
+        difference of the two radiances times the mean of the two upstream
+        gradients.
+
+        Args:
+            dim: Dimension of the image along which the samples are neighbors.
+            jump: Weighted difference between each sample of the image and the
+                next one, changed in place, shape (size · s, size · s).
+            upstream_at_samples: Upstream gradient of the pixel of each covered
+                sample, shape (3, S).
         """
         samples = self.fragments.samples
+        # Slices for the last sample of each pixel, and the first sample of the next.
         before: Any = (slice(None), slice(samples - 1, -1, samples))
         after: Any = (slice(None), slice(samples, None, samples))
         if dim == 0:
             before = before[::-1]
             after = after[::-1]
         grid = self.sample_grid
-        is_covered = (grid[before] >= 0) & (grid[after] >= 0)
-        first = grid[before][is_covered]
-        second = grid[after][is_covered]
-        both = at_samples.index_select(1, first) + at_samples.index_select(1, second)
-        difference = self.radiance.index_select(1, first) - self.radiance.index_select(1, second)
-        jump[before].masked_scatter_(is_covered, (difference * both).sum(0) / 2)
+        are_covered = (grid[before] >= 0) & (grid[after] >= 0)
+        sample_before = grid[before][are_covered]
+        sample_after = grid[after][are_covered]
+        upstream_before = upstream_at_samples.index_select(1, sample_before)
+        upstream_sum = upstream_before + upstream_at_samples.index_select(1, sample_after)
+        radiance_before = self.radiance.index_select(1, sample_before)
+        difference = radiance_before - self.radiance.index_select(1, sample_after)
+        corrected = (difference * upstream_sum).sum(0) / 2
+        jump[before].masked_scatter_(are_covered, corrected)
 
     def gradient_by_silhouettes(self, positions: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the gradient by the positions of the ends of silhouette edges.
-
-        A force is the gradient by the position of an edge in the image.
+        """Compute the gradient by the movement of silhouette edges at the K crossings.
 
         Args:
             positions: Homogeneous positions of the vertices, shape (V, 3).
-            upstream: Gradient by the linear values of pixels, shape (3, P + E).
+            upstream: Gradient by the linear values of the P covered and E
+                uncovered pixels, shape (3, P + E).
 
         Returns:
             A tuple of
-            - the vertices at the ends of the K edges, shape (2 K,);
-            - the gradient by their homogeneous positions, shape (2 K, 3).
+            - the vertices at the first ends of the K edges, and then at the
+              second ends, shape (2 K,);
+            - the gradient by the homogeneous positions of these vertices,
+              shape (2 K, 3).
         """
         crossings = self.crossings
-        # Image rows run down.
+        # Component of the edge normal along the row (to the right) or column (down) of
+        # the two samples. The weight n_x² of a crossing times its movement n · v / n_x
+        # is n_x (n · v).
         along = torch.where(crossings.horizontal, crossings.normal[0], -crossings.normal[1])
+        # Gradient by the position of the crossing in the image, shape (K, 2).
         forces = (self._silhouette_forces(upstream) * along * crossings.normal).T
-        weights = (1 - crossings.fraction, crossings.fraction)
+        # An end moves the crossing the more, the nearer it is.
+        end_weights = (1 - crossings.fraction, crossings.fraction)
         gradients = []
-        for ends, weight in zip(crossings.ends, weights, strict=True):
-            x, y, depth = positions[ends].T
-            place = torch.stack([x / depth, y / depth], dim=1)
-            gradients.append(_by_homogeneous(forces * weight[:, None], place, depth[:, None]))
+        for end_vertices, end_weight in zip(crossings.ends, end_weights, strict=True):
+            x, y, depth = positions[end_vertices].T
+            end_position = torch.stack([x / depth, y / depth], dim=1)
+            end_forces = forces * end_weight[:, None]
+            gradients.append(_by_homogeneous(end_forces, end_position, depth[:, None]))
         return crossings.ends.flatten(), torch.cat(gradients)
 
     def _silhouette_forces(self, upstream: Tensor) -> Tensor:
-        """Compute the gradient by the movement of silhouettes across samples, shape (K,)."""
-        pixels = _pixels_of_cells(self.crossings.cells, self.fragments)
-        # Column in `upstream` of each pixel of the image, or -1.
-        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=pixels.device)
-        changed_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
-        column_of_pixel[changed_pixels] = torch.arange(upstream.shape[1], device=pixels.device)
-        force = self.radiance.new_zeros(pixels.shape[1])
+        """Compute the gradient by the movement of K silhouettes toward the second sample.
+
+        Args:
+            upstream: Gradient by the linear values of the P covered and E
+                uncovered pixels, shape (3, P + E).
+
+        Returns:
+            Gradient at each crossing, shape (K,).
+        """
+        # Pixels of the first and of the second sample at each crossing, shape (2, K).
+        pixels_at_crossings = _pixels_of_cells(self.crossings.cells, self.fragments)
+        device = pixels_at_crossings.device
+        # Column of `upstream` for each pixel of the image, or -1.
+        column_of_pixel = torch.full((self.fragments.size**2,), -1, device=device)
+        upstream_pixels = torch.cat([self.fragments.pixels, self.uncovered_pixels])
+        column_of_pixel[upstream_pixels] = torch.arange(upstream.shape[1], device=device)
+        force = self.radiance.new_zeros(pixels_at_crossings.shape[1])
         first_samples, second_samples = self.crossings.samples
-        # The two samples may lie in two pixels, which gain half each.
-        for pixels_of_side in pixels:
-            first = self._seen_radiance(first_samples, pixels_of_side)
-            second = self._seen_radiance(second_samples, pixels_of_side)
-            gradient = upstream[:, column_of_pixel[pixels_of_side]]
-            force += (gradient * (first - second)).sum(0)
+        # The pixels of both samples gain half of the difference each.
+        for pixels in pixels_at_crossings:
+            first_radiance = self._seen_radiance(first_samples, pixels)
+            second_radiance = self._seen_radiance(second_samples, pixels)
+            pixel_gradient = upstream[:, column_of_pixel[pixels]]
+            force += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
         return force
 
     def _seen_radiance(self, samples: Tensor, pixels: Tensor) -> Tensor:
-        """Return the radiance at K samples, or the background of K pixels if they show no mesh."""
+        """Look up the radiance at samples, or the background of pixels if a sample shows no mesh.
+
+        Args:
+            samples: Indices of K covered samples, or NOT_COVERED, shape (K,).
+            pixels: Row-major indices of K pixels, whose background is used for
+                NOT_COVERED, shape (K,).
+
+        Returns:
+            Radiance, shape (3, K).
+        """
         return torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
 
 
 def _by_homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
-    """Convert gradients by positions in the image to gradients by homogeneous positions.
+    """Convert gradients by image positions to gradients by homogeneous positions (chain rule).
 
     Args:
-        forces: Gradients by the positions (x, y), shape (N, 2).
-        places: Positions (x, y) in the image, shape (N, 2).
+        forces: Gradients by the image positions (x, y) of N points,
+            shape (N, 2).
+        places: Image positions (x, y), shape (N, 2).
         depth: Third homogeneous coordinate w, shape (N, 1).
 
     Returns:
@@ -357,7 +421,16 @@ def _by_homogeneous(forces: Tensor, places: Tensor, depth: Tensor) -> Tensor:
 
 
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
-    """Return the row-major indices of the pixels that hold samples at row-major positions."""
+    """Find the pixels to which samples of an image belong.
+
+    Args:
+        cells: Row-major indices of the samples among all samples of the image,
+            any shape.
+        fragments: View with the size of the image and its samples per pixel.
+
+    Returns:
+        Row-major indices of the pixels, same shape.
+    """
     samples = fragments.samples
     resolution = fragments.size * samples
     row = cells // resolution // samples
@@ -375,35 +448,38 @@ def _find_crossings(
     """Find where visible silhouettes pass between neighboring samples.
 
     Args:
-        fragments: Covered samples, with tensors on the CPU.
+        fragments: Covered samples of the view, with tensors on the CPU.
         positions: Homogeneous positions of the vertices, shape (V, 3).
-        nearness: Nearness of the vertices to the camera, which is linear in the
-            image, shape (V,).
+        nearness: Nearness of the vertices to the camera, shape (V,). On a plane,
+            it is a linear function of the image position. It is larger for
+            nearer points.
         faces: Vertex indices of all faces, shape (F, 3).
         sample_grid: Index of the covered sample at each sample of the image, or
             NOT_COVERED, shape (size · s, size · s).
 
     Returns:
-        Crossings in rows, and then in columns.
+        Crossings with rows of samples, and then crossings with columns.
     """
     x, y, w = positions.T
     points = np.stack([x / w, y / w, nearness]).T
-    # Positions in units of samples, x to the right and y down, shape (2, V).
+    # Positions in units of samples, x to the right and y down, shape (2, V). They are
+    # rounded as in the rasterizers.
     places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
     ends = _silhouette_edges(places, faces)
     if len(fragments.face) == 0:
-        # A mesh outside the image has no visible silhouettes.
+        # A mesh outside of the image has no visible silhouettes.
         ends = ends[:, :0]
     start = places[:, ends[0]]
     end = places[:, ends[1]]
-    # The normal is in an image whose y-axis points up.
+    # Normal of each edge, with y up. The edge (a, b) with y down has the normal (b, a).
     normal = np.stack([end[1] - start[1], end[0] - start[0]])
+    # The minimum avoids a division by 0 for edges without length.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), 1 / SUBSAMPLES)
     silhouettes = _Silhouettes(fragments, places, nearness, sample_grid, ends, normal)
     in_rows = silhouettes.crossings_along(X)
     in_columns = silhouettes.crossings_along(Y)
-    joined = [np.concatenate(pair, axis=-1) for pair in zip(in_rows, in_columns, strict=True)]
-    return Crossings(*map(torch.from_numpy, joined))
+    both = [np.concatenate(pair, axis=-1) for pair in zip(in_rows, in_columns, strict=True)]
+    return Crossings(*map(torch.from_numpy, both))
 
 
 @dataclass(frozen=True)
@@ -440,9 +516,16 @@ class _Silhouettes:
         resolution = len(self.sample_grid)
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
-        cuts = _cut(start[1 - axis], end[1 - axis], start[axis], end[axis], resolution)
+        # A line is a row for the axis X, and a column for the axis Y.
+        cuts = _cut_edges(
+            start_across=start[1 - axis],
+            end_across=end[1 - axis],
+            start_along=start[axis],
+            end_along=end[axis],
+            resolution=resolution,
+        )
         edge = cuts.edge
-        # Row-major positions of the samples after and before each cut.
+        # Row-major indices of the samples after and before each of the K cuts.
         if axis == X:
             after = cuts.line * resolution + cuts.next_sample
             before = after - 1
@@ -450,15 +533,18 @@ class _Silhouettes:
             after = cuts.next_sample * resolution + cuts.line
             before = after - resolution
         cells = np.stack([before, after])
+        # Indices of the covered samples, or NOT_COVERED, shape (2, K).
         samples = self.sample_grid.ravel()[cells].astype(np.int64)
         place = start[:, edge] + cuts.fraction * (end - start)[:, edge]
         surface_nearness = self._surface_nearness(samples, place)
         is_visible = self._is_visible(cuts, samples, surface_nearness)
-        # This coordinate grows with the distance from the farther sample.
+        # This coordinate grows with the distance of the cut from the sample that shows
+        # the farther surface.
         from_farther = np.where(surface_nearness[0] < surface_nearness[1], 1, -1) * place[axis]
         kept = np.flatnonzero(is_visible)
+        # Sort by the pair of samples, and then by the distance.
         kept = kept[np.lexsort([from_farther[kept], after[kept]])]
-        # If several cuts lie between the same two samples, the first one is kept.
+        # Keep the first cut between two samples.
         kept = kept[np.diff(after[kept], prepend=-1) != 0]
         return (
             self.ends[:, edge[kept]],
@@ -472,15 +558,17 @@ class _Silhouettes:
     def _is_visible(
         self, cuts: _Cuts, samples: np.ndarray, surface_nearness: np.ndarray
     ) -> np.ndarray:
-        """Tell which cuts are visible.
+        """Tell which of K cuts of silhouette edges are visible.
 
-        A cut is hidden if the surfaces at both samples beside it are nearer.
+        A cut is hidden if the surfaces at both samples beside the cut are nearer
+        than the edge.
 
         Args:
-            cuts: K cuts of the silhouette edges.
-            samples: Covered samples beside each cut, shape (2, K).
-            surface_nearness: Nearness of their surfaces at the cut,
-                shape (2, K).
+            cuts: The K cuts.
+            samples: Indices of the covered samples before and after each cut, or
+                NOT_COVERED, shape (2, K).
+            surface_nearness: Nearness, at each cut, of the surfaces that the two
+                samples show, shape (2, K).
 
         Returns:
             True for visible cuts, shape (K,).
@@ -492,23 +580,27 @@ class _Silhouettes:
         return (samples >= 0).any(axis=0) & is_in_front
 
     def _surface_nearness(self, samples: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Compute the nearness of the planes of faces at places in the image.
+        """Compute the nearness of the faces beside K cuts, extended to the position of the cut.
 
         Args:
-            samples: Covered samples that show the faces, or NOT_COVERED,
+            samples: Indices of the covered samples before and after each cut, or
+                NOT_COVERED, shape (2, K).
+            place: Image position (x, y) of each cut in units of samples,
                 shape (2, K).
-            place: Positions at which the planes are evaluated, in units of
-                samples, shape (2, K).
 
         Returns:
-            Nearness, shape (2, K). It is minus infinity for NOT_COVERED.
+            Nearness of the face that each sample shows, shape (2, K). It is minus
+            infinity for NOT_COVERED.
         """
         sample_to_seen_face = self.fragments.face.numpy()
+        # Vertices of the three corners, shape (2, K, 3). The index -1 (NOT_COVERED)
+        # selects an arbitrary face, whose result is replaced at the end.
         corners = self.fragments.corners.numpy()[sample_to_seen_face[samples]]
         nearness_of_corners = self.nearness[corners]
+        # x and y of the corners a, b and c, shape (2, K) each.
         (ax, bx, cx), (ay, by, cy) = np.moveaxis(self.places[:, corners], 3, 1)
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        # Faces without area get the nearness of their first corner.
+        # Dividing by infinity gives a face without area the nearness of corner a.
         area = np.where(area == 0, np.inf, area)
         # Barycentric weights of the corners b and c.
         weight_b = ((place[0] - ax) * (cy - ay) - (place[1] - ay) * (cx - ax)) / area
@@ -521,17 +613,17 @@ class _Silhouettes:
 
 
 class _Cuts(NamedTuple):
-    """K places where edges cross rows of samples, or columns of samples.
+    """K cuts: places where edges cross rows of samples, or columns of samples.
 
-    A line stands for a row or a column.
+    A line is a row if rows are cut, and a column if columns are cut.
 
     Attributes:
-        edge: Index of the edge, shape (K,).
-        line: Index of the line, shape (K,).
-        fraction: Position between start and end of the edge, from 0 to 1,
+        edge: Index of the edge of each cut, shape (K,).
+        line: Index of the line of each cut, shape (K,).
+        fraction: Position of the cut between the start (0) and the end (1) of
+            the edge, shape (K,).
+        next_sample: Index in the line of the first sample at or after the cut,
             shape (K,).
-        next_sample: Index in the line of the first sample at or after the
-            place, shape (K,).
     """
 
     edge: np.ndarray
@@ -540,32 +632,41 @@ class _Cuts(NamedTuple):
     next_sample: np.ndarray
 
 
-def _cut(
-    start: np.ndarray, end: np.ndarray, across: np.ndarray, end_across: np.ndarray, resolution: int
+def _cut_edges(
+    start_across: np.ndarray,
+    end_across: np.ndarray,
+    start_along: np.ndarray,
+    end_along: np.ndarray,
+    resolution: int,
 ) -> _Cuts:
-    """Cut edges at each line of samples between their starts and ends.
+    """Find where N edges cross the lines of samples, which are rows or columns.
 
-    Cuts before the first sample or after the last sample of a line are left
-    out. All coordinates are in units of samples.
+    Cuts before the first sample or after the last sample of a line are left out.
+    All coordinates are in units of samples. Line i has the coordinate i.
 
     Args:
-        start: Coordinate of the start of N edges across the lines, shape (N,).
-        end: Coordinate of their ends across the lines, shape (N,).
-        across: Coordinate of their starts along the lines, shape (N,).
-        end_across: Coordinate of their ends along the lines, shape (N,).
+        start_across: Coordinate of the start of each edge across the lines,
+            shape (N,).
+        end_across: Coordinate of the end of each edge across the lines,
+            shape (N,).
+        start_along: Coordinate of the start along the lines, shape (N,).
+        end_along: Coordinate of the end along the lines, shape (N,).
         resolution: Number of lines, and of samples in a line.
 
     Returns:
         Cuts in ascending order of the edge and then of the line.
     """
-    first = np.ceil(np.minimum(start, end)).clip(0, resolution).astype(np.int64)
-    last = np.ceil(np.maximum(start, end)).clip(0, resolution).astype(np.int64)
-    counts = last - first
-    edge = np.repeat(np.arange(len(start)), counts)
-    cuts_before_edge = np.cumsum(counts) - counts
-    line = np.arange(len(edge)) - (cuts_before_edge - first)[edge]
-    fraction = (line - start[edge]) / (end - start)[edge]
-    position = across[edge] + fraction * (end_across - across)[edge]
+    # An edge crosses the lines from first_line to end_line - 1.
+    lower = np.minimum(start_across, end_across)
+    upper = np.maximum(start_across, end_across)
+    first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
+    end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
+    cuts_per_edge = end_line - first_line
+    edge = np.repeat(np.arange(len(start_across)), cuts_per_edge)
+    cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
+    line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]
+    fraction = (line - start_across[edge]) / (end_across - start_across)[edge]
+    position = start_along[edge] + fraction * (end_along - start_along)[edge]
     next_sample = np.ceil(position).astype(np.int64)
     is_inside = (next_sample > 0) & (next_sample < resolution)
     return _Cuts(
@@ -577,64 +678,79 @@ def _cut(
 
 
 def _silhouette_edges(places: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Find the edges whose faces all lie on one side of them in the image.
+    """Find the edges of a mesh whose faces all lie on the same side of the edge in the image.
 
     Args:
-        places: Positions of the vertices in the image, shape (2, V).
+        places: Image positions (x, y) of the vertices, shape (2, V).
         faces: Vertex indices of the faces, shape (F, 3).
 
     Returns:
         Vertices at both ends of the N silhouette edges, shape (2, N).
     """
     edges = _edges(np.ascontiguousarray(faces, dtype=np.int64).tobytes())
+    # x and y of the corners a, b and c of each face, shape (F,) each.
     (ax, bx, cx), (ay, by, cy) = places.take(edges.corners, axis=1)
     orientation = np.sign((bx - ax) * (cy - ay) - (cx - ax) * (by - ay))
-    # A face lies to the left (+1) or to the right (-1) of its sides.
-    sides = (orientation * edges.direction).ravel()
-    sum_of_sides = np.bincount(edges.edge_of_side, sides, len(edges.face_count))
-    # A face that is seen edge-on is on neither side. One of two faces may be.
-    is_silhouette = np.abs(sum_of_sides) > edges.face_count - 2
+    # 1 and -1 if the face lies on one or the other side of its edge. The direction of
+    # an edge is from the lower to the higher vertex index.
+    face_sides = (orientation * edges.direction).ravel()
+    side_sums = np.bincount(edges.edge_of_face_side, face_sides, len(edges.face_count))
+    # All faces lie on the same side if the sum is ± the number of faces. A face that is
+    # seen edge-on counts 0, so one face of an edge may be missing in the sum.
+    is_silhouette = np.abs(side_sums) > edges.face_count - 2
     return edges.ends.take(np.flatnonzero(is_silhouette), axis=1)
 
 
 class _Edges(NamedTuple):
-    """N edges of a mesh of F faces.
+    """The N edges of a mesh with F faces.
+
+    Each face has three sides. An edge is a side of one or more faces.
 
     Attributes:
-        corners: Vertices of the faces, shape (3, F).
+        corners: Vertex indices of the three corners of each face, shape (3, F).
         ends: Vertices at both ends of each edge, the lower index first,
             shape (2, N).
-        edge_of_side: Edge of each of the three sides of the faces,
-            shape (3 F,).
-        direction: 1 for sides that lead to the vertex with the higher index,
-            and -1 for the others, shape (3, F).
+        edge_of_face_side: Index of the edge for each side of each face, the
+            first sides of all faces first, shape (3 F,).
+        direction: 1 for sides of faces that lead from the lower to the higher
+            vertex index, and -1 for other sides, shape (3, F).
         face_count: Number of faces at each edge, shape (N,).
     """
 
     corners: np.ndarray
     ends: np.ndarray
-    edge_of_side: np.ndarray
+    edge_of_face_side: np.ndarray
     direction: np.ndarray
     face_count: np.ndarray
 
 
 @lru_cache(maxsize=4)
-def _edges(faces: bytes) -> _Edges:
-    """Find the edges of faces (F, 3), given as the bytes of int64 numbers so that they hash."""
-    corners = np.ascontiguousarray(np.frombuffer(faces, dtype=np.int64).reshape(-1, 3).T)
-    # Shape (3, F), for the first and the second vertex of the three sides.
-    first, second = corners.take(EDGES, axis=0).swapaxes(0, 1)
-    low = np.minimum(first, second).ravel()
-    high = np.maximum(first, second).ravel()
+def _edges(face_bytes: bytes) -> _Edges:
+    """Find the edges of a mesh.
+
+    Args:
+        face_bytes: Bytes of an int64 array with the vertex indices of F faces,
+            shape (F, 3). Bytes can be hashed, so that the result can be cached.
+
+    Returns:
+        Edges of the mesh.
+    """
+    faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
+    corners = np.ascontiguousarray(faces.T)
+    # Vertices at the starts and at the ends of the three sides, shape (3, F) each.
+    start, end = corners.take(EDGES, axis=0).swapaxes(0, 1)
+    low = np.minimum(start, end).ravel()
+    high = np.maximum(start, end).ravel()
     vertex_count = int(high.max()) + 1
-    # np.unique sorts one number per side faster than a pair of vertices.
-    keys, edge_of_side, face_count = np.unique(
+    # Sides with the same key are the same edge. np.unique sorts one number per side
+    # faster than a pair of vertices.
+    keys, edge_of_face_side, face_count = np.unique(
         low * vertex_count + high, return_inverse=True, return_counts=True
     )
     return _Edges(
         corners=corners,
         ends=np.stack(np.divmod(keys, vertex_count)),
-        edge_of_side=edge_of_side.ravel(),
-        direction=np.where(first < second, 1.0, -1.0),
+        edge_of_face_side=edge_of_face_side.ravel(),
+        direction=np.where(start < end, 1.0, -1.0),
         face_count=face_count,
     )

@@ -1,4 +1,6 @@
-"""Rasterizers: OpenGL, NumPy and numba find the face that each sample of an image shows.
+"""Rasterizers, which find the nearest face at each sample of an image.
+
+There are three: opengl, numpy and numba.
 
 Each module of this package has a function
 
@@ -16,16 +18,17 @@ with these arguments:
 - closed: False draws faces from both sides. True promises that the mesh is
   watertight, that it lies within the range of depths, and that its faces are
   counter-clockwise seen from outside. Faces that are clockwise in the image are
-  then left out. The same samples are covered. Their ids only differ at samples
-  where a face that is seen from behind is as near as the nearest face within
-  rounding, as along silhouettes.
+  then left out. The same samples are covered with True and False. The face of a
+  sample can only differ where a face that is seen from behind is as near as the
+  nearest face up to rounding, such as along silhouettes.
 
-The result holds the index of the nearest face at each sample, or -1, int32,
-shape (N, R, R). Row 0 is at the top. If depths are equal, the lower index wins.
+The result is the index of the nearest face at each sample, or -1 if there is
+none, int32, shape (N, R, R). Row 0 is at the top. If two faces have the same
+depth, the face with the lower index is returned.
 
-All rasterizers round vertices to 1/256 of a sample, so faces that share an edge
-cover each sample once. The results of NumPy and numba are equal. OpenGL rounds
-depths differently.
+All rasterizers round vertices to 1/256 of a sample. A sample at the common edge
+of two faces is therefore covered by exactly one of them. NumPy and numba give
+the same results. OpenGL rounds depths differently.
 """
 
 from dataclasses import dataclass
@@ -37,8 +40,8 @@ from renderer.errors import InputError, require_choice
 from renderer.settings import RASTERIZERS
 from renderer.visibility.rasterizers import opengl
 
-# Points are clipped to this number of samples from the center of the image, so
-# that products of fixed-point coordinates fit in int64.
+# `Rasterizer.rasterize` clips projected points to a square around the image center
+# with this side in samples. Products of fixed-point coordinates then fit in int64.
 SPAN = 2**21
 
 
@@ -59,18 +62,18 @@ class Rasterizer:
     ) -> np.ndarray:
         """Find the nearest face at each sample of N images.
 
-        The module docstring of `renderer.visibility.rasterizers` describes the arguments in
-        detail.
-
         Args:
-            points: Projected vertices, float64, shape (N, V, 3).
+            points: Vertices as the N cameras project them, float64,
+                shape (N, V, 3). x and y are in [-1, 1] in the image, and the
+                third coordinate is the depth.
             faces: Vertex indices of the faces, shape (F, 3).
-            resolution: Number R of samples per side.
-            closed: Whether the mesh is watertight, so that faces that are seen
-                from behind are left out.
+            resolution: Number R of samples per side of an image.
+            closed: True promises that the mesh is watertight. Faces that are seen
+                from behind are then left out.
 
         Returns:
-            Index of the face at each sample, or -1, int32, shape (N, R, R).
+            Index of the nearest face at each sample, or -1, int32,
+            shape (N, R, R).
 
         Raises:
             ValueError: If a point is NaN or infinite.
@@ -78,7 +81,7 @@ class Rasterizer:
         lowest = points.min(initial=0)
         highest = points.max(initial=0)
         if not (np.isfinite(lowest) and np.isfinite(highest)):
-            raise ValueError("points holds NaN or infinity, but must be finite")
+            raise ValueError("points has NaN or infinite values: give finite values")
         limit = SPAN / resolution
         if max(-lowest, highest) > limit:
             points = np.clip(points, -limit, limit)
@@ -99,7 +102,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
 
     Raises:
         InputError: If the name is unknown, if "opengl" does not work on this
-            machine, or if "numba" is not installed.
+            machine, or if "numba" is chosen but not installed.
     """
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
@@ -107,7 +110,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     if rasterizer == "numpy":
         return Rasterizer("numpy", "numpy")
     try:
-        # This import takes half a second.
+        # numba is imported here because the import takes half a second.
         from renderer.visibility.rasterizers import numba
 
         return Rasterizer("numba", f"numba ({numba.VERSION})")

@@ -1,9 +1,11 @@
-"""Compiled rasterizer, which draws one triangle after another.
+"""Rasterizer that is compiled with numba and draws one triangle after another.
 
-The arithmetic is that of `renderer.visibility.rasterizers.numpy`.
+The arithmetic and the results are the same as in
+`renderer.visibility.rasterizers.numpy`. numba stores the machine code in
+__pycache__. If this folder is read-only, numba stores it below ~/.cache.
 
-The results are equal to those of `renderer.visibility.rasterizers.numpy`. numba stores the
-machine code in __pycache__ or, if that folder is read-only, below ~/.cache.
+Positions are fixed-point numbers: integers in units of a subsample, which is
+1 / 2^bits of a sample. x points to the right and y down.
 """
 
 from __future__ import annotations
@@ -19,13 +21,13 @@ from renderer.visibility.rasterizers.numpy import FAR, SUBSAMPLE_BITS, to_fixed_
 
 try:
     import numba
-except ImportError as error:  # numba also raises this for a version of NumPy that it does not know.
+except ImportError as error:  # numba also raises this if it does not support the version of NumPy.
     raise InputError(
         f"numba cannot be imported ({error}): pip install numba, or choose the rasterizer numpy"
     ) from error
 
 VERSION = numba.__version__
-# Types of the arguments of `_draw`.
+# Types of the arguments and of the result of `_draw` for the compiler.
 TYPES = (
     "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
 )
@@ -46,35 +48,63 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     Raises:
         IndexError: If a face has a vertex that does not exist.
     """
-    # The compiled code does not look for negative indices if they are unsigned.
+    # Unsigned indices are faster, because the compiled code need not handle negative
+    # indices.
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)
     if corners.max(initial=0) >= points.shape[1]:
-        raise IndexError(f"faces has vertex indices beyond the {points.shape[1]} vertices")
+        raise IndexError(
+            f"faces has vertex indices outside of 0 to {points.shape[1] - 1}: "
+            "give indices of vertices"
+        )
     ids = np.full((len(points), resolution, resolution), -1, dtype=np.int32)
-    # Depths are whole numbers of 24 bits, which float32 holds exactly.
-    nearest = np.empty(ids.shape[1:], dtype=np.float32)
-    for view, view_ids in zip(points, ids, strict=True):
-        nearest.fill(FAR)
-        positions, depths = to_fixed_point(view, resolution)
-        _draw(positions, depths, corners, closed, SUBSAMPLE_BITS, view_ids, nearest)
+    # Depths are whole numbers with 24 bits, which float32 can store exactly.
+    nearest_depths = np.empty(ids.shape[1:], dtype=np.float32)
+    for view_points, view_ids in zip(points, ids, strict=True):
+        nearest_depths.fill(FAR)
+        positions, depths = to_fixed_point(view_points, resolution)
+        _draw(positions, depths, corners, closed, SUBSAMPLE_BITS, view_ids, nearest_depths)
     return ids
 
 
-# The error model of NumPy leaves out checks for divisors of 0. There are none.
+# With the error model "numpy", the compiled code does not check whether a divisor is 0.
+# The code never divides by 0, because triangles without area are skipped.
 _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function with arguments of TYPES, and store the machine code if possible."""
+    """Compile a function for arguments of the types TYPES.
+
+    The machine code is stored in a file, so that the next process need not
+    compile the function again.
+
+    Args:
+        function: Function to compile.
+
+    Returns:
+        Compiled function.
+    """
+    # numba may raise any exception if its cache is read-only or damaged.
     try:
         return _njit(TYPES, cache=True)(function)
-    except Exception:  # numba has no narrower class for a read-only or damaged cache.
+    except Exception:
         return _njit(TYPES)(function)
 
 
 @_njit
 def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
-    """Compute twice the signed area of a triangle, negative if it is counter-clockwise."""
+    """Compute twice the signed area of the triangle with the vertices a, b and c.
+
+    Args:
+        x: x of all vertices, shape (V,).
+        y: y of all vertices, pointing down, shape (V,).
+        a: Index of the first vertex.
+        b: Index of the second vertex.
+        c: Index of the third vertex.
+
+    Returns:
+        Area, which is negative for a triangle that is counter-clockwise in the
+        image.
+    """
     return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
 
 
@@ -82,16 +112,40 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 def _covered_range(
     coordinates: Any, a: int, b: int, c: int, bits: int, resolution: int
 ) -> tuple[int, int]:
-    """Find the rows, or the columns, that a triangle can cover: the first one, and the end."""
+    """Find the range of rows, or of columns, in which a triangle can cover samples.
+
+    Args:
+        coordinates: y of all vertices for rows, or x for columns, shape (V,).
+        a: Index of the first vertex of the triangle.
+        b: Index of the second vertex.
+        c: Index of the third vertex.
+        bits: Number of fractional bits of the coordinates.
+        resolution: Number of rows or columns.
+
+    Returns:
+        The first row, and the first row after the range.
+    """
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
-    # Negating before and after the shift rounds up.
+    # A shift by `bits` divides and rounds down. Both signs make it round up.
     return max(-(-least >> bits), 0), min(-(-greatest >> bits), resolution)
 
 
 @_njit
 def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort the corners (ax, ay), (bx, by) and (cx, cy) by y, from the top to the bottom."""
+    """Sort three corners by y, from the top to the bottom.
+
+    Args:
+        ax: x of the first corner.
+        ay: y of the first corner, pointing down.
+        bx: x of the second corner.
+        by: y of the second corner.
+        cx: x of the third corner.
+        cy: y of the third corner.
+
+    Returns:
+        x and y of the top, the middle and the bottom corner, six numbers.
+    """
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     if by > cy:
@@ -103,11 +157,20 @@ def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
 
 @_njit
 def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> int:
-    """Find the first column at or after the place where a row crosses an edge.
+    """Find the first column at or after the point at which a row crosses an edge.
 
-    All coordinates are in subsamples. The edge leads from (x, y) to
-    (to_x, to_y).
+    Args:
+        x: x of the start of the edge in subsamples.
+        y: y of the start.
+        to_x: x of the end of the edge in subsamples.
+        to_y: y of the end, not equal to y.
+        row_y: y of the row in subsamples.
+        bits: Number of fractional bits of the coordinates.
+
+    Returns:
+        Column.
     """
+    # // rounds down, and the minus sign before it makes the result round up.
     return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << bits))
 
 
@@ -115,19 +178,21 @@ def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> in
 def _draw(
     positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids: Any, nearest: Any
 ) -> None:
-    """Draw the faces of one view in place.
+    """Draw the faces of one view into an image of face indices, in place.
 
-    Faces are drawn in ascending order, so that the lower index stays if depths
-    are equal.
+    Faces are drawn in ascending order. If two faces have the same depth at a
+    sample, the face with the lower index therefore stays.
 
     Args:
         positions: Fixed-point positions of the vertices, shape (2, V).
         depths: Depths of the vertices, from 0 to FAR, shape (V,).
         faces: Vertex indices of the faces, shape (F, 3).
-        closed: Whether faces that are clockwise in the image are left out.
+        closed: True leaves out faces that are clockwise in the image.
         bits: Number of fractional bits of the positions.
-        ids: Index of the face at each sample, changed in place, shape (R, R).
-        nearest: Depth at each sample, changed in place, shape (R, R).
+        ids: Index of the nearest face at each sample, changed in place,
+            shape (R, R).
+        nearest: Depth of this face at each sample, changed in place,
+            shape (R, R).
     """
     x = positions[0]
     y = positions[1]
@@ -142,30 +207,35 @@ def _draw(
         left, right = _covered_range(x, i, j, k, bits, resolution)
         if top >= bottom or left >= right:
             continue
-        # Duplicate faces with sorted corners have exactly the same depth. The first
-        # one stays.
+        # Two faces with the same vertices in another order must get exactly the same
+        # depth, so that the first face stays. The corners are therefore sorted.
         a = min(i, j, k)
         c = max(i, j, k)
         b = i + j + k - a - c
+        # The depth is a linear function of column and row. Its slopes per sample:
         to_b = depths[b] - depths[a]
         to_c = depths[c] - depths[a]
         scale = subsamples / _doubled_area(x, y, a, b, c)
         slope_x = (to_b * (y[c] - y[a]) - to_c * (y[b] - y[a])) * scale
         slope_y = (to_c * (x[b] - x[a]) - to_b * (x[c] - x[a])) * scale
+        # Column and row of corner a, in samples.
         first_column = x[a] / subsamples
         first_row = y[a] / subsamples
         ax, ay, bx, by, cx, cy = _sort_downward(x[a], y[a], x[b], y[b], x[c], y[c])
         for row in range(top, bottom):
             row_y = row << bits
             row_depth = depths[a] + (row - first_row) * slope_y
-            # A row crosses the longest edge and one of the two other edges.
-            one = _crossing(ax, ay, cx, cy, row_y, bits)
-            other = (
+            # A row crosses the edge from the top to the bottom corner, and one of the
+            # two other edges.
+            long_edge = _crossing(ax, ay, cx, cy, row_y, bits)
+            short_edge = (
                 _crossing(ax, ay, bx, by, row_y, bits)
                 if row_y < by
                 else _crossing(bx, by, cx, cy, row_y, bits)
             )
-            for column in range(max(min(one, other), 0), min(max(one, other), resolution)):
+            first = max(min(long_edge, short_edge), 0)
+            end = min(max(long_edge, short_edge), resolution)
+            for column in range(first, end):
                 sample = np.uint64(row), np.uint64(column)
                 depth = np.rint(row_depth + slope_x * (column - first_column))
                 if 0 <= depth < nearest[sample]:

@@ -1,4 +1,4 @@
-"""NumPy rasterizer with fixed-point corners and exact integer arithmetic, as GPUs have.
+"""NumPy rasterizer with fixed-point corners and exact integer arithmetic, as on GPUs.
 
 Corners (x, y) are integers in 1/256 of a sample. In the row y = 256 r, an edge
 from (x₀, y₀) to (x₁, y₁) begins at the column
@@ -19,7 +19,8 @@ index if depths are equal.
 Only covered samples are computed: triangles are split into rows, and rows into
 samples. This happens in blocks that stay in the cache of the processor. The
 longest axis is the last axis of every array. An array of triangles has shape
-(2, 3, T), for x and y, three corners and T triangles.
+(2, 3, T), for x and y, three corners and T triangles. x points to the right and
+y down.
 """
 
 from collections.abc import Iterator
@@ -27,20 +28,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Corners are rounded to multiples of 1 / SUBSAMPLES of a sample.
+# Positions are integers in units of a subsample, which is 1 / SUBSAMPLES of a sample.
 SUBSAMPLE_BITS = 8
 SUBSAMPLES = 2**SUBSAMPLE_BITS
-# Depth of the far plane, with 24 bits. Surfaces at the far plane are not drawn.
+# Depth of the far plane. Depths are integers with 24 bits. Surfaces at the far plane
+# are not drawn.
 FAR = 2**24 - 1
-# Number of bits of a key that hold the index of the face.
+# Number of low bits of a key that hold the index of the face. The depth is above them.
 FACE_BITS = 32
-# Key of samples without a face. It is less than any key at the far plane, and
-# its index is -1.
+# Key of samples without a face. It is less than any key at the far plane, and its low
+# bits are the face index -1.
 EMPTY = (FAR << FACE_BITS) - 1
-# Number of faces that are processed at once, so that their arrays stay in the
-# cache of the processor.
+# Number of faces that `_keys` processes at once. The arrays of so many faces stay in
+# the cache of the processor.
 FACES = 2**14
-# Number of rows, or of samples, that are processed at once, for the same reason.
+# Number of rows of triangles, or of samples of rows, that `_parts` returns at once.
+# Arrays of this length stay in the cache of the processor.
 PARTS = 2**13
 
 
@@ -58,7 +61,7 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
-        # The conversion to int32 keeps the lower half of each key.
+        # The conversion to int32 keeps the lower half of each key, the face index.
         view_ids[:] = _keys(view, faces, resolution, closed).reshape(view_ids.shape)
     return ids
 
@@ -80,26 +83,30 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
     for begin in range(0, len(faces), FACES):
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
         drawn = _cull(positions.take(block, axis=1), resolution, closed)
-        # Duplicate faces with sorted corners have exactly the same depth. The lower
-        # index wins.
+        # Two faces with the same vertices in another order must get exactly the same
+        # depth, so that the lower index wins. The corners are therefore sorted.
         corners = _sort(block.take(drawn.triangle_index, axis=1))
         triangles = positions.take(corners, axis=1)
         edges = _edges(triangles)
         planes = _planes(triangles, depths.take(corners))
         face_ids = drawn.triangle_index + begin
+        # First split triangles into rows, and then rows into samples.
         for triangle, row in _parts(drawn.row_count):
             row += drawn.first_row.take(triangle)
             left, right = _crossings(edges, triangle, row, resolution)
+            # One entry for each span, which is a row of a triangle.
             x, y, depth, slope_x, slope_y = planes.take(triangle, axis=1)
             depth_at_row = depth + (row - y) * slope_y
             first_offset = left - x
             first_sample = row * resolution + left
             face = face_ids.take(triangle)
+            # One entry for each covered sample, which is number `step` of its span.
             for span, step in _parts(right - left):
                 offset = first_offset.take(span) + step
                 exact_depth = depth_at_row.take(span) + slope_x.take(span) * offset
                 rounded = np.rint(exact_depth).astype(np.int64)
-                # Negative depths are large as unsigned numbers.
+                # As unsigned numbers, negative depths are larger than FAR. They are in
+                # front of the near plane and not drawn.
                 clipped = np.minimum(rounded.view(np.uint64), FAR).view(np.int64)
                 sample_keys = (clipped << FACE_BITS) | face.take(span)
                 np.minimum.at(keys, first_sample.take(span) + step, sample_keys)
@@ -107,28 +114,31 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
 
 
 def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Convert projected points to fixed-point positions and depths.
+    """Convert projected points to fixed-point positions and to depths from 0 to FAR.
 
-    As on GPUs, positions are converted to float32 after one multiplication and
-    addition, and then rounded to subsamples.
+    As on GPUs, positions in samples are computed with one multiplication and one
+    addition, rounded to float32, and then rounded to subsamples.
 
     Args:
-        points: Projected points, shape (V, 3).
+        points: Projected points (x, y, depth), with the image in [-1, 1] and the
+            near plane at the depth -1, shape (V, 3).
         resolution: Number of samples per side of the image.
 
     Returns:
         A tuple of
         - x to the right and y down from the center of the first sample, in
-          1 / SUBSAMPLES of a sample, int64, shape (2, V);
-        - depths between 0 and FAR, float64, shape (V,).
+          subsamples, int64, shape (2, V);
+        - depths, float64, shape (V,).
     """
     half = resolution / 2
+    # Positions in samples from the top left corner of the image. The product with a
+    # float64 array is float64, so the result is only rounded once, in the next step.
     window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]])
     window += half
-    # The window is float64 until here, so that its values are rounded once.
     snapped = window.astype(np.float32)
     snapped *= SUBSAMPLES
     positions = np.rint(snapped, out=snapped).astype(np.int64)
+    # Measure from the center of the first sample instead of its corner.
     positions -= SUBSAMPLES // 2
     depths = points[:, 2] + 1
     depths /= 2
@@ -137,12 +147,14 @@ def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.
 
 
 class _Drawn(NamedTuple):
-    """T triangles that are drawn.
+    """T triangles that may cover samples.
 
     Attributes:
-        triangle_index: Index of each triangle among those given, shape (T,).
-        first_row: First row that each triangle can cover, shape (T,).
-        row_count: Number of rows that each triangle can cover, shape (T,).
+        triangle_index: Index of each triangle among all triangles, shape (T,).
+        first_row: First row in which each triangle can cover samples,
+            shape (T,).
+        row_count: Number of rows in which each triangle can cover samples,
+            shape (T,).
     """
 
     triangle_index: np.ndarray
@@ -159,12 +171,13 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
     triangle, and end before its greatest coordinate.
 
     Args:
-        triangles: Corners of F triangles, shape (2, 3, F).
+        triangles: Positions (x, y) of the three corners of F triangles in
+            subsamples, shape (2, 3, F).
         resolution: Number of samples per side.
-        closed: Whether clockwise triangles are left out.
+        closed: True leaves out triangles that are clockwise in the image.
 
     Returns:
-        Triangles that are drawn.
+        Triangles that may cover samples.
     """
     areas = _doubled_areas(triangles)
     # Columns and rows, shape (2, F).
@@ -181,33 +194,58 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
 
 
 def _doubled_areas(triangles: np.ndarray) -> np.ndarray:
-    """Compute twice the signed areas of triangles, negative if they are counter-clockwise."""
+    """Compute twice the signed areas of F triangles.
+
+    Args:
+        triangles: Positions (x, y) of the three corners, with y pointing down,
+            shape (2, 3, F).
+
+    Returns:
+        Areas, shape (F,). They are negative for triangles that are
+        counter-clockwise in the image.
+    """
     (ax, bx, cx), (ay, by, cy) = triangles
     return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
 
 
 def _next_sample(positions: np.ndarray) -> np.ndarray:
-    """Find the first row, or the first column, at or after each position."""
+    """Find the first row, or the first column, at or after each position.
+
+    Args:
+        positions: Positions in subsamples, any shape.
+
+    Returns:
+        Rows or columns, same shape.
+    """
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
 def _sort(corners: np.ndarray) -> np.ndarray:
-    """Sort three values per column, shape (3, T), several times faster than np.sort."""
+    """Sort the three values of each column, several times faster than np.sort.
+
+    Args:
+        corners: Integers, shape (3, T).
+
+    Returns:
+        The smallest, the middle and the largest value of each column,
+        shape (3, T).
+    """
     least = corners.min(axis=0)
     greatest = corners.max(axis=0)
     return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
 
 
 class _EdgeLines(NamedTuple):
-    """Lines of the three edges of T triangles.
+    """Lines through the three edges of T triangles.
 
-    The edges lead from the top corner to the bottom corner, from the top corner
-    to the middle corner, and from the middle corner to the bottom corner. A row
-    crosses an edge at the column -(slope · row + constant) / height.
+    The first edge leads from the top corner to the bottom corner, the second one
+    from the top corner to the middle corner, and the third one from the middle
+    corner to the bottom corner. A row crosses an edge at the column
+    -(slope · row + constant) / height.
 
     Attributes:
-        coefficients: Slope, constant and height of the three edges,
-            shape (3, 3, T).
+        coefficients: Slope, constant and height (axis 0) of the three edges
+            (axis 1), shape (3, 3, T).
         middle_row: First row at or after the middle corner, shape (T,).
     """
 
@@ -216,15 +254,23 @@ class _EdgeLines(NamedTuple):
 
 
 def _edges(triangles: np.ndarray) -> _EdgeLines:
-    """Find the lines of the edges of triangles, shape (2, 3, T)."""
+    """Compute the lines through the edges of T triangles.
+
+    Args:
+        triangles: Positions (x, y) of the three corners in subsamples,
+            shape (2, 3, T).
+
+    Returns:
+        Lines of the edges.
+    """
     x, y = triangles
-    # One number per corner holds y in its upper 32 bits and x in its lower 32
-    # bits. Sorting these numbers sorts the corners from the top to the bottom.
-    # Sums of three numbers in `_sort` may overflow, and their differences wrap
-    # back.
+    # Sort the corners from the top to the bottom. One number per corner holds y in its
+    # upper 32 bits and x in its lower 32 bits. In `_sort`, the sum of three such
+    # numbers may overflow, but the differences are right again.
     downward = _sort((y << 32) + x)
     x = ((downward + 2**31) & (2**32 - 1)) - 2**31
     y = (downward - x) >> 32
+    # Sorted corners at the starts and ends of the three edges.
     start = [0, 0, 1]
     end = [2, 1, 2]
     dx = x[end] - x[start]
@@ -238,38 +284,41 @@ def _edges(triangles: np.ndarray) -> _EdgeLines:
 def _crossings(
     edges: _EdgeLines, triangle: np.ndarray, row: np.ndarray, resolution: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the columns that triangles cover in rows.
+    """Find the columns that a triangle covers in a row, for N pairs of a triangle and a row.
 
     Args:
         edges: Lines of the edges of T triangles.
-        triangle: Index of the triangle of each of N parts, shape (N,).
-        row: Row of each part, shape (N,).
+        triangle: Index of the triangle of each pair, shape (N,).
+        row: Row of each pair, shape (N,).
         resolution: Number of samples per side.
 
     Returns:
-        A tuple of the first covered column, and the first column after it that
-        is not covered, shape (N,) each.
+        The first covered column, and the first column after the covered columns,
+        shape (N,) each.
     """
-    is_below = row >= edges.middle_row.take(triangle)
-    # A row crosses the first edge, and the second or the third edge. The
-    # coefficients of the three edges follow each other.
-    short_edge = triangle + (1 + is_below) * len(edges.middle_row)
-    crossed = np.stack([triangle, short_edge])
-    slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed, axis=1)
+    is_below_middle = row >= edges.middle_row.take(triangle)
+    # A row crosses the first edge, and the second or the third edge. In the flattened
+    # coefficients, the second edges of all T triangles follow the first edges.
+    triangle_count = len(edges.middle_row)
+    short_edge = triangle + (1 + is_below_middle) * triangle_count
+    crossed_edges = np.stack([triangle, short_edge])
+    slope, constant, height = edges.coefficients.reshape(3, -1).take(crossed_edges, axis=1)
+    # // rounds down, and the minus sign before it makes the result round up.
     columns = (-((slope * row + constant) // height)).clip(0, resolution)
     return np.minimum(*columns), np.maximum(*columns)
 
 
 def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Compute the depth of triangles as a linear function of column and row.
+    """Compute the depth of T triangles as a linear function of column and row.
 
     Args:
-        triangles: Corners, shape (2, 3, T).
+        triangles: Positions (x, y) of the three corners in subsamples,
+            shape (2, 3, T).
         depths: Depths of the corners, shape (3, T).
 
     Returns:
-        Column, row and depth of the first corner, and the slopes of the depth
-        per column and per row, shape (5, T).
+        Five rows: the column, the row and the depth of the first corner, and the
+        slopes of the depth per column and per row, shape (5, T).
     """
     (ax, bx, cx), (ay, by, cy) = triangles
     depth_a, depth_b, depth_c = depths
@@ -282,14 +331,17 @@ def _planes(triangles: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Split items into parts, about PARTS at a time, and keep all parts of an item together.
+    """List the parts of items, in blocks of about PARTS parts.
+
+    For example, items with 2 and 3 parts give the item indices 0, 0, 1, 1, 1 and
+    the part numbers 0, 1, 0, 1, 2. All parts of an item are in the same block.
 
     Args:
-        counts: Number of parts of each item.
+        counts: Number of parts of each item, shape (N,).
 
     Yields:
-        A tuple of the index of the item, and the number of the part in its item
-        from 0, for each part of a block.
+        For a block of B parts, the index of the item of each part, and the number
+        of the part in its item, shape (B,) each.
     """
     ends = np.cumsum(counts)
     starts = ends - counts

@@ -51,7 +51,7 @@ void main() {
 """
 
 
-# Bytes of a float32 coordinate.
+# Number of bytes of a float32 coordinate.
 FLOAT_BYTES = 4
 
 
@@ -71,8 +71,9 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
         InputError: If there is no EGL device, or if the driver fails or renders
             wrong ids.
     """
-    # Duplicate faces that begin with the same vertex have exactly the same depth.
-    # The first one stays. A cyclic permutation keeps the orientation.
+    # Two faces with the same vertices must get exactly the same depth, so that the first
+    # face stays. This needs vertices in the same order. If the orientation matters, only
+    # cyclic permutations are allowed.
     if closed:
         lowest = faces.argmin(axis=1)[:, None]
         ordered = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
@@ -83,10 +84,10 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 
 
 def device() -> str:
-    """Return the name of the device of the OpenGL driver.
+    """Return the name of the device on which OpenGL draws.
 
     Returns:
-        Name of the device.
+        Name of the device, such as the name of a GPU or "llvmpipe".
 
     Raises:
         InputError: If there is no EGL device, or if the driver fails or renders
@@ -98,7 +99,16 @@ def device() -> str:
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
-    """Create an OpenGL context, check it, and release it at the end of the block."""
+    """Create an OpenGL context for a `with` block, and check that it draws correctly.
+
+    Yields:
+        Context, which is released at the end of the block.
+
+    Raises:
+        InputError: If there is no EGL device, or if the driver fails or renders
+            wrong ids.
+    """
+    # See the module docstring.
     with suppress(ImportError):
         import triton  # noqa: F401
     import moderngl
@@ -108,7 +118,8 @@ def _context() -> Iterator[moderngl.Context]:
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]
     except Exception as error:  # moderngl raises no narrower class.
         raise InputError(
-            "no EGL device was found: apt install libegl1 libgl1, or choose the rasterizer numpy"
+            "the rasterizer opengl found no EGL device: apt install libegl1 libgl1, or choose the "
+            "rasterizer numpy"
         ) from error
     try:
         _check(context)
@@ -122,10 +133,13 @@ def _context() -> Iterator[moderngl.Context]:
 
 
 def _check(context: moderngl.Context) -> None:
-    """Raise InputError if the driver renders wrong ids in a test image.
+    """Draw a test image, and raise InputError if the driver renders wrong face ids.
 
-    The image shows a large triangle twice, first seen from behind and then from
-    the front, and a small triangle in front of it.
+    Face 0 is a large triangle that is seen from behind, face 1 is the same
+    triangle seen from the front, and face 2 is a small triangle in front of them.
+
+    Args:
+        context: OpenGL context.
     """
     large_triangle = [[-1, -1, 0], [3, -1, 0], [-1, 3, 0]]
     small_triangle = [[-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]
@@ -148,7 +162,19 @@ def _check(context: moderngl.Context) -> None:
 def _draw(
     context: moderngl.Context, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool
 ) -> np.ndarray:
-    """Draw the views in a context, see `rasterize` for the arguments and the result."""
+    """Draw N views and read the face ids.
+
+    Args:
+        context: OpenGL context.
+        points: Projected vertices, float64, shape (N, V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        resolution: Number R of samples per side.
+        closed: True leaves out faces that are clockwise in the image.
+
+    Returns:
+        Index of the nearest face at each sample, or -1, int32,
+        shape (N, R, R).
+    """
     import moderngl
 
     size = (resolution, resolution)
@@ -160,11 +186,11 @@ def _draw(
     framebuffer.use()
     culling = moderngl.CULL_FACE if closed else moderngl.NOTHING
     context.enable_only(moderngl.DEPTH_TEST | culling)
-    # The rows of the result go down, so counter-clockwise faces are clockwise
-    # for OpenGL.
+    # The vertex shader turns the image upside down, because OpenGL stores the lowest row
+    # first. This makes counter-clockwise faces clockwise.
     context.front_face = "cw"
-    # If depths are equal, the face that was drawn first stays. It has the lower
-    # index.
+    # With "<", the face that was drawn first stays if depths are equal. Faces are drawn
+    # in ascending order of their indices.
     context.depth_func = "<"
 
     ids_from_one = np.empty((len(points), *size), dtype=np.int32)
