@@ -24,23 +24,25 @@ from renderer.errors import (
 from renderer.settings import MAX_VIEWS
 from renderer.validation import as_array, require_whole
 
-# How the axes of a camera of others lie, see `PinholeCamera.from_matrix`.
+# Names for the directions of the axes of other programs' cameras, see
+# `PinholeCamera.from_matrix`.
 CONVENTIONS = ("opencv", "opengl")
-# Default of `Camera.clip_range`. A normalized mesh has a radius of at most √3.
+# Default of `Camera.clip_range` in world units. It shows all of a normalized mesh, whose
+# vertices are at most √3 from the origin.
 CLIP_RANGE = 2.0
-# Largest polar angle and largest first azimuth of an orbit in degrees: two turns.
+# Largest polar angle, roll and first azimuth of an orbit in degrees: two turns.
 MAX_TURN = 720.0
-# Limits of the field of view in degrees.
+# Limits of the field of view in degrees, for `orbit_cameras` and projectors.
 MIN_FOV = 0.05
 MAX_FOV = 172.0
-# Distance of the near plane from a perspective camera is at least this fraction
-# of the distance of the camera. A mesh that comes nearer raises an error.
+# Smallest depth of the near plane of a perspective camera, as a fraction of the distance
+# of the camera from the origin. A mesh with a smaller depth raises an error.
 NEAREST = 0.01
-# All points before a pinhole camera have at least this fraction of the depth of
-# the farthest point.
+# Smallest depth of a point in front of a pinhole camera, as a fraction of the depth of
+# the farthest point. A mesh with a smaller depth raises an error.
 MIN_DEPTH_RATIO = 1e-3
-# Largest difference of the product of a rotation matrix and its transpose from
-# the identity, and largest skew in units of the focal length.
+# Largest difference between R Rᵀ and the identity for a rotation matrix R, and largest
+# skew of intrinsics, divided by the focal length.
 MATRIX_TOLERANCE = 1e-4
 
 
@@ -62,8 +64,8 @@ class Camera(ABC):
             in world units.
         up: Position of the origin in the image, above the center in world
             units.
-        clip_range: Surfaces are visible if their depth differs from the depth of the
-            origin by at most this, in world units.
+        clip_range: Largest difference between the depth of a visible surface and
+            the depth of the origin, in world units.
         distance: Distance of the camera from the origin in world units.
 
     Raises:
@@ -80,7 +82,8 @@ class Camera(ABC):
     clip_range: float = field(default=CLIP_RANGE, kw_only=True)
 
     distance: ClassVar[float]
-    # Only a `PinholeCamera` has other values.
+    # Principal point and aspect ratio of the pixels. Only a `PinholeCamera` has other
+    # values.
     principal_right: ClassVar[float] = 0.0
     principal_up: ClassVar[float] = 0.0
     pixel_aspect: ClassVar[float] = 1.0
@@ -107,24 +110,24 @@ class Camera(ABC):
         return self.distance + self.clip_range
 
     def with_clip_range(self, radius: float) -> Self:
-        """Return a camera that shows a ball around the origin in its full depth.
+        """Return a camera whose clipping range contains a ball around the origin.
 
         Args:
             radius: Radius of the ball in world units.
 
         Returns:
-            This camera if its clipping range suffices, and otherwise a copy with a
-            larger clipping range.
+            This camera if its clipping range is large enough. Otherwise a copy
+            with a larger clipping range.
         """
         if radius <= self.clip_range:
             return self
         return replace(self, clip_range=math.floor(radius) + 1.0)
 
     def fixed(self) -> Self:
-        """Return a camera with numbers instead of tensors.
+        """Return a camera whose fields are numbers instead of tensors.
 
         Returns:
-            This camera if it has no tensors, and otherwise a copy.
+            This camera if no field is a tensor. Otherwise a copy.
         """
         numbers: dict[str, Any] = {}
         for name, value in vars(self).items():
@@ -150,7 +153,7 @@ class Camera(ABC):
         """
         factor = log_distance.exp()
         moved: dict[str, Any] = {"polar": self.polar + polar, "azimuth": self.azimuth + azimuth}
-        # The distance of an orthographic camera is no field.
+        # An orthographic camera has no field `distance`.
         for name in ("width", "distance"):
             if name in vars(self):
                 moved[name] = getattr(self, name) * factor
@@ -178,7 +181,7 @@ class Camera(ABC):
             "width": scale * self.width,
             "clip_range": scale * self.clip_range,
         }
-        # The distance of an orthographic camera is no field.
+        # An orthographic camera has no field `distance`.
         if "distance" in vars(self):
             distance = self.distance - back
             if not distance > 0:
@@ -205,7 +208,7 @@ class Camera(ABC):
         cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
-        # This is the sine of the polar angle.
+        # This equals the sine of the polar angle.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
         up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
@@ -225,15 +228,20 @@ class Camera(ABC):
         return np.vstack([columns, [0, 0, 0, 1]])
 
     def _from_center(self, points: np.ndarray) -> np.ndarray:
-        """Return points relative to the point that the camera is turned about."""
+        """Subtract the point about which attacks turn the camera. Here, it is the origin.
+
+        Args:
+            points: Points in world axes, shape (..., 3).
+        """
         return points
 
     def eye(self) -> np.ndarray:
-        """Return where the camera is, in homogeneous world coordinates.
+        """Return the position of the camera in homogeneous world coordinates.
 
         Returns:
-            For an orthographic camera, the unit vector to the camera and 0. For
-            a perspective camera, its position and 1. Float64, shape (4,).
+            For a perspective camera, the position and 1. For an orthographic
+            camera, which is infinitely far away, the unit vector to the camera
+            and 0. Float64, shape (4,).
         """
         return np.append(self.axes()[2], 0.0)
 
@@ -281,7 +289,16 @@ class Camera(ABC):
         return torch.stack([x, y, w]).T, nearness
 
     def _coordinates(self, points: Tensor) -> Tensor:
-        """Return the coordinates (right, up, back) of points (V, 3), shape (3, V)."""
+        """Convert points from world axes to the axes right, up and back of the camera.
+
+        Unlike `axes`, the result is differentiable with respect to the angles.
+
+        Args:
+            points: V points in world axes, shape (V, 3).
+
+        Returns:
+            Coordinates right, up and back from the origin, shape (3, V).
+        """
         polar = _as_tensor(_in_radians(self.polar), points)
         azimuth = _as_tensor(_in_radians(self.azimuth), points)
         sin_polar = polar.sin()
@@ -300,11 +317,11 @@ class Camera(ABC):
         """Compute w and the nearness of points, see `homogeneous`.
 
         Args:
-            back: Coordinate of the points along the axis from the origin to the
+            back: Coordinate of V points along the axis from the origin to the
                 camera, in world units, shape (V,).
 
         Returns:
-            A tuple of w and the nearness, shape (V,) each.
+            The number w and the nearness of each point, shape (V,) each.
         """
 
     def depths(self, points: np.ndarray) -> np.ndarray | None:
@@ -350,7 +367,7 @@ class OrthographicCamera(Camera):
         return coordinates.T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ones and the coordinate toward the camera."""
+        """Return w = 1, and the coordinate toward the camera as nearness. See `Camera`."""
         return torch.ones_like(back), back
 
 
@@ -401,7 +418,7 @@ class PerspectiveCamera(Camera):
         return np.stack([x, y, normalized_depth]).T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the depth over the distance of the camera, and the inverse of this ratio."""
+        """Return w, which is the depth divided by the distance, and 1 / w as nearness."""
         w = 1 - back / self.distance
         return w, 1 / w
 
@@ -410,8 +427,9 @@ class PerspectiveCamera(Camera):
         depths = self.distance - points @ self.axes()[2]
         if not (depths >= NEAREST * self.distance).all():
             raise InputError(
-                f"the mesh reaches the camera at distance {self.distance:g} or extends beyond it: "
-                "increase the distance (by a smaller fov or a larger width), or normalize the mesh"
+                f"the mesh reaches the camera at distance {self.distance:g} from the origin, or "
+                "extends beyond it: increase the distance (by a smaller fov or a larger width), or "
+                "normalize the mesh"
             )
         return depths
 
@@ -514,33 +532,34 @@ class PinholeCamera(PerspectiveCamera):
             64
         """
         require_choice("convention", convention, CONVENTIONS)
+        # The rows of the rotation are the axes of the camera in world axes.
         rotation, translation = _split_view(view)
         if convention == "opencv":
-            # The rows of the rotation are the camera's axes. Ours are x to the
-            # right, y up and z backward.
+            # The axes of OpenCV are right, down and forward. Ours are right, up and back.
             rotation = rotation * [[1], [-1], [-1]]
             translation = translation * [1, -1, -1]
-        focal_x, focal_y, x, y = _split_intrinsics(intrinsics)
+        focal_x, focal_y, principal_x, principal_y = _split_intrinsics(intrinsics)
         image_width, image_height = _as_image_size(size)
         side = min(image_width, image_height)
-        back = rotation[2]
+        right, up, back = rotation
         position = -translation @ rotation
         distance = float(np.linalg.norm(position)) or 1.0
+        # The center lies on the axis of the camera.
         center = position - distance * back
         azimuth = math.atan2(back[1], back[0])
-        # This axis points to the right without roll.
+        # The axis to the right of a camera without roll, which is horizontal.
         level = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
         return cls(
             polar=math.degrees(math.atan2(math.hypot(back[0], back[1]), back[2])),
             azimuth=math.degrees(azimuth),
             width=distance * side / focal_x,
             distance=distance,
-            roll=math.degrees(math.atan2(-rotation[1] @ level, rotation[0] @ level)),
+            roll=math.degrees(math.atan2(-up @ level, right @ level)),
             center_x=center[0],
             center_y=center[1],
             center_z=center[2],
-            principal_right=(2 * x - image_width) / side,
-            principal_up=(image_height - 2 * y) / side,
+            principal_right=(2 * principal_x - image_width) / side,
+            principal_up=(image_height - 2 * principal_y) / side,
             pixel_aspect=focal_y / focal_x,
         )
 
@@ -563,7 +582,7 @@ class PinholeCamera(PerspectiveCamera):
         return pose
 
     def _from_center(self, points: np.ndarray) -> np.ndarray:
-        """Return points relative to the center."""
+        """Subtract the center of the camera from points in world axes, shape (..., 3)."""
         return points - np.array([self.center_x, self.center_y, self.center_z])
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -590,7 +609,14 @@ class PinholeCamera(PerspectiveCamera):
         return torch.stack([x, y, w]).T, nearness
 
     def _coordinates(self, points: Tensor) -> Tensor:
-        """Return the coordinates (right, up, back) of points (V, 3), shape (3, V)."""
+        """Convert points from world axes to the axes of the camera, from its center.
+
+        Args:
+            points: V points in world axes, shape (V, 3).
+
+        Returns:
+            Coordinates right, up and back from the center, shape (3, V).
+        """
         center = [self.center_x, self.center_y, self.center_z]
         offset = torch.stack([_as_tensor(coordinate, points) for coordinate in center])
         right, up, back = super()._coordinates(points - offset)
@@ -612,7 +638,18 @@ class PinholeCamera(PerspectiveCamera):
 
 
 def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Check a view matrix, and return its rotation (3, 3) and its translation (3,)."""
+    """Check a view matrix, and split it into rotation and translation.
+
+    Args:
+        view: Matrix from world to camera coordinates, shape (4, 4) or (3, 4).
+
+    Returns:
+        Rotation, shape (3, 3), and translation, shape (3,).
+
+    Raises:
+        InputError: If the matrix has another shape, or is no rotation and
+            translation.
+    """
     matrix = as_array("view", view).astype(np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"view has shape {matrix.shape}: give a matrix (4, 4) or (3, 4)")
@@ -622,27 +659,49 @@ def _split_view(view: Any) -> tuple[np.ndarray, np.ndarray]:
     is_affine = np.array_equal(matrix[3:], np.eye(4)[3 : len(matrix)])
     if not (error <= MATRIX_TOLERANCE and is_right_handed and is_affine):
         raise InputError(
-            "view is no rotation and translation: give the matrix from world to camera"
+            "view is no rotation and translation: give the matrix from world to camera coordinates"
         )
     return rotation, matrix[:3, 3]
 
 
 def _split_intrinsics(intrinsics: Any) -> tuple[float, float, float, float]:
-    """Check intrinsics, and return fx, fy, cx and cy."""
+    """Check an intrinsic matrix, and return its focal lengths and principal point.
+
+    Args:
+        intrinsics: Matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels,
+            shape (3, 3).
+
+    Returns:
+        fx, fy, cx and cy.
+
+    Raises:
+        InputError: If the matrix has another form.
+    """
     matrix = as_array("intrinsics", intrinsics).astype(np.float64)
     if matrix.shape != (3, 3):
         raise InputError(f"intrinsics has shape {matrix.shape}: give a matrix (3, 3)")
-    (focal_x, skew, x), (below, focal_y, y), last = matrix.tolist()
-    is_calibration = focal_x > 0 and focal_y > 0 and below == 0 and last == [0, 0, 1]
-    if not (is_calibration and abs(skew) <= MATRIX_TOLERANCE * focal_x):
+    (focal_x, skew, center_x), (below_diagonal, focal_y, center_y), last_row = matrix.tolist()
+    has_focal_lengths = focal_x > 0 and focal_y > 0
+    has_zeros = below_diagonal == 0 and abs(skew) <= MATRIX_TOLERANCE * focal_x
+    if not (has_focal_lengths and has_zeros and last_row == [0, 0, 1]):
         raise InputError(
             f"intrinsics is {matrix.tolist()}: give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
         )
-    return focal_x, focal_y, x, y
+    return focal_x, focal_y, center_x, center_y
 
 
 def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
-    """Check the size of an image, and return its width and its height."""
+    """Check the size of an image, and return its width and its height.
+
+    Args:
+        size: Number of pixels per side, or a pair of width and height.
+
+    Returns:
+        Width and height in pixels.
+
+    Raises:
+        InputError: If a number is not whole or not positive.
+    """
     width, height = size if isinstance(size, tuple | list) and len(size) == 2 else (size, size)
     for side in (width, height):
         require_whole("size", side)
@@ -651,7 +710,20 @@ def _as_image_size(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _as_scalar(name: str, value: Any) -> Any:
-    """Convert a field of a camera to one number, or to a tensor () that gradients flow to."""
+    """Convert the value of a camera's field to a number, or to a tensor of shape ().
+
+    A tensor stays a tensor, so that gradients with respect to it can be computed.
+
+    Args:
+        name: Name of the field, for the error.
+        value: Number, or a tensor, array or list with one number.
+
+    Returns:
+        Number or tensor.
+
+    Raises:
+        InputError: If the value is not one number.
+    """
     if isinstance(value, Tensor) and value.numel() == 1:
         value = value.reshape(())
     elif isinstance(value, np.ndarray | list | tuple) and np.size(value) == 1:
@@ -662,12 +734,12 @@ def _as_scalar(name: str, value: Any) -> Any:
 
 
 def _as_tensor(value: float | Tensor, like: Tensor) -> Tensor:
-    """Convert a field of a camera to a tensor with the dtype and the device of another."""
+    """Convert the value of a camera's field to a tensor with the dtype and device of `like`."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def _in_radians(degrees: Any) -> Any:
-    """Convert an angle, which is a number or a tensor that gradients flow to."""
+    """Convert an angle from degrees to radians. A tensor stays a tensor with a graph."""
     if isinstance(degrees, Tensor):
         return torch.deg2rad(degrees)
     return math.radians(degrees)

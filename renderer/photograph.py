@@ -1,10 +1,11 @@
-"""Cut square windows out of photographs, each as a camera without lens shift sees it.
+"""Cut square windows out of photographs, as if the camera had been turned toward an object.
 
-The optical axis of a camera passes through the center of its image. An object
-elsewhere in a photograph is therefore seen by a camera that is turned towards it
-at the same place. The two images are related by a homography (Hartley and
-Zisserman 2004, section 8.4.2). Photographs must not be cropped: the optical axis
-of their camera passes through their center.
+The optical axis of our cameras passes through the image center. If an object is
+elsewhere in a photograph, this module computes the image of a camera at the same
+place that is turned toward the object. The photograph and this image are related
+by a homography (Hartley and Zisserman 2004, section 8.4.2). Photographs must not
+be cropped, because the optical axis of the camera must pass through the center
+of the photograph.
 
 A camera has the axes right, up and back. It looks along minus back.
 """
@@ -27,47 +28,50 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 Array = NDArray[Any]
-# Smallest number of samples per side of a pixel that is larger than the pixels of
-# the photograph.
+# Smallest number of samples along one side of a pixel in `Window.cut`, if the pixels of
+# the window are larger than those of the photograph.
 LEAST_SAMPLES = 8
-# Pixels around a part of a photograph that interpolation needs.
+# Number of pixels that `Window.cut` reads around the window, because bicubic
+# interpolation needs neighbors.
 BORDER = 2
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph by an upright camera.
+    """Photograph of an upright camera.
 
     Attributes:
-        pixels: Pixels of 8 bits, shape (H, W, 3).
-        focal_length: Distance of the image plane from the camera in pixels. None
-            for a camera without perspective.
+        pixels: RGB values, uint8, shape (H, W, 3).
+        focal_length: Focal length in pixels. None for a camera without
+            perspective.
     """
 
     pixels: UInt8[Array, "height width 3"]
     focal_length: float | None
 
     def window(self, center: Array, side: float, above: Array) -> Window:
-        """Turn the camera towards a square of the photograph, without roll.
+        """Compute the window that a camera sees that is turned toward a point, without roll.
 
         Args:
-            center: Center of the square (column, row) in pixels.
-            side: Side of the square in pixels.
-            above: World's z axis in the axes of the photograph's camera, shape
-                (3,).
+            center: Column and row of the point in the photograph, in pixels,
+                shape (2,).
+            side: Side of the window in pixels.
+            above: World's z-axis in the axes of the photograph's camera,
+                shape (3,).
 
         Returns:
-            The window of the turned camera, whose optical axis passes through the
-            center of the square.
+            Window whose center shows the point.
         """
         focal_length = self.focal_length
         if focal_length is None:
-            # Rows of an image count downwards.
+            # Without perspective, the window is shifted. Rows are counted downward.
             column, row = center
             to_pixels = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
             return Window(to_pixels, side, np.eye(3))
         height, width = self.pixels.shape[:2]
-        # A ray (x, y, z) meets the image plane at (x, y) × focal_length / -z.
+        # Matrix from a direction (x, y, z) in the axes of the camera to homogeneous
+        # (column, row). The direction meets the image plane at
+        # (x, y) · focal_length / -z.
         to_pixels = np.array(
             [
                 [focal_length, 0, -width / 2],
@@ -75,27 +79,30 @@ class Photograph:
                 [0.0, 0.0, -1.0],
             ]
         )
+        # Direction to the point, and axes of the turned camera.
         forward = np.linalg.solve(to_pixels, np.array([*center, 1.0]))
         back = -forward / np.linalg.norm(forward)
         right = np.cross(above, back)
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(back, right), back])
-        # A point (x, y, 1) of the window is the ray (x, y, -focal_length).
-        to_ray = np.diag([1.0, 1.0, -focal_length])
-        return Window(to_pixels @ axes.T @ to_ray, side, axes)
+        # A point (x, y, 1) of the window has the direction (x, y, -focal_length) in the
+        # axes of the turned camera.
+        to_direction = np.diag([1.0, 1.0, -focal_length])
+        return Window(to_pixels @ axes.T @ to_direction, side, axes)
 
 
 @dataclass(frozen=True)
 class Window:
-    """The square image of a turned camera, which replaces a part of a photograph.
+    """Square image that a camera would see that is turned toward a part of a photograph.
 
     Attributes:
-        homography: Matrix from a point (x right, y up, 1), in pixels from the
-            center of the window, to homogeneous (column, row, weight) in the
-            photograph, shape (3, 3).
-        side: Side of the window, in pixels of the size that they have in the
-            center of the photograph.
-        axes: Axes right, up and back of the window's camera, as rows, in the axes
+        homography: Matrix from a point of the window to homogeneous
+            (column, row, weight) in the photograph, shape (3, 3). The point is
+            (x, y, 1), with x to the right and y up, in pixels from the center of
+            the window.
+        side: Side of the window in pixels. The pixels have the size of those in
+            the center of the photograph.
+        axes: Axes right, up and back of the turned camera as rows, in the axes
             of the photograph's camera, shape (3, 3).
     """
 
@@ -110,36 +117,38 @@ class Window:
         encoding: str = "linear",
         beyond: int | None = None,
     ) -> Float[Tensor, "channels size size"]:
-        """Resample the window in linear light.
+        """Resample the photograph in the window, with linear values.
 
         Args:
-            photograph: Pixels of 8 bits, shape (H, W, C).
-            size: Pixels per side of the result.
+            photograph: Photograph or mask, uint8, shape (H, W, C).
+            size: Number of pixels per side of the result.
             encoding: Encoding of the photograph, "linear" or "srgb".
-            beyond: Value outside of the photograph, 0 to 255. None repeats its
-                border.
+            beyond: Value of pixels outside of the photograph, from 0 to 255. None
+                repeats the pixels at the border of the photograph.
 
         Returns:
-            Linear values in [0, 1], shape (C, size, size), float32.
+            Linear values in [0, 1], float32, shape (C, size, size).
         """
         is_enlarged = self.side < size
         samples = 1 if is_enlarged else max(LEAST_SAMPLES, math.ceil(self.side / size))
         part = self._needed_part()
-        pixels = part.read(photograph, beyond)
-        linear = decode(torch.from_numpy(pixels).permute(2, 0, 1) / 255, encoding)[None]
-        # Pixels are averaged by the renderer's box filter. Where pixels are
-        # enlarged, this would leave steps, so these are interpolated.
+        part_pixels = part.read(photograph, beyond)
+        linear = decode(torch.from_numpy(part_pixels).permute(2, 0, 1) / 255, encoding)[None]
+        # Large pixels are the mean of samples with the values of the nearest pixels, as
+        # with the box filter of the renderer. Small pixels would have visible steps, so
+        # they are interpolated.
         mode = "bicubic" if is_enlarged else "nearest"
         resolution = size * samples
+        # Positions of samples along one side, in pixels from the window center.
         offsets = ((np.arange(resolution) + 0.5) / resolution - 0.5) * self.side
-        resampled = []
-        # Resampling a row of pixels at a time bounds the memory.
-        for y in -offsets.reshape(size, samples):
-            points = np.stack(self.pixels(*np.meshgrid(offsets, y)), axis=-1)
+        rows = []
+        # Resampling one row of pixels at a time limits the memory.
+        for sample_rows in -offsets.reshape(size, samples):
+            points = np.stack(self.pixels(*np.meshgrid(offsets, sample_rows)), axis=-1)
             grid = torch.from_numpy(part.normalized(points)).to(linear)[None]
             at_samples = F.grid_sample(linear, grid, mode, align_corners=False)
-            resampled.append(F.avg_pool2d(at_samples, samples)[0])
-        return torch.cat(resampled, dim=1).clamp(0, 1)
+            rows.append(F.avg_pool2d(at_samples, samples)[0])
+        return torch.cat(rows, dim=1).clamp(0, 1)
 
     def pixels(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Map points in the window to the photograph.
@@ -156,10 +165,10 @@ class Window:
         return columns / weights, rows / weights
 
     def _needed_part(self) -> _Part:
-        """Return the part of the photograph that the window shows, with a border.
+        """Find the rectangle of the photograph that the window shows, with a border.
 
-        A homography keeps straight lines, so the corners of the window are its
-        outermost points.
+        A homography maps lines to lines. The corners of the window are therefore
+        its outermost points in the photograph.
         """
         half = self.side / 2
         x = np.array([-half, half, half, -half])
@@ -175,10 +184,13 @@ class Window:
 
 @dataclass(frozen=True)
 class _Part:
-    """A rectangle of pixels, which may lie beyond the photograph.
+    """Rectangle of pixels, which may extend beyond the photograph.
 
-    It has the columns from `left` to `right`, and the rows from `top` to `bottom`,
-    without the last one.
+    Attributes:
+        left: First column.
+        top: First row.
+        right: Column after the last one.
+        bottom: Row after the last one.
     """
 
     left: int
@@ -187,12 +199,15 @@ class _Part:
     bottom: int
 
     def read(self, photograph: Array, beyond: int | None) -> Array:
-        """Return the pixels of a photograph (H, W, C) in this part.
+        """Read the pixels of the rectangle.
 
         Args:
             photograph: Photograph, shape (H, W, C).
-            beyond: Value of pixels beyond the photograph. None for the value of
-                the nearest pixel.
+            beyond: Value of pixels outside of the photograph. None uses the value
+                of the nearest pixel.
+
+        Returns:
+            Pixels, shape (bottom - top, right - left, C).
         """
         height, width = photograph.shape[:2]
         columns = np.arange(self.left, self.right)
@@ -205,6 +220,14 @@ class _Part:
         return pixels
 
     def normalized(self, points: Array) -> Array:
-        """Return points (..., 2) of columns and rows, with this part in [-1, 1]."""
+        """Convert columns and rows of the photograph to coordinates of `grid_sample`.
+
+        Args:
+            points: Columns and rows in pixels, shape (..., 2).
+
+        Returns:
+            Coordinates (x, y), which are in [-1, 1] in the rectangle,
+            shape (..., 2).
+        """
         extent = [self.right - self.left, self.bottom - self.top]
         return 2 * (points - [self.left, self.top]) / extent - 1

@@ -1,10 +1,11 @@
-"""Settings: dataclasses whose fields carry their explanation, unit, range and choices.
+"""Settings: dataclasses whose fields have an explanation, a unit, a range and choices.
 
-A field of a settings class is made by `setting`. Its facts stand there once: the base class
-`Settings` checks the values of an instance by them, and `--help` of a command prints them.
+The function `setting` creates a field of a settings class. These facts about the field are
+written only there. The base class `Settings` checks the values of an instance with them, and
+`--help` of a command prints them.
 
-This module and the modules of settings above it import neither torch nor NumPy. Commands read
-and check their settings before anything that takes seconds to import.
+This module does not import torch and NumPy, and the other modules of settings do not either.
+Commands read and check their settings before they import anything that takes seconds.
 """
 
 from __future__ import annotations
@@ -29,27 +30,48 @@ from renderer.errors import (
     require_range,
 )
 
+# Type of the settings class that a function returns an instance of.
 Kind = TypeVar("Kind")
-REQUIRED = MISSING  # the default of a setting that has none
+# Argument `default` of `setting` for a field that the user must give.
+REQUIRED = MISSING
 
+# Allowed encodings of image values, kinds of normals, and rasterizers.
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
 RASTERIZERS = ("auto", "opengl", "numba", "numpy")
+# Largest number of bounces of light.
 MAX_BOUNCES = 100
-MAX_SIZE = 4096  # pixels per side of an image
-MAX_SAMPLES_PER_ROW = 2**15  # samples in a row of an image, so at most a billion in all of it
-SILHOUETTE_SAMPLES = 8  # the default if gradients include visibility changes at silhouettes
-MAX_SAMPLES = 64  # samples per side of a pixel, which resolve its coverage to 1/4096
-MAX_DEGREE = 40  # spherical-harmonic degree of lighting, enough for reflections at MIN_ROUGHNESS
-MIN_ROUGHNESS = 0.2  # below it, lighting of degree 40 is too smooth for the highlights
+# Largest image size in settings of commands, in pixels per side.
+MAX_SIZE = 4096
+# Largest number of samples in a row of an image. A whole image then has at most a billion.
+MAX_SAMPLES_PER_ROW = 2**15
+# Default number of samples per side of a pixel if gradients include visibility changes at
+# silhouettes.
+SILHOUETTE_SAMPLES = 8
+# Largest number of samples per side of a pixel. The coverage of a pixel is then a multiple of
+# 1/4096.
+MAX_SAMPLES = 64
+# Largest degree of the spherical harmonics of a light. Highlights of surfaces with the
+# roughness MIN_ROUGHNESS need this degree.
+MAX_DEGREE = 40
+# Smallest roughness that is rendered. Highlights of smoother surfaces would need light of a
+# degree above MAX_DEGREE.
+MIN_ROUGHNESS = 0.2
+# Largest number of cameras of `orbit_cameras`.
 MAX_VIEWS = 10**5
-MAX_VERTICES = 10**7  # some 5 GB
-TURBIDITY = (2.0, 10.0)  # range of the haze of the air, from clear to hazy (pure air has 1)
+# Largest number of vertices to which `subdivide` divides a mesh. This takes about 5 GB of memory.
+MAX_VERTICES = 10**7
+# Smallest and largest turbidity (haziness) of the air for the skylight, from clear to hazy. Pure
+# air would have 1.
+TURBIDITY = (2.0, 10.0)
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Explanation, unit and range of a field. They are the arguments of `setting`."""
+    """Explanation, unit, range and choices of a field of a settings class.
+
+    The attributes are the arguments of `setting`, which explains them.
+    """
 
     about: str = ""
     unit: str = ""
@@ -64,7 +86,7 @@ class Facts:
     checks_type: bool = True
 
     def limits(self) -> list[Limit]:
-        """List the ends of the range that the field has."""
+        """List the limits of the field's range that are set, at most four."""
         ends = (
             Limit("at least", "≥", operator.ge, self.minimum),
             Limit("above", ">", operator.gt, self.above),
@@ -76,7 +98,14 @@ class Facts:
 
 @dataclass(frozen=True)
 class Limit:
-    """One end of a range, in words for errors and as a sign for `--help`."""
+    """Limit of a range of numbers.
+
+    Attributes:
+        words: Words for errors, such as "at least".
+        sign: Sign for `--help`, such as "≥".
+        holds: Function that compares a value with `end`, such as operator.ge.
+        end: Number of the limit. None for no limit.
+    """
 
     words: str
     sign: str
@@ -99,10 +128,10 @@ def setting(
     may_be_empty: bool = False,
     checks_type: bool = True,
 ) -> Any:
-    """Make a field of a settings class.
+    """Create a field of a settings class.
 
-    The range and the choices of a list are those of its items. None is always permitted where
-    the annotation permits it.
+    If the value is a list, its items are checked against the range and the choices. None is
+    permitted if the annotation of the field permits None.
 
     Args:
         default: Default value. A list or a mapping is copied for each instance. A function is
@@ -149,11 +178,11 @@ def setting(
 
 
 def setting_like(kind: type, name: str, default: Any) -> Any:
-    """Make a field that has the facts of a field of another settings class.
+    """Create a field with the explanation, unit and range of a field of another class.
 
     Args:
-        kind: The other class.
-        name: Name of its field.
+        kind: Settings class with the other field.
+        name: Name of the other field.
         default: Default value of the new field.
 
     Returns:
@@ -163,7 +192,13 @@ def setting_like(kind: type, name: str, default: Any) -> Any:
 
 
 def _field(default: Any, facts: Facts) -> Any:
-    """Make a field of a dataclass. A list, a mapping or a function makes a default for each."""
+    """Create a field of a dataclass.
+
+    Args:
+        default: Default value. A list or a mapping is copied for each instance, and a function
+            is called for each instance. REQUIRED for no default.
+        facts: Explanation, unit and range, which are stored in the metadata of the field.
+    """
     metadata = {"facts": facts}
     if default is REQUIRED:
         return field(metadata=metadata)
@@ -175,10 +210,10 @@ def _field(default: Any, facts: Facts) -> Any:
 
 
 class Settings:
-    """Base of all settings classes, which are dataclasses.
+    """Base class of all settings classes, which are dataclasses.
 
-    A new instance is refused with an InputError that names the first field whose value has the
-    wrong type, is out of its range, is none of its choices, or is an empty text.
+    A new instance raises an InputError if a value has the wrong type, is out of range, is none of
+    the choices, or is an empty text. The error names the first such field.
     """
 
     def __post_init__(self) -> None:
@@ -191,56 +226,64 @@ class Settings:
 
 
 def facts_of(kind: type, name: str) -> Facts:
-    """Return the facts of a field.
+    """Return the explanation, unit, range and choices of a field.
 
-    A subclass may give a field another default without `setting`. The facts of its parent then
-    apply.
+    A subclass may give a field another default without calling `setting`. The facts of the parent
+    class then apply.
 
     Args:
         kind: Settings class.
         name: Name of the field.
 
     Returns:
-        The facts. They are empty if the field was not made by `setting`.
+        Facts of the field. They are empty if the field was not created by `setting`.
     """
     for base in kind.__mro__:
-        own: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})
-        if name in own and "facts" in own[name].metadata:
-            return cast(Facts, own[name].metadata["facts"])
+        fields_of_base: dict[str, Field[Any]] = vars(base).get("__dataclass_fields__", {})
+        if name in fields_of_base and "facts" in fields_of_base[name].metadata:
+            return cast(Facts, fields_of_base[name].metadata["facts"])
     return Facts()
 
 
 def field_types(kind: type) -> dict[str, Any]:
-    """Return the annotations of a dataclass's fields by name."""
+    """Return the types with which the fields of a dataclass are annotated.
+
+    Args:
+        kind: Dataclass.
+
+    Returns:
+        Types by the names of the fields.
+    """
     hints = get_type_hints(kind)
     return {item.name: hints[item.name] for item in fields(cast(Any, kind))}
 
 
 def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) -> Kind:
-    """Make an instance of a settings class from a mapping.
+    """Create an instance of a settings class from a mapping.
 
     Args:
-        kind: The settings class.
-        values: Values of its fields by name.
+        kind: Settings class.
+        values: Values of the fields by name.
         argument: Name of the argument that holds the mapping, for errors.
 
     Returns:
-        The instance.
+        Instance of the class.
 
     Raises:
-        InputError: If the mapping has an unknown name, lacks a required one, or has a wrong value.
+        InputError: If the mapping has an unknown name, lacks a required name, or has a wrong
+            value.
     """
-    known = fields(cast(Any, kind))
-    names = [item.name for item in known]
+    known_fields = fields(cast(Any, kind))
+    names = [known.name for known in known_fields]
     for name in values:
         if name not in names:
-            wrong = f"{argument}.{name}"
-            raise InputError(f"{wrong} is not a setting: choose from {', '.join(names)}", wrong)
-    for item in known:
-        has_default = item.default is not MISSING or item.default_factory is not MISSING
-        if not has_default and item.name not in values:
-            wrong = f"{argument}.{item.name}"
-            raise InputError(f"{wrong} is not set: give its value", wrong)
+            unknown = f"{argument}.{name}"
+            raise InputError(f"{unknown} is not a setting: choose from {', '.join(names)}", unknown)
+    for known in known_fields:
+        has_default = known.default is not MISSING or known.default_factory is not MISSING
+        if not has_default and known.name not in values:
+            missing = f"{argument}.{known.name}"
+            raise InputError(f"{missing} has no value: set it", missing)
     try:
         return kind(**values)
     except InputError as error:
@@ -249,12 +292,21 @@ def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) ->
 
 @cache
 def _checked_fields(kind: type) -> list[tuple[str, Any, Facts]]:
-    """List the name, the annotation and the facts of each field."""
+    """List the name, the annotated type and the facts of each field of a settings class."""
     return [(name, hint, facts_of(kind, name)) for name, hint in field_types(kind).items()]
 
 
 def _check_value(name: str, value: Any, facts: Facts) -> None:
-    """Check a value, or each item of a list, by the facts of its field."""
+    """Check a value, or each item of a list, against the range and the choices of its field.
+
+    Args:
+        name: Name of the field, for the error.
+        value: Value of the field.
+        facts: Range and choices of the field.
+
+    Raises:
+        InputError: If the value is not permitted.
+    """
     if isinstance(value, str) and not value and not facts.may_be_empty:
         raise InputError(f"{name} is empty: give a name", name)
     if facts.is_pair:
@@ -270,7 +322,16 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
 
 
 def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
-    """Check one number. NaN is in no range."""
+    """Check that a number is within limits. NaN is not within any limits.
+
+    Args:
+        name: Name of the field, for the error.
+        value: Value to check.
+        limits: Limits of the range.
+
+    Raises:
+        InputError: If the value is no number, or not within the limits.
+    """
     if limits and not is_number(value):
         raise InputError(f"{name}={describe(value)} must be a number", name)
     if not all(limit.holds(value, limit.end) for limit in limits):
@@ -279,19 +340,29 @@ def _check_range(name: str, value: Any, limits: Sequence[Limit]) -> None:
 
 
 def _check_pair(name: str, value: Any, facts: Facts) -> None:
-    """Check a list of a minimum and a maximum."""
+    """Check that a list is a pair [minimum, maximum] within the range of its field.
+
+    Args:
+        name: Name of the field, for the error.
+        value: List to check.
+        facts: Range of the field.
+
+    Raises:
+        InputError: If the list is no such pair.
+    """
     minimum = -math.inf if facts.minimum is None else facts.minimum
     maximum = math.inf if facts.maximum is None else facts.maximum
     if len(value) == 2 and minimum <= value[0] <= value[1] <= maximum:
         return
     expected = f"give [minimum, maximum], both from {minimum:g} to {maximum:g}"
-    raise InputError(f"{name}={list(value)}: {expected}", name)
+    raise InputError(f"{name}={list(value)} is no range: {expected}", name)
 
 
 def require_field_types(settings: Any, *unchecked: str) -> None:
-    """Check the fields of a dataclass that is no settings class against their annotations.
+    """Check that the fields of a dataclass have the types with which they are annotated.
 
-    Whole numbers pass as numbers, and paths as strings.
+    This is for dataclasses that are not derived from `Settings`. A whole number is accepted for a
+    float, and a path for a string.
 
     Args:
         settings: Instance of the dataclass.
@@ -306,6 +377,7 @@ def require_field_types(settings: Any, *unchecked: str) -> None:
             raise InputError(f"{name} is {describe(value)}: give {_expected(hint)}", name)
 
 
+# For each annotated type, the function that tells whether a value has this type.
 _CHECKS: dict[Any, Callable[[object], bool]] = {
     Any: lambda value: True,
     int: is_whole,
@@ -317,7 +389,12 @@ _CHECKS: dict[Any, Callable[[object], bool]] = {
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Return whether a value is of an annotated type."""
+    """Tell whether a value has the type of an annotation.
+
+    Args:
+        value: Value to check.
+        hint: Type, union of types, or list type such as `list[float]`.
+    """
     check = _CHECKS.get(hint)
     if check is not None:
         return check(value)
@@ -334,6 +411,7 @@ def _fits(value: object, hint: Any) -> bool:
     return isinstance(value, origin or hint)
 
 
+# For each annotated type, the words for a value of this type in errors.
 _NOUNS: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -345,7 +423,14 @@ _NOUNS: dict[Any, str] = {
 
 
 def _expected(hint: Any) -> str:
-    """Describe an annotated type for an error."""
+    """Describe the values that an annotated type allows, for an error.
+
+    Args:
+        hint: Type, union of types, or list type such as `list[float]`.
+
+    Returns:
+        Description such as "a list of numbers or None".
+    """
     if get_origin(hint) in (Union, types.UnionType):
         return " or ".join(_expected(option) for option in get_args(hint))
     if get_origin(hint) is list:
@@ -403,7 +488,7 @@ class ImageSettings(Settings):
 
     @property
     def global_illumination(self) -> bool:
-        """Whether a mesh changes its own light, by shadows or bounces."""
+        """True if the mesh casts shadows on itself, or if light bounces between its surfaces."""
         return self.shadows or self.bounces > 0
 
 
@@ -411,12 +496,12 @@ def samples_per_side(samples: int | None, silhouettes: bool) -> int:
     """Choose the number of samples per side of a pixel.
 
     Args:
-        samples: The number that was asked for. None for the default.
-        silhouettes: Whether gradients include visibility changes at silhouettes. Their documented
-            accuracy needs more samples.
+        samples: Number that the user chose. None for the default.
+        silhouettes: True if gradients include visibility changes at silhouettes. The default is
+            then larger, because the documented accuracy of these gradients needs more samples.
 
     Returns:
-        The number of samples per side of a pixel.
+        Number of samples per side of a pixel.
     """
     if samples is not None:
         return samples

@@ -1,11 +1,16 @@
-"""Bases of light: functions whose weighted sums are the lights of one kind.
+"""Bases of light: sets of functions whose weighted sums are the lights of one kind.
 
-The weights are the coefficients of a light. If its position is fixed, an image
-is linear in them, so that operators can be computed for each basis.
+The weights are called the coefficients of a light. There are three for each
+function, for red, green and blue. If light sources do not move, an image is
+linear in the coefficients. A transfer operator can therefore be computed for each
+basis.
 
-Environment light has one basis, `Harmonics`. Each kind of light within the scene
-is a subclass of `LocalBasis` in a module of its own, such as light/lamps.py and
-light/projector.py. CONTRIBUTING.md describes how to add one.
+Environment light has the basis `Harmonics`. Local light comes from sources within
+the scene, such as lamps. Each kind of local light is a subclass of `LocalBasis` in
+a module of its own, such as light/lamps.py. CONTRIBUTING.md describes how to add a
+kind.
+
+In shapes, `size` is the number of functions of a basis.
 """
 
 from __future__ import annotations
@@ -33,11 +38,12 @@ from renderer.vectors import unit
 
 
 class EnvironmentPart(NamedTuple):
-    """The environment light of a basis.
+    """Part of a basis that is environment light.
 
     Attributes:
-        rows: Its coefficients among those of the whole basis.
-        basis: Its own basis.
+        rows: Slice of the coefficients of the whole basis that belong to this
+            part.
+        basis: Basis of this part.
     """
 
     rows: slice
@@ -45,11 +51,12 @@ class EnvironmentPart(NamedTuple):
 
 
 class LocalPart(NamedTuple):
-    """One local light of a basis.
+    """Part of a basis that is one kind of local light.
 
     Attributes:
-        rows: Its coefficients among those of the whole basis.
-        basis: Its own basis.
+        rows: Slice of the coefficients of the whole basis that belong to this
+            part.
+        basis: Basis of this part.
     """
 
     rows: slice
@@ -57,7 +64,10 @@ class LocalPart(NamedTuple):
 
 
 class Basis(ABC):
-    """Functions whose sums, weighted with RGB coefficients (size, 3), are lights of one kind."""
+    """Set of functions whose weighted sums are the lights of one kind.
+
+    The weights are RGB coefficients, shape (size, 3).
+    """
 
     @property
     @abstractmethod
@@ -66,29 +76,48 @@ class Basis(ABC):
 
     @property
     def environment(self) -> EnvironmentPart | None:
-        """Environment light of this basis, or None."""
+        """Part of this basis that is environment light, or None."""
         return None
 
     @property
     def local_lights(self) -> list[LocalPart]:
-        """Lights within the scene, in the order of their coefficients."""
+        """Parts of this basis that are local lights, in the order of their coefficients."""
         return []
 
     @property
     def movable_light(self) -> LocalPart | None:
-        """First light within the scene that can be moved, or None."""
+        """First part of this basis that is a movable local light, or None."""
         return next((part for part in self.local_lights if part.basis.is_movable), None)
 
     @abstractmethod
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Project coefficients (..., size, 3) to those of light that can be emitted."""
+        """Replace coefficients by those of a light that can exist, without negative radiance.
+
+        Args:
+            coefficients: Coefficients, shape (..., size, 3).
+
+        Returns:
+            Coefficients, shape (..., size, 3).
+        """
 
     def moved(self, positions: Tensor) -> Self:
-        """Return the basis with those of its lights that can be moved at positions (L, 3)."""
+        """Return a copy in which movable lights are at other positions.
+
+        Args:
+            positions: Positions of the L movable lights in world axes,
+                shape (L, 3).
+        """
         return self
 
     def picture(self, coefficients: Tensor) -> Tensor | None:
-        """Return the image (H, W, 3) in [0, 1] that coefficients (size, 3) show, or None."""
+        """Convert coefficients to an image, if a light of this kind projects an image.
+
+        Args:
+            coefficients: Coefficients, shape (size, 3).
+
+        Returns:
+            Image in [0, 1], shape (H, W, 3), or None.
+        """
         return None
 
 
@@ -135,7 +164,10 @@ class Harmonics(Basis):
 
     @property
     def nonzero(self) -> Tensor:
-        """Ascending indices of the functions that an unshadowed diffuse surface reflects, (K,)."""
+        """Ascending indices of the K functions that change the irradiance, shape (K,).
+
+        All other functions have no effect on a diffuse surface without shadows.
+        """
         return nonzero_coefficients(self.degree)
 
     def irradiance(self, normals: Tensor) -> Tensor:
@@ -153,18 +185,25 @@ class Harmonics(Basis):
         require_finite(normals=normals)
         factors = lambertian_factors(self.degree)[self.nonzero].to(normals)
         rows = select_rows(unit(normals.double().T), self.nonzero.tolist())
+        # Shape (K, N). Transposing at the end is faster than filling columns.
         by_function = torch.stack(rows).to(normals.dtype) * factors[:, None]
-        # A processor fills rows fastest, so that the matrix is transposed last.
         return by_function.T.contiguous()
 
     def radiance(self, directions: Tensor) -> Tensor:
-        """Compute the radiance per unit of each coefficient, (N, size), from directions (N, 3)."""
+        """Compute the radiance from N directions per unit of each coefficient.
+
+        Args:
+            directions: Directions toward the light, shape (N, 3).
+
+        Returns:
+            Radiance, shape (N, size).
+        """
         return basis(directions, self.degree)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Project coefficients to light without negative radiance and with the same mean.
+        """Replace coefficients by a light without negative radiance and with the same mean.
 
-        Of such lights, the result has the most similar irradiance.
+        Of all such lights, the result has the most similar irradiance.
 
         Args:
             coefficients: Coefficients, shape (..., size, 3).
@@ -172,7 +211,8 @@ class Harmonics(Basis):
         Returns:
             Coefficients, shape (..., size, 3).
         """
-        # The import of the optimizers of SciPy takes long.
+        # The module is imported here because it imports SciPy's optimizers, which takes
+        # long.
         from renderer.light.nonnegative import project_nonnegative
 
         return project_nonnegative(coefficients)
@@ -196,23 +236,24 @@ class Harmonics(Basis):
         return nearest_nonnegative(coefficients, within)
 
 
+# Default basis of environment light, and its degree and number of coefficients.
 HARMONICS = Harmonics()
-# Degree and number of coefficients of environment light by default.
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 
 
 class LightPaths(NamedTuple):
-    """Straight paths of light from local lights to surface points.
+    """E straight paths of light from local lights to surface points.
 
     Attributes:
-        point: Index of the surface point at the end of each path, int64, shape (E,).
-        function: Index of the function of the basis that each path belongs to,
+        point: Index of the surface point at the end of each path, int64,
+            shape (E,).
+        function: Index of the basis function whose light each path carries,
             int64, shape (E,).
-        source: Position at which each path starts, shape (E, 3).
-        irradiance: Irradiance per unit of the function's coefficient, shape (E,).
-            It is differentiable in the points and normals. The choice of paths
-            is not.
+        source: Position of the start of each path in world axes, shape (E, 3).
+        irradiance: Irradiance of the surface point per unit of the function's
+            coefficient, shape (E,). It is differentiable with respect to the
+            points and normals. The choice of the paths is not differentiable.
     """
 
     point: Tensor
@@ -243,7 +284,7 @@ class LocalBasis(Basis):
     @classmethod
     @abstractmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
-        """Create the light that settings describe.
+        """Create the basis and the coefficients that settings describe.
 
         Args:
             settings: The settings of this kind of light in `augment.settings`, with
@@ -257,37 +298,43 @@ class LocalBasis(Basis):
         """
 
     def source_positions(self) -> Tensor:
-        """Return the positions (L, 3) of the sources of a movable light."""
+        """Return the positions of the L sources of a movable light, shape (L, 3)."""
         raise NotImplementedError
 
     @abstractmethod
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
-        """Find the paths from the lights to surface points, without regard to occlusion.
+        """Find the paths from the sources to S surface points, as if nothing blocked them.
 
         Args:
-            points: Surface points, shape (S, 3).
-            normals: Unit normals there, shape (S, 3).
-            positions: Positions of the lights, shape (L, 3). The default is those
-                of the basis. Only a movable basis takes others.
+            points: Surface points in world axes, shape (S, 3).
+            normals: Unit normals at the points, shape (S, 3).
+            positions: Positions to which the L sources have moved, shape (L, 3).
+                None uses the positions of the basis. Only a movable basis accepts
+                positions.
 
         Returns:
-            The paths, whose irradiance is differentiable in all arguments.
+            Paths. Their irradiance is differentiable with respect to all
+            arguments.
         """
 
     @abstractmethod
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
-        """Describe the light for Mitsuba.
+        """Create the entries of Mitsuba emitters that give the same light.
+
+        A diffuse surface reflects albedo / π times the irradiance in Mitsuba, and
+        albedo times the irradiance in this project. The emitters are brighter to
+        compensate for this.
 
         Args:
             coefficients: Coefficients of the light, shape (size, 3).
-            albedo_scale: Factor of the light, which stands for that of the albedo.
+            albedo_scale: Factor for the albedo of the mesh. The emitters are
+                multiplied by it, because the materials in Mitsuba are not.
 
         Returns:
-            An entry of a Mitsuba scene for each emitter (see
-            `renderer.io.mitsuba_entries`). Mitsuba reflects albedo / π of the
-            irradiance, and this project all of it.
+            Entry of a Mitsuba scene for each emitter (see
+            `renderer.io.mitsuba_entries`).
         """
 
     @property
@@ -295,24 +342,30 @@ class LocalBasis(Basis):
         return [LocalPart(slice(0, self.size), self)]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Project coefficients to the nearest that can be emitted.
-
-        Each light shows on its own where it is clamped.
-        """
+        """Clamp coefficients to [0, power], see `Basis.project_nonnegative`."""
         return self.nearest_nonnegative(coefficients)
 
     def nearest_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """Find the nearest coefficients from 0 to `power`, as `Harmonics.nearest_nonnegative`."""
+        """Find the nearest coefficients in [0, power], also within a ball.
+
+        Args:
+            coefficients: Coefficients, shape (..., size, 3), or (A, size, 3) if
+                `within` is given.
+            within: Ball in which the result must lie, or None.
+
+        Returns:
+            Coefficients of the same shape.
+        """
         return nearest_in_box(coefficients, 0, self.power, within)
 
 
 @dataclass(frozen=True)
 class SumBasis(Basis):
-    """Lights of several bases at once.
+    """Basis of lights that are sums of lights of several bases.
 
     Attributes:
-        parts: The bases, of which one at most is environment light. Their
-            coefficients follow each other.
+        parts: Bases, at most one of which is environment light. The coefficients
+            of the second basis follow those of the first one, and so on.
 
     Raises:
         InputError: If two parts are environment light.
@@ -322,7 +375,9 @@ class SumBasis(Basis):
 
     def __post_init__(self) -> None:
         if sum(part.environment is not None for part in self.parts) > 1:
-            raise InputError("parts holds two environment lights: add their coefficients instead")
+            raise InputError(
+                "parts has two environment lights: use one, and add the coefficients of both"
+            )
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.parts))
@@ -347,7 +402,7 @@ class SumBasis(Basis):
         ]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """Project the coefficients of each part."""
+        """Apply `project_nonnegative` to the coefficients of each part."""
         projected = [
             part.project_nonnegative(coefficients[..., rows, :])
             for rows, part in self._rows_of_parts()
@@ -358,7 +413,11 @@ class SumBasis(Basis):
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
     def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:
-        """Yield each part after its rows of coefficients."""
+        """List the parts with the slices of their coefficients.
+
+        Yields:
+            Slice of the coefficients, and part.
+        """
         first = 0
         for part in self.parts:
             yield slice(first, first + part.size), part
@@ -366,24 +425,37 @@ class SumBasis(Basis):
 
 
 def parts_of(basis: Basis) -> list[EnvironmentPart | LocalPart]:
-    """Return the parts of a basis in the order of their coefficients, each with its rows."""
+    """List the environment light and the local lights of a basis.
+
+    Args:
+        basis: Basis of all lights.
+
+    Returns:
+        Parts in the order of their coefficients.
+    """
     environment = [] if basis.environment is None else [basis.environment]
     return sorted([*environment, *basis.local_lights], key=lambda part: part.rows.start)
 
 
 def harmonics_of(basis: Basis) -> Harmonics:
-    """Return the harmonics of the environment light, which a scene always has."""
+    """Return the harmonics of a basis with environment light.
+
+    Args:
+        basis: Basis with environment light, as each scene has one.
+    """
     environment = basis.environment
     assert environment is not None
     return environment.basis
 
 
 class SplitLight(NamedTuple):
-    """A light, divided into environment light and local lights.
+    """Light that is divided into environment light and local lights.
 
     Attributes:
-        environment: Coefficients ((degree + 1)², 3), None without such light.
-        local_lights: Each basis with its coefficients (size, 3).
+        environment: SH coefficients of the environment light,
+            shape ((degree + 1)², 3). None without environment light.
+        local_lights: Basis of each local light, with its coefficients,
+            shape (size, 3).
     """
 
     environment: Tensor | None
@@ -391,20 +463,20 @@ class SplitLight(NamedTuple):
 
     @property
     def basis(self) -> SumBasis:
-        """Basis of all lights, with that of the environment light first."""
+        """Basis of all lights, with the environment light first."""
         environment = [] if self.environment is None else [Harmonics(degree_of(self.environment))]
         return SumBasis((*environment, *(basis for basis, _ in self.local_lights)))
 
 
 def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
-    """Divide coefficients (size, 3) of a basis into environment light and local lights.
+    """Divide the coefficients of a basis into environment light and local lights.
 
     Args:
         basis: Basis of all lights.
         coefficients: Coefficients of the basis, shape (size, 3).
 
     Returns:
-        The coefficients of the environment light, and each local light with its
+        Coefficients of the environment light, and local lights with their
         coefficients.
     """
     environment = basis.environment
@@ -417,14 +489,16 @@ def split_light(basis: Basis, coefficients: Tensor) -> SplitLight:
 def with_local_lights(
     sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]
 ) -> tuple[Basis, Tensor]:
-    """Join environment light and local lights.
+    """Combine environment light and local lights to one basis with coefficients.
 
     Args:
-        sky: Coefficients of environment light, shape ((degree + 1)², 3).
-        lights: Local lights, each with its coefficients (size, 3).
+        sky: SH coefficients of environment light, shape ((degree + 1)², 3).
+        lights: Bases of local lights with their coefficients, shape (size, 3)
+            each.
 
     Returns:
-        The basis of all lights, the sky's first, and their coefficients.
+        Basis of all lights, with the environment light first, and coefficients of
+        this basis.
     """
     harmonics = Harmonics(degree_of(sky))
     if not lights:

@@ -1,9 +1,9 @@
-"""The daylight sky of Preetham, Shirley and Smits as distant light.
+"""Environment light of the daylight sky of Preetham, Shirley and Smits.
 
-The source is their "A Practical Analytic Model for Daylight" (1999). The sky
-has three scalar parameters: the zenith angle and the azimuth of the sun in
-degrees, in world axes, and the turbidity (haziness) of the air. The disc of the
-sun is not part of the sky.
+The source is "A Practical Analytic Model for Daylight" (1999). The sky has three
+parameters: the zenith angle and the azimuth of the sun in degrees, in world axes,
+and the turbidity (haziness) of the air. The disc of the sun is not part of the
+sky.
 
 Radiance is linear Rec. 709 RGB in kcd/m²: (1, 1, 1) is white of 1000 cd/m². The
 mean luminance of a clear day's sky over the sphere is about 5. That of the
@@ -31,15 +31,17 @@ from renderer.light.basis import HARMONICS
 from renderer.settings import TURBIDITY
 from renderer.validation import as_tensor
 
-# The sun's zenith angle in degrees, from overhead to the horizon, inclusive.
+# Smallest and largest zenith angle of the sun in degrees: from overhead to the horizon.
 ZENITH = (0.0, 90.0)
 
+# Degree l and order m of each of the 49 SH coefficients.
 _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
-# The order m of each coefficient.
+# Order m of each coefficient, shape (49,).
 _ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])
-# The index of the coefficient of order -m, for the coefficient of order m.
+# For each coefficient of degree l and order m, the index of the coefficient of order -m.
 _MIRRORED = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
-# The row of each coefficient in the fit, which has the orders m ≥ 0 only.
+# For each coefficient, the index of its polynomial in the fit. The fit has polynomials
+# for the orders m ≥ 0 only, and those of m and -m are the same.
 _ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
 
 
@@ -86,33 +88,48 @@ def coefficients(
 
 
 class _FittedSky(torch.autograd.Function):
-    """Evaluate the polynomials and rotate them about z by the azimuth φ, in radians.
+    """SH coefficients of the sky, with their derivatives by the three parameters.
 
-    With the coefficients Ũ of the sky at azimuth 0, the rotated ones are
-    U_lm = Ũ_lm cos(mφ) and U_l,-m = Ũ_lm sin(mφ) for m ≥ 0. The paper prints
-    the rotation by -φ, and ∂U/∂θ without the power of turbidity in its second
-    sum.
+    Polynomials give the coefficients Ũ of a sky with the sun at azimuth 0. For the
+    azimuth φ, the coefficients are U_lm = Ũ_lm cos(mφ) and U_l,-m = Ũ_lm sin(mφ)
+    for m ≥ 0. The paper prints the rotation by -φ, and ∂U/∂θ without the power of
+    turbidity in its second sum.
     """
 
     @staticmethod
     def forward(
         ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor
     ) -> Tensor:
-        # Chebyshev polynomials in variables that range over [-1, 1].
-        in_zenith, by_zenith = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
-        in_turbidity, by_turbidity = _chebyshev(
+        """Compute the coefficients and their derivatives.
+
+        Args:
+            ctx: Context of autograd.
+            zenith: Zenith angle of the sun in radians, shape (...).
+            azimuth: Azimuth of the sun in radians, same shape.
+            turbidity: Turbidity, same shape.
+            fit: Polynomials, see `_library_fit`.
+
+        Returns:
+            SH coefficients, shape (..., 49, 3).
+        """
+        # Chebyshev polynomials of two variables in [-1, 1], and their derivatives.
+        zenith_values, zenith_slopes = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
+        turbidity_values, turbidity_slopes = _chebyshev(
             5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1]
         )
-        # Row 0 is the value, row 1 its derivative by zenith, row 2 by turbidity.
-        zenith_factors = torch.stack([in_zenith, by_zenith, in_zenith])
-        turbidity_factors = torch.stack([in_turbidity, in_turbidity, by_turbidity])
+        # The first axis is the value, its derivative by the zenith angle, and its
+        # derivative by the turbidity, shape (3, ..., polynomials).
+        zenith_factors = torch.stack([zenith_values, zenith_slopes, zenith_values])
+        turbidity_factors = torch.stack([turbidity_values, turbidity_values, turbidity_slopes])
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
         polynomials = fit.to(products).flatten(2).flatten(0, 1)
+        # Shape (3, ..., 28 coefficients with m ≥ 0, 3 colors).
         at_azimuth_zero = (products.flatten(-2) @ polynomials).unflatten(-1, (-1, 3))
+        # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         orders = _ORDERS.to(azimuth)
-        turn = azimuth[..., None] * orders.abs()
-        turn = torch.where(orders < 0, turn.sin(), turn.cos())[..., None]
-        value, by_zenith, by_turbidity = at_azimuth_zero[..., _ROW_IN_FIT, :] * turn
+        angles = azimuth[..., None] * orders.abs()
+        rotation = torch.where(orders < 0, angles.sin(), angles.cos())[..., None]
+        value, by_zenith, by_turbidity = at_azimuth_zero[..., _ROW_IN_FIT, :] * rotation
         by_azimuth = -orders[:, None] * value[..., _MIRRORED, :]
         ctx.save_for_backward(by_zenith, by_azimuth, by_turbidity)
         return value
@@ -120,6 +137,16 @@ class _FittedSky(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        """Compute the gradients by the zenith angle, the azimuth and the turbidity.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the coefficients, shape (..., 49, 3).
+
+        Returns:
+            Gradients by the three parameters, shape (...) each, and None for the
+            polynomials.
+        """
         by_zenith, by_azimuth, by_turbidity = (
             (upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors
         )
@@ -128,69 +155,104 @@ class _FittedSky(torch.autograd.Function):
 
 @cache
 def _library_fit() -> Tensor:
-    """Load the polynomials, shape (zenith powers, turbidity powers, 28 orders m ≥ 0, 3)."""
+    """Load the polynomials of the sky that come with the library.
+
+    Returns:
+        Coefficients of the products of Chebyshev polynomials in the zenith angle
+        (axis 0) and in 1 / turbidity (axis 1), for the 28 SH coefficients with
+        order m ≥ 0 (axis 2) and three colors (axis 3).
+    """
     return load_file(Path(__file__).with_name("skylight_fit.safetensors"))["fit"]
 
 
 def _as_parameters(
     zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float
 ) -> list[Tensor]:
-    """Return the angles in radians and the turbidity as tensors.
+    """Check the parameters of a sky, and convert them to tensors.
 
-    They have the dtype and the device of the first floating tensor among
-    turbidity, zenith and azimuth. If all are numbers, they are float64. Angles in
-    float64 are rounded to this dtype only after the conversion. Values outside of
-    the domain raise `InputError`.
+    The tensors get the dtype and the device of the first floating-point tensor
+    among turbidity, zenith and azimuth. Without such a tensor, they are float64.
+    Angles are converted to radians before they are rounded to this dtype.
+
+    Args:
+        zenith: Zenith angle of the sun in degrees.
+        azimuth: Azimuth of the sun in degrees.
+        turbidity: Turbidity.
+
+    Returns:
+        Zenith angle and azimuth in radians, and turbidity, in the shapes of the
+        arguments.
+
+    Raises:
+        InputError: If a value is no number or tensor, not finite, or out of
+            range.
     """
-    named = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
-    for name, value in named.items():
+    value_by_name = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
+    for name, value in value_by_name.items():
         if not is_number(value):
-            as_tensor(name, value)  # This raises InputError for anything but a tensor.
+            # This raises InputError unless the value is a tensor.
+            as_tensor(name, value)
     floating = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
     like = floating[0] if floating else torch.zeros((), dtype=torch.float64)
-    turbidities = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
+    turbidity_tensor = torch.as_tensor(turbidity, dtype=like.dtype, device=like.device)
     degrees = []
     for angle in (zenith, azimuth):
         dtype = angle.dtype if _is_floating(angle) else torch.float64
         degrees.append(torch.as_tensor(angle, dtype=dtype, device=like.device))
-    zeniths, azimuths = degrees
-    require_finite(azimuth=azimuths)
+    zenith_degrees, azimuth_degrees = degrees
+    require_finite(azimuth=azimuth_degrees)
     expected = "0 to 90 degrees, with the sun above the horizon"
-    _require_in_domain("zenith", zeniths.to(like.dtype), ZENITH, expected)
-    _require_in_domain("turbidity", turbidities, TURBIDITY, "2 to 10")
-    radians = [torch.deg2rad(angles).to(like.dtype) for angles in degrees]
-    return [*radians, turbidities]
+    _require_in_domain("zenith", zenith_degrees.to(like.dtype), ZENITH, expected)
+    _require_in_domain("turbidity", turbidity_tensor, TURBIDITY, "2 to 10")
+    radians = [torch.deg2rad(angle).to(like.dtype) for angle in degrees]
+    return [*radians, turbidity_tensor]
 
 
 def _is_floating(value: object) -> TypeGuard[Tensor]:
-    """Return whether a value is a tensor of floating-point numbers."""
+    """Tell whether a value is a tensor of floating-point numbers."""
     return isinstance(value, Tensor) and value.is_floating_point()
 
 
 def _require_in_domain(
     name: str, value: Tensor, limits: tuple[float, float], description: str
 ) -> None:
-    """Raise `InputError` if an entry of a parameter is outside of its limits or NaN.
+    """Check that all entries of a parameter are within limits, up to rounding.
 
-    An entry may exceed a limit by rounding.
+    Args:
+        name: Name of the parameter, for the error.
+        value: Values of the parameter, any shape.
+        limits: Smallest and largest value.
+        description: Description of the range, for the error.
+
+    Raises:
+        InputError: If an entry is outside of the limits, or NaN.
     """
     low, high = limits
     rounding = 4 * torch.finfo(value.dtype).eps
-    # NaN fails both comparisons, so it counts as outside.
+    # Both comparisons are False for NaN, so NaN counts as outside.
     is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
     if is_outside.any():
         first = value[is_outside][0].item()
         raise InputError(
-            f"{name}={first:.9g} is outside the sky model's domain: give {description}"
+            f"{name}={first:.9g} is outside of the range of the sky model: give {description}"
         )
 
 
 def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:
-    """Return the first Chebyshev polynomials at x (...) and their derivatives by a parameter.
+    """Evaluate Chebyshev polynomials of a variable, and their derivatives by a parameter.
 
-    `slope` is the derivative of x by this parameter. Both results have the
-    shape (..., count).
+    Args:
+        x: Variable, in [-1, 1], shape (...).
+        slope: Derivative of the variable by the parameter, shape (...) or a
+            number.
+        count: Number of polynomials.
+
+    Returns:
+        Values and derivatives of the polynomials T_0 to T_(count - 1),
+        shape (..., count) each.
     """
+    # The recurrence is T_(k + 1) = 2 x T_k - T_(k - 1). Its derivative follows from the
+    # product rule.
     values = [torch.ones_like(x), x]
     derivatives = [torch.zeros_like(x), torch.ones_like(x) * slope]
     for _ in range(2, count):

@@ -37,29 +37,26 @@ from renderer.settings import MIN_ROUGHNESS
 from renderer.surface.microfacets import DIELECTRIC, reflectance
 from renderer.vectors import unit
 
-# Relative amplitude below which `_fit` sets the lobe functions of a degree to
-# zero.
+# `_fit` sets the lobe functions of a degree to 0 if the amplitude of this degree in a
+# highlight is at most this fraction of the amplitude of degree 0.
 NEGLIGIBLE = 1e-3
 
-# `lobe_functions` takes functions of degree up to USUAL from one common table.
+# For lights up to this degree, `lobe_functions` uses one common table of this degree.
 USUAL = 6
-# Number of Chebyshev polynomials in the roughness, with which `_table`
-# approximates the lobe functions. It is also the number of values of the
-# roughness at which `_table` computes them.
+# `_table` computes the lobe functions at this number of values of the roughness, and
+# interpolates them with the same number of Chebyshev polynomials in the roughness.
 NODES = 12
-# Number of polynomials in the cosine that `_fit` uses beyond the 2 degree + 1
-# that a perfect mirror would need.
+# `_fit` uses this many more Chebyshev polynomials in the cosine than a perfect mirror would
+# need, which are 2 degree + 1.
 MARGIN = 3
-# Number of cosines for which `_fit` integrates lobes at once. It limits the
-# memory.
+# `_fit` integrates the lobes for this many cosines at once. It limits the memory.
 COSINES_AT_ONCE = 16
-# Number of polar angles and number of azimuths of the half vectors over which
-# `_lobe_integrals` sums. The azimuths are those on one side of the plane of n
-# and v.
+# `_lobe_integrals` sums over half vectors with this many polar angles and azimuths. The
+# azimuths cover one side of the plane that contains the normal and the camera direction.
 POLAR_NODE_COUNT = 32
 AZIMUTH_COUNT = 24
 
-# The x, y and z components of S vectors, each of shape (S,).
+# Type for the x, y and z components of S vectors, shape (S,) each.
 Components = tuple[Tensor, Tensor, Tensor]
 
 
@@ -226,23 +223,40 @@ class ViewAxis(NamedTuple):
 
     @staticmethod
     def along(direction: Tensor) -> ViewAxis:
-        """Return the spherical coordinates of a unit vector of shape (3,)."""
+        """Compute the spherical coordinates of a direction.
+
+        Args:
+            direction: Unit vector in world axes, shape (3,).
+
+        Returns:
+            Polar angle and azimuth of the direction.
+        """
         x, y, z = direction
         polar = Angle(sine=torch.hypot(x, y), cosine=z)
-        # x / sin(polar) would divide by 0 at the poles. atan2 gives the azimuth
-        # 0 there.
+        # At the poles, x / sin(polar) would divide by 0, but atan2 returns 0.
         azimuth = torch.atan2(y, x)
         return ViewAxis(polar, Angle(sine=azimuth.sin(), cosine=azimuth.cos()))
 
     def for_columns(self, coefficients: Tensor) -> ViewAxis:
-        """Return the angles as `_rotate_harmonics` takes them for these coefficients."""
+        """Convert both angles to the shape, dtype and device that `_rotate_harmonics` needs.
+
+        Args:
+            coefficients: Coefficients that will be rotated, shape (K, S).
+        """
         return ViewAxis(
             polar=self.polar.for_columns(coefficients),
             azimuth=self.azimuth.for_columns(coefficients),
         )
 
     def to_view(self, vectors: Tensor) -> Components:
-        """Rotate vectors of shape (S, 3) from world axes to view axes."""
+        """Rotate vectors from world axes to view axes.
+
+        Args:
+            vectors: S vectors in world axes, shape (S, 3).
+
+        Returns:
+            Components x, y and z in view axes, shape (S,) each.
+        """
         x, y, z = vectors.T
         without_azimuth = _rotate_about_z((x, y, z), self.azimuth.reversed())
         return _rotate_about_y(without_azimuth, self.polar.reversed())
@@ -273,10 +287,17 @@ class Tilt(NamedTuple):
 
     @staticmethod
     def along(directions: Components) -> Tilt:
-        """Return the rotations that take (0, 0, 1) to the given unit vectors.
+        """Compute the rotations that rotate the z-axis (0, 0, 1) to given directions.
 
-        R_x(a) R_y(b) takes (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The
-        angle b is chosen such that cos b ≥ 0.
+        R_x(a) R_y(b) rotates (0, 0, 1) to (sin b, -sin a cos b, cos a cos b). The
+        angle b is chosen so that cos b ≥ 0.
+
+        Args:
+            directions: Components of S unit vectors in view axes, shape (S,)
+                each.
+
+        Returns:
+            One rotation for each direction.
         """
         x, y, z = directions
         sine_b = x
@@ -286,7 +307,14 @@ class Tilt(NamedTuple):
         return Tilt(torch.stack([sine_b, cosine_b, sine_a, cosine_a]))
 
     def to_sample(self, vectors: Components) -> Components:
-        """Rotate one vector per sample from view axes to sample axes."""
+        """Rotate one vector per sample from view axes to sample axes.
+
+        Args:
+            vectors: Components of S vectors in view axes, shape (S,) each.
+
+        Returns:
+            Components in sample axes, shape (S,) each.
+        """
         without_x = _rotate_about_x(vectors, self.about_x.reversed())
         return _rotate_about_y(without_x, self.about_y.reversed())
 
@@ -307,7 +335,11 @@ class Angle(NamedTuple):
         return Angle(sine=-self.sine, cosine=self.cosine)
 
     def for_columns(self, coefficients: Tensor) -> Angle:
-        """Return an angle of shape () in shape (1,), on the device and in the dtype given."""
+        """Convert an angle of shape () to shape (1,), with another dtype and device.
+
+        Args:
+            coefficients: Tensor with the dtype and the device.
+        """
         return Angle(
             sine=self.sine[None].to(coefficients), cosine=self.cosine[None].to(coefficients)
         )
@@ -351,7 +383,11 @@ def _rotate_in_plane(first: Tensor, second: Tensor, angle: Angle) -> tuple[Tenso
 
 
 def _degree_of_lobes(lobes: Tensor) -> int:
-    """Return the degree of M lobe functions: M = (degree + 1) (degree + 2) / 2."""
+    """Find the degree of M = (degree + 1) (degree + 2) / 2 lobe functions.
+
+    Args:
+        lobes: Values of the lobe functions at S samples, shape (M, S).
+    """
     return (math.isqrt(8 * len(lobes) + 1) - 3) // 2
 
 
@@ -576,10 +612,15 @@ def coat_mean(roughness: Tensor) -> Tensor:
 
 
 def _coat_coefficients() -> Tensor:
-    """Return the coefficients of E(μ) in products of polynomials, float64, shape (NODES, P).
+    """Return the coefficients of the function E(μ) of `coat_albedo` in Chebyshev polynomials.
 
-    The products are the same as in `_table`. E(μ) is the integral of the lobe,
-    and so √(4π) times its coefficient of degree 0.
+    E(μ) is the integral of the lobe over all directions of light, which is √(4π)
+    times the SH coefficient of degree 0.
+
+    Returns:
+        Coefficients of products of a polynomial in the roughness (axis 0) and a
+        polynomial in the cosine (axis 1), as in `_table`, float64,
+        shape (NODES, P).
     """
     return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
@@ -609,10 +650,9 @@ def _argument_to_roughness(argument: Tensor) -> Tensor:
 
 
 def along(roughness: Tensor) -> Tensor:
-    """Evaluate the NODES Chebyshev polynomials of the roughness.
+    """Evaluate the Chebyshev polynomials in which tables express functions of the roughness.
 
-    Tables of this module hold coefficients for them. The result is
-    differentiable.
+    The result is differentiable with respect to the roughness.
 
     Args:
         roughness: Roughness in [MIN_ROUGHNESS, 1], shape (S,).
@@ -624,7 +664,15 @@ def along(roughness: Tensor) -> Tensor:
 
 
 def _cosine_polynomials(cosine: Tensor, count: int) -> Tensor:
-    """Evaluate Chebyshev polynomials of cosines of shape (S,), shape (count, S)."""
+    """Evaluate the Chebyshev polynomials in which `_table` expresses functions of the cosine.
+
+    Args:
+        cosine: Cosine n·v in [0, 1] at S samples, shape (S,).
+        count: Number of polynomials.
+
+    Returns:
+        Values of the polynomials, shape (count, S).
+    """
     return _chebyshev(_cosine_to_argument(cosine), count)
 
 
@@ -684,7 +732,12 @@ def _table(degree: int) -> Tensor:
 @lru_cache(maxsize=8)
 @torch.inference_mode(False)
 def _table_at(degree: int, roughness: float) -> Tensor:
-    """Fit the lobe functions at one roughness as in `_fit`, and keep the latest results."""
+    """Return the result of `_fit` from a cache with the latest eight results.
+
+    Args:
+        degree: Largest degree of the spherical harmonics.
+        roughness: Roughness in [MIN_ROUGHNESS, 1].
+    """
     return _fit(degree, roughness)
 
 
