@@ -283,7 +283,7 @@ def settings_from(kind: type[Kind], values: Mapping[str, Any], argument: str) ->
         has_default = known.default is not MISSING or known.default_factory is not MISSING
         if not has_default and known.name not in values:
             missing = f"{argument}.{known.name}"
-            raise InputError(f"{missing} has no value: set it", missing)
+            raise InputError(f"{missing} is not set: give a value", missing)
     try:
         return kind(**values)
     except InputError as error:

@@ -263,17 +263,18 @@ class LightPaths(NamedTuple):
 
 
 class LocalBasis(Basis):
-    """Light from sources within the scene, which casts shadows and does not bounce.
+    """Basis of light from sources within the scene, which casts shadows and does not bounce.
 
-    A subclass is a frozen dataclass. `nb.render` takes it as it is. Its
-    name is that of its settings and of its file in the folder of an adversary.
+    A subclass is a frozen dataclass. The function `nb.render` accepts an
+    instance as a light.
 
     Attributes:
-        name: Name of this kind of light, in files, settings and messages.
-        allow_negative: Whether coefficients may be negative.
-        is_movable: Whether `connect` and `moved` take other positions than
-            `source_positions`.
-        power: The largest coefficient. The smallest is 0.
+        name: Name of this kind of light in settings, in file names and in
+            messages.
+        allow_negative: True if coefficients may be negative.
+        is_movable: True if the sources can be at other positions than
+            `source_positions`. `connect` and `moved` then accept positions.
+        power: Largest coefficient. The smallest coefficient is 0.
     """
 
     name: ClassVar[str]
