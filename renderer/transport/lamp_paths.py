@@ -25,10 +25,10 @@ from renderer.transport.rays import NO_FACE, Rays, Surface
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
 
-# `SparseTransfer.few`: A matrix with a smaller fraction of nonzero entries is
+# `SparseTransfer.is_sparse`: A matrix with a smaller fraction of nonzero entries is
 # faster to multiply entry by entry than as a dense matrix.
 SPARSE_FRACTION = 1 / 16
-# `SparseTransfer.few`: A matrix with at most this many entries is always
+# `SparseTransfer.is_sparse`: A matrix with at most this many entries is always
 # faster to multiply as a dense matrix.
 SMALL_MATRIX_SIZE = 2**16
 
@@ -65,7 +65,7 @@ class SparseTransfer(NamedTuple):
         flat_matrix = zeros.index_copy_(1, flat_position, self.weight.T)
         return flat_matrix.unflatten(1, (len(functions), pixel_count)), functions
 
-    def few(self, pixel_count: int) -> bool:
+    def is_sparse(self, pixel_count: int) -> bool:
         """Tell whether multiplying entry by entry is faster than multiplying `dense`.
 
         Args:
@@ -111,7 +111,7 @@ class SparseTransfer(NamedTuple):
         return radiance.unflatten(0, (len(lights), pixel_count)).mT
 
 
-def joined(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
+def concatenate_entries(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
     """Concatenate the entries of several transfer matrices in order.
 
     Args:

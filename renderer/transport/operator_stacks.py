@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError
 from renderer.image import as_background, background_term, clamp, encode
-from renderer.transport.lamp_paths import SparseTransfer, joined
+from renderer.transport.lamp_paths import SparseTransfer, concatenate_entries
 from renderer.transport.operators import TransferOperator, apply_transfer, require_image_gradient
 from renderer.validation import as_tensor
 
@@ -423,7 +423,7 @@ class OperatorStack:
                 stack_pixel = columns[operator.sparse.pixel]
                 sparse_parts.append(operator.sparse._replace(pixel=stack_pixel))
             entry_counts.append(0 if operator.sparse is None else len(operator.sparse.function))
-        sparse = joined(sparse_parts)
+        sparse = concatenate_entries(sparse_parts)
         self._sparse = sparse and sparse.to(device)
         # The sparse entries of operator i are _first_entry[i] to _first_entry[i + 1] - 1.
         self._first_entry = F.pad(torch.tensor(entry_counts).cumsum(0), (1, 0))

@@ -35,7 +35,7 @@ from renderer.light.basis import HARMONICS, Basis, EnvironmentPart, Harmonics, L
 from renderer.settings import ImageSettings
 from renderer.shading.gloss import Gloss, SampleGloss, at_samples
 from renderer.surface.albedo import shared_albedo, surface_albedo
-from renderer.transport.lamp_paths import SparseTransfer, joined, local_transfer
+from renderer.transport.lamp_paths import SparseTransfer, concatenate_entries, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays, Surface
 from renderer.validation import as_tensor
@@ -719,7 +719,7 @@ class _OperatorBuilder:
         sparse = []
         for part in self.basis.local_lights:
             entries = self._local_entries(part, surface, channels)
-            if entries.few(len(fragments.pixels)):
+            if entries.is_sparse(len(fragments.pixels)):
                 sparse.append(self._sparse_rows(part, entries, channels))
             else:
                 dense.append(self._local_rows(part, entries, surface))
@@ -738,7 +738,7 @@ class _OperatorBuilder:
             nonzero=joined_rows.coefficients,
             settings=self.settings,
             basis=self.basis,
-            sparse=joined(sparse),
+            sparse=concatenate_entries(sparse),
             distinct=distinct,
         )
 
