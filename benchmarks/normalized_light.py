@@ -13,19 +13,38 @@ pretrained/laboratory. The validation split shares no object, pattern or map wit
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
 
-from benchmarks.splits import solids
+from augment.classifiers import Classifier
+from augment.settings import NormalizedLightSettings
+from benchmarks.splits import LABEL, TEST, VALIDATION, load, solids
 from train.command_settings import LabSettings
 from train.evaluation.laboratory.laboratory import write_laboratory
+from train.evaluation.scores.metrics import Pooled, auc_and_recalls, metric_title
+from train.evaluation.scores.predictions import Predictor
+from train.evaluation.tables import Table, format_interval
+from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
+from train.report.summary import RunSummary
 from train.runs.run_config import read_json
 from train.settings import published
 
-VALIDATION = "validation"
-TEST = "test"
+# Networks that are scored, by their names for `benchmarks.splits.load`.
+NETWORKS = ("efficientnet_lite0", "pretrained/best")
+# Values of each setting that `choose` tries, and how often it goes through all of them.
+CANDIDATES = {
+    "white_balance": (0.0, 0.25, 0.5, 0.75, 1.0),
+    "level": (0.4, 0.6, 0.8, 1.0),
+    "percentile": (90.0, 95.0, 98.0, 99.5),
+    "gamma": (0.8, 1.0, 1.25),
+}
+ROUNDS = 2
+# Metrics of the table.
+SHOWN = ("auc", "recall_at/0.05", "recall", "false_positive_rate")
 # Names of the parts of a split.
 PATTERNS = "patterns"
 MAPS = "maps"
@@ -94,6 +113,98 @@ def render(options: argparse.Namespace) -> None:
             print(f"{name}: {count} renders", flush=True)
 
 
+# ---------------------------------------------------------------------------- choose
+
+
+def evaluate(network: Classifier, folder: Path) -> Evaluation:
+    """Score a network on a folder of renders.
+
+    Args:
+        network: Network to score.
+        folder: Folder of renders.
+    """
+    predictor = Predictor(network, network.classes, network.size)
+    pooled = Pooled(predictor.predict(folder, LABEL).predictions)
+    summary = RunSummary(folder, network.name, {}, {}, None)
+    return Evaluation(summary, pools_of(pooled))
+
+
+def mean_auc(networks: Sequence[Classifier], split: Path, light: NormalizedLightSettings) -> float:
+    """Average the AUC over networks and the parts of a split, in normalized light.
+
+    Args:
+        networks: Networks without normalized light.
+        split: Folder of the split.
+        light: How the light is normalized.
+    """
+    areas = []
+    for network in networks:
+        normalizing = network.normalizing_light(light)
+        for part in PARTS:
+            pool = evaluate(normalizing, split / part).pools[ALL]
+            auc, *_ = auc_and_recalls(*pool.scores)
+            areas.append(float(auc))
+    return fmean(areas)
+
+
+def choose(options: argparse.Namespace) -> None:
+    """Change one setting at a time, and keep the value with the highest mean AUC.
+
+    Args:
+        options: Parsed command line.
+    """
+    networks = [load(name, SIZE) for name in NETWORKS]
+    split = options.renders / VALIDATION
+    areas: dict[str, float] = {}
+
+    def measure(light: NormalizedLightSettings) -> float:
+        """Measure each setting once, and print it."""
+        key = str(asdict(light))
+        if key not in areas:
+            areas[key] = mean_auc(networks, split, light)
+            print(f"{areas[key]:.4f} {key}", flush=True)
+        return areas[key]
+
+    best = NormalizedLightSettings(percentile=98.0, level=0.8, white_balance=0.5, gamma=1.0)
+    for _ in range(ROUNDS):
+        for name, values in CANDIDATES.items():
+            candidates = [replace(best, **{name: value}) for value in values]
+            best = max([best, *candidates], key=measure)
+    plain = [
+        float(auc_and_recalls(*evaluate(network, split / part).pools[ALL].scores)[0])
+        for network in networks
+        for part in PARTS
+    ]
+    print(f"without normalized light: {fmean(plain):.4f}")
+    print(f"best: {asdict(best)}")
+
+
+# ---------------------------------------------------------------------------- test
+
+
+def test(options: argparse.Namespace) -> None:
+    """Print the scores of each network on the test split, with and without normalized light.
+
+    Args:
+        options: Parsed command line.
+    """
+    rows = []
+    for name in NETWORKS:
+        network = load(name, SIZE)
+        for part in PARTS:
+            folder = options.renders / TEST / part
+            without = [evaluate(network, folder)]
+            normalized = [evaluate(network.normalizing_light(), folder)]
+            for title, evaluations in (("without", without), ("with", normalized)):
+                cells = [format_interval(mean_metric(evaluations, ALL, key)) for key in SHOWN]
+                rows.append([name, part, title, *cells])
+            differences = [difference(normalized, without, ALL, key) for key in SHOWN]
+            cells = [format_interval(value, "+") for value in differences]
+            rows.append([name, part, "difference", *cells])
+    header = ["network", "images", "normalized light", *map(metric_title, SHOWN)]
+    print(Table("", header, rows))
+
+
 # ---------------------------------------------------------------------------- command
 
 
@@ -112,8 +223,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--data", type=Path)
     add("--renders", type=Path, required=True)
     options = parser.parse_args(argv)
-    if options.command == "render":
-        render(options)
+    commands = {"render": render, "choose": choose, "test": test}
+    commands[options.command](options)
 
 
 if __name__ == "__main__":
