@@ -39,6 +39,7 @@ from train.auditing.relit_audit import (
     photographs_screen,
     write_photographs_page,
 )
+from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
 from train.class_names import class_name, class_of_meshes, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
@@ -111,7 +112,7 @@ def run_audit(
     caveats = _compare_sizes(networks.values())
     if not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
-    settings = complete(settings, networks[page.CLASSIFIER])
+    settings = complete(settings, networks[CLASSIFIER])
     plan = _Plan(settings, networks)
     out = writable_folder(settings.out, "out")
     # An audit of networks that have no names does not continue.
@@ -131,7 +132,7 @@ def run_audit(
         console.warning(sentence)
     with sole_writer("out", out):
         _begin(settings, out, renders)
-        plan.find_views(out / page.CLASSIFIER)
+        plan.find_views(out / CLASSIFIER)
         if plan.folders.get(page.LABORATORY) == renders:
             size = max(network.size for network in plan.networks.values())
             laboratory = laboratory_settings(settings, renders, size)
@@ -143,8 +144,10 @@ def run_audit(
             plan.measure(key, out / key)
             if settings.photographs:
                 _measure_photographs(network, settings, out / key)
+        plan.score_in_normalized_light(out)
+        remedies = name_remedies(plan.networks)
         names = _names(plan.networks)
-        return page.write_audit_page(settings.label, names, plan.folders, out, caveats)
+        return page.write_audit_page(settings.label, names, remedies, plan.folders, out, caveats)
 
 
 def _audit_photographs(
@@ -183,7 +186,7 @@ def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
     """Return the names of networks, which differ."""
     names = {key: network.name for key, network in networks.items()}
     if len(set(names.values())) < len(names):
-        names[page.HARDENED] += " (hardened)"
+        names[HARDENED] += " (hardened)"
     return names
 
 
@@ -230,7 +233,7 @@ class _Plan:
         """
         own.mkdir(exist_ok=True)
         path = own / page.PLAIN
-        _write_part(path, _search, self.networks[page.CLASSIFIER], self.attacked_views)
+        _write_part(path, _search, self.networks[CLASSIFIER], self.attacked_views)
         plain = PlainViews(**read_json(path))
         self.views = plain.apply_to(self.views)
         self.attacked_views = plain.apply_to(self.attacked_views)
@@ -249,13 +252,27 @@ class _Plan:
         for kind in KINDS:
             path = own / f"{kind}.json"
             _write_part(path, success_by_light, network, self.attacked_views, kind, own)
-        for name, folder in self.folders.items():
-            predictor = Predictor(network, network.classes, network.size, self.device)
-            _write_folder(own / name, partial(_evaluate, predictor, folder, self.label))
+        self._score(network, own)
         others = [other for other in self.networks.values() if other is not network]
         if others:
             path = own / page.TRANSFER
             _write_part(path, transfer_success, network, *others, self.attacked_views, own)
+
+    def score_in_normalized_light(self, out: Path) -> None:
+        """Score the networks with normalized light in front on the folders of images.
+
+        Args:
+            out: Folder of the audit.
+        """
+        for key, network in normalizing(self.networks).items():
+            self._score(network, out / key)
+
+    def _score(self, network: Classifier, own: Path) -> None:
+        """Score a network on each folder of images, in the folder `own`."""
+        for name, folder in self.folders.items():
+            own.mkdir(exist_ok=True)
+            predictor = Predictor(network, network.classes, network.size, self.device)
+            _write_folder(own / name, partial(_evaluate, predictor, folder, self.label))
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
@@ -303,10 +320,10 @@ def load_networks(settings: AuditSettings) -> dict[str, Classifier]:
     """
     with keyed(name="classifier"):
         classifier = load_chosen(settings)
-    networks = {page.CLASSIFIER: classifier}
+    networks = {CLASSIFIER: classifier}
     if settings.hardened:
         with keyed(name="hardened"):
-            networks[page.HARDENED] = load_network(settings.hardened)
+            networks[HARDENED] = load_network(settings.hardened)
     return networks
 
 
@@ -348,7 +365,8 @@ def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
 def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
     """Remove earlier results or check that they have the same settings, and write the settings."""
     if settings.overwrite:
-        for name in (page.CLASSIFIER, page.HARDENED, renders.name):
+        networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
+        for name in (*networks, renders.name):
             shutil.rmtree(out / name, ignore_errors=True)
     elif (out / CONFIG).exists():
         require_same(out, settings, "out=", _may_be_added)

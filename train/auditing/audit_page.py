@@ -1,6 +1,7 @@
 """Write the report of an audit from the files of its parts."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from train.auditing.audit_screen import attack_pictures, charts, plain_sentence,
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.auditing.plain_light import PlainViews
 from train.auditing.relit_audit import relit_sections
+from train.auditing.remedies import CLASSIFIER, NORMALIZED, Recommendation, recommend
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -37,9 +39,6 @@ VERDICTS = {
     "No": "It is not safe under unusual lighting.",
     "Unknown": "It is unknown whether it is safe.",
 }
-# Folders of the parts of the networks.
-CLASSIFIER = "classifier"
-HARDENED = "hardened"
 # Parts of a network that are scored on a folder of images.
 LABORATORY = "laboratory"
 PHOTOGRAPHS = "photographs"
@@ -68,17 +67,20 @@ class Audited(NamedTuple):
         screen: First screen of the report.
         label: Class whose objects were tested.
         names: Names of the networks by the folders of their parts.
+        recommendation: Which remedy is recommended. None if it is unknown.
     """
 
     path: Path
     screen: FirstScreen
     label: str
     names: Mapping[str, str]
+    recommendation: Recommendation | None
 
 
 def write_audit_page(
     label: str,
     names: Mapping[str, str],
+    remedies: Mapping[str, str],
     folders: Mapping[str, Path],
     out: Path,
     caveats: Sequence[str],
@@ -88,6 +90,8 @@ def write_audit_page(
     Args:
         label: Class whose objects were tested.
         names: Names of the networks by the folders of their parts in `out`.
+        remedies: Folders of the parts of the compared remedies by name, as
+            `name_remedies` returns them.
         folders: Folders of the scored images by part.
         out: Folder of the audit.
         caveats: Sentences at the beginning of the report.
@@ -110,6 +114,9 @@ def write_audit_page(
     if len(paths) > 1:
         transfers = {name: read_json(path / TRANSFER) for name, path in paths.items()}
     screen = _first_screen(label, paths, folders, counts, plain)
+    recommendation = _recommendation(remedies, folders, out)
+    if recommendation is not None:
+        screen = replace(screen, sentences=[*screen.sentences, recommendation.sentence])
     path = write_page(
         out,
         "audit.html.jinja",
@@ -127,7 +134,8 @@ def write_audit_page(
         script=SLIDER_SCRIPT if _slider(counts) else "",
         transfers=transfers,
         answers=[write_answer(label, name, path, folders) for name, path in paths.items()],
-        photographs=_score_sections(paths),
+        photographs=_score_sections(_with_remedies(paths, remedies, out)),
+        recommendation=recommendation,
         rates={name: _rates(lights) for name, lights in correct.items()},
         worst=_worst(label, folders, scored),
         screen=screen,
@@ -136,7 +144,30 @@ def write_audit_page(
         relit=relit_sections(paths),
         config=read_config(out / CONFIG),
     )
-    return Audited(path, screen, label, names)
+    return Audited(path, screen, label, names, recommendation)
+
+
+def _recommendation(
+    remedies: Mapping[str, str], folders: Mapping[str, Path], out: Path
+) -> Recommendation | None:
+    """Recommend a remedy by the first folder of images. None without one."""
+    part = next(iter(folders), None)
+    if part is None or len(remedies) == 1:
+        return None
+    return recommend(_evaluations({name: out / key / part for name, key in remedies.items()}))
+
+
+def _with_remedies(
+    paths: Mapping[str, Path], remedies: Mapping[str, str], out: Path
+) -> dict[str, Path]:
+    """Add the networks with normalized light to the folders of the networks by name."""
+    names = {path.name: name for name, path in paths.items()}
+    added = {}
+    for key in remedies.values():
+        if key.endswith(NORMALIZED):
+            name = names[key.removesuffix(NORMALIZED)]
+            added[f"{name}, normalized light"] = out / key
+    return {**paths, **added}
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
@@ -176,12 +207,7 @@ def _compare(
     images: Path,
 ) -> FirstScreen | None:
     """Compare the scores of two networks, each a name and a folder, on the same images."""
-    runs = {}
-    for name, path in (original, hardened):
-        scores = {path.name: summary.PhotographScores.read(read_json(path / SUMMARY))}
-        runs[name] = [summary.RunSummary(path.parent, name, {"network": name}, scores, None)]
-    (group,) = summary.group_by_images(runs).values()
-    evaluations = compare.read_evaluations(group)
+    evaluations = _evaluations(dict([original, hardened]))
     compared = Compared(
         label=in_words(label),
         before=evaluations[original[0]],
@@ -191,6 +217,16 @@ def _compare(
         place=place_of(images, images.name),
     )
     return compare_networks(compared, contrasts(original[1], hardened[1], images, [label]))
+
+
+def _evaluations(paths: Mapping[str, Path]) -> compare.Evaluations:
+    """Read the scores of networks on the same images, by name, from the folders of the scores."""
+    runs = {}
+    for name, path in paths.items():
+        scores = {path.name: summary.PhotographScores.read(read_json(path / SUMMARY))}
+        runs[name] = [summary.RunSummary(path.parent, name, {"network": name}, scores, None)]
+    (group,) = summary.group_by_images(runs).values()
+    return compare.read_evaluations(group)
 
 
 def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:

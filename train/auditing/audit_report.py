@@ -7,15 +7,9 @@ from typing import Any
 
 from renderer.io.files import atomic_write
 from renderer.validation import as_path
-from train.auditing.audit_page import (
-    CLASSIFIER,
-    HARDENED,
-    RECOGNIZED,
-    TRANSFER,
-    Audited,
-    write_answer,
-)
+from train.auditing.audit_page import RECOGNIZED, TRANSFER, Audited, write_answer
 from train.auditing.lights import KINDS
+from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.evaluation.scores.metrics import METRICS, read_metric
 from train.evaluation.scores.scoring import SUMMARY
 from train.evaluation.tables import Estimate
@@ -78,12 +72,16 @@ class AuditReport:
         label: Class whose objects were tested.
         network: Numbers of the audited network.
         hardened: Numbers of the hardened network. None without one.
+        recommendation: Sentence that recommends normalized light, hardening,
+            both or nothing, by the recall at 5% false positives. Empty if no
+            images were scored.
         page: The report as HTML, which loads nothing else.
     """
 
     label: str
     network: NetworkReport
     hardened: NetworkReport | None
+    recommendation: str
     page: str
 
     def save(self, path: str | Path) -> Path:
@@ -101,9 +99,12 @@ class AuditReport:
         return file
 
     def __str__(self) -> str:
-        """Return the answer of each network, one in each line."""
+        """Return the answer of each network and the recommendation, one in each line."""
         networks = [self.network] if self.hardened is None else [self.network, self.hardened]
-        return "\n".join(network.answer for network in networks)
+        lines = [network.answer for network in networks]
+        if self.recommendation:
+            lines.append(self.recommendation)
+        return "\n".join(lines)
 
 
 def read_audit(audited: Audited) -> AuditReport:
@@ -121,7 +122,14 @@ def read_audit(audited: Audited) -> AuditReport:
     for key, name in audited.names.items():
         networks[key] = _read_network(label, name, folder / key)
     text = audited.path.read_text(encoding="utf-8")
-    return AuditReport(label, networks[CLASSIFIER], networks.get(HARDENED), text)
+    recommended = audited.recommendation
+    return AuditReport(
+        label=label,
+        network=networks[CLASSIFIER],
+        hardened=networks.get(HARDENED),
+        recommendation="" if recommended is None else recommended.sentence,
+        page=text,
+    )
 
 
 def _read_network(label: str, name: str, folder: Path) -> NetworkReport:

@@ -16,9 +16,9 @@ from augment.classifiers.plain_networks import (
 )
 from augment.settings import NormalizeLight
 from renderer.errors import InputError
-from train.auditing import audit_page as page
 from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
+from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.command_settings import ENVIRONMENTS, AuditSettings
 from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
 from train.report.results import require_replaceable
@@ -102,18 +102,16 @@ def audit(
     device = device_of(network) if device is None else device
     options = (size, classes, normalization, value_range, device)
     with gradient_flags_kept(network), gradient_flags_kept(hardened):
-        networks = {
-            page.CLASSIFIER: as_classifier(network, *options, normalize_light=normalize_light)
-        }
+        networks = {CLASSIFIER: as_classifier(network, *options, normalize_light=normalize_light)}
         if hardened is not None:
             is_classifier = isinstance(hardened, Classifier)
-            networks[page.HARDENED] = as_classifier(
+            networks[HARDENED] = as_classifier(
                 hardened,
                 *options,
                 argument="hardened",
                 normalize_light=None if is_classifier else normalize_light,
             )
-        classifier = networks[page.CLASSIFIER]
+        classifier = networks[CLASSIFIER]
         with folder_or_temporary(out) as folder:
             require_replaceable(folder, "out", overwrite)
             items = as_mappings("meshes", meshes, classifier, folder)

@@ -278,16 +278,24 @@ def _sentences(
     equal = compared.difference(EQUAL_RATE)
     if equal is not None:
         text = "At an equal rate of 10% false positives, recall"
-        sentences.append(_gain_sentence(text, equal))
+        sentences.append(gain_sentence(text, equal))
     top1 = compared.difference("class_top1") if compared.has_several_classes else None
     if top1 is not None:
         text = "Among all classes of the network, top-1 (the mean over classes)"
-        sentences.append(_gain_sentence(text, top1))
+        sentences.append(gain_sentence(text, top1))
     return sentences
 
 
-def _gain_sentence(subject: str, change: compare.Difference) -> str:
-    """Compare a metric of both networks, and say whether the difference is proven."""
+def gain_sentence(subject: str, change: compare.Difference) -> str:
+    """Compare a metric of both networks, and say whether the difference is proven.
+
+    Args:
+        subject: Start of the sentence, such as "Recall".
+        change: Difference of the metric.
+
+    Returns:
+        A sentence with the interval of the difference.
+    """
     assert change.low is not None and change.high is not None
     verdicts = {1: "a proven gain", -1: "a proven loss", 0: "a difference is not proven"}
     verdict = verdicts[_direction(change)]

@@ -38,7 +38,7 @@ TOP_RANKS = {"class_top1": 1, "class_top5": 5}
 COUNTED: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
 # Names of the metrics that the tables of reports show, in this order. A slash
 # separates the keys of nested entries of summary.json.
-METRICS = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD, *TOP_RANKS)
+METRICS: tuple[str, ...] = ("recall", "false_positive_rate", *RANKED, *AT_THRESHOLD, *TOP_RANKS)
 # Titles by which `metric_title` replaces these names in tables.
 TITLES = {
     "recall": "recall",

@@ -1,0 +1,116 @@
+"""An audit recommends a remedy only if its gain is larger than chance."""
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+
+import augment
+from train.auditing.remedies import (
+    BOTH,
+    HARDENING,
+    LIGHT_ALONE,
+    ORIGINAL,
+    name_remedies,
+    normalizing,
+    recommend,
+)
+from train.data.photographs import Photograph
+from train.evaluation.scores.metrics import Pooled
+from train.evaluation.scores.predictions import Prediction
+from train.report.comparison import Evaluation, pools_of
+from train.report.summary import RunSummary
+
+COUNT = 60
+
+
+def evaluation(found: Sequence[int], labels: Sequence[str] = ("orange",)) -> Evaluation:
+    """Make the evaluation of a network that finds some of COUNT images of each label.
+
+    An image that is found scores above all negatives, and has the rank 1. Others score below.
+    """
+    predictions = []
+    for label in labels:
+        for number in range(COUNT):
+            score = 2.0 if number in found else -2.0
+            predictions.append(prediction(label, label, number, score))
+        predictions += [prediction("other_ball", label, number, 0.0) for number in range(COUNT)]
+    pools = pools_of(Pooled(predictions))
+    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), pools)
+
+
+def prediction(shown: str, label: str, number: int, score: float) -> Prediction:
+    """Make the prediction about a label for an image."""
+    is_found = score > 0
+    return Prediction(
+        photograph=Photograph(PurePosixPath(f"{shown}/{number}.png"), shown, None),
+        label=label,
+        predicted=label if is_found else "other",
+        probability=0.5,
+        true_probability=None if shown != label else 0.5,
+        true_rank=None if shown != label else 2 - is_found,
+        label_probability=0.5,
+        label_rank=2 - is_found,
+        log_odds=score,
+    )
+
+
+FEW = range(10)
+MORE = range(30)
+MOST = range(50)
+
+
+@pytest.mark.parametrize(
+    ("light_alone", "hardening", "both", "expected"),
+    [
+        (FEW, FEW, FEW, None),
+        (MORE, FEW, FEW, LIGHT_ALONE),
+        (MORE, MORE, MORE, LIGHT_ALONE),
+        (FEW, MORE, MORE, HARDENING),
+        (MORE, MOST, MOST, HARDENING),
+        (FEW, FEW, MORE, BOTH),
+        (MORE, range(32), MOST, BOTH),
+        ((), range(11), range(11), None),
+    ],
+)
+@pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])
+def test_the_cheapest_remedy_is_recommended_that_no_other_improves_on(
+    labels, light_alone, hardening, both, expected
+):
+    found = {ORIGINAL: FEW, LIGHT_ALONE: light_alone, HARDENING: hardening, BOTH: both}
+    evaluations = {name: [evaluation(images, labels)] for name, images in found.items()}
+    recommendation = recommend(evaluations)
+    assert recommendation.remedy == expected
+    values = [float(row[1].partition(" ")[0]) for row in recommendation.table.rows]
+    np.testing.assert_allclose(
+        values, [len(images) / COUNT for images in found.values()], atol=1e-3
+    )
+
+
+def test_a_remedy_is_unknown_without_negatives():
+    pools = evaluation(FEW).pools
+    positives = [item for pool in pools.values() for item in pool.positives]
+    run = RunSummary(Path("run"), "network", {}, {}, None)
+    without = Evaluation(run, pools_of(Pooled(positives)))
+    assert recommend({ORIGINAL: [without], LIGHT_ALONE: [without]}) is None
+
+
+def network(normalize_light: bool) -> augment.Classifier:
+    """Make a classifier of the mean color."""
+    return augment.Classifier(
+        lambda images: images.mean((2, 3)),
+        8,
+        ["red", "green", "blue"],
+        normalize_light=normalize_light,
+    )
+
+
+def test_a_network_that_normalizes_light_itself_gets_no_second_normalization():
+    networks = {"classifier": network(False), "hardened": network(True)}
+    assert [*normalizing(networks)] == ["classifier_normalized_light"]
+    assert name_remedies(networks) == {
+        ORIGINAL: "classifier",
+        LIGHT_ALONE: "classifier_normalized_light",
+        BOTH: "hardened",
+    }
