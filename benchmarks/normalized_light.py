@@ -14,19 +14,22 @@ pretrained/laboratory. The validation split shares no object, pattern or map wit
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from augment.classifiers import Classifier
 from augment.settings import NormalizedLightSettings
 from benchmarks.splits import LABEL, TEST, VALIDATION, load, solids
 from train.command_settings import LabSettings
+from train.data.photographs import Photograph, find_photographs, load_photographs
 from train.evaluation.laboratory.laboratory import write_laboratory
 from train.evaluation.scores.metrics import Pooled, auc_and_recalls, metric_title
-from train.evaluation.scores.predictions import Predictor
+from train.evaluation.scores.predictions import compute_logits, rank_classes
 from train.evaluation.tables import Table, format_interval
 from train.report.comparison import ALL, Evaluation, difference, mean_metric, pools_of
 from train.report.summary import RunSummary
@@ -35,14 +38,13 @@ from train.settings import published
 
 # Networks that are scored, by their names for `benchmarks.splits.load`.
 NETWORKS = ("efficientnet_lite0", "pretrained/best")
-# Values of each setting that `choose` tries, and how often it goes through all of them.
+# Values of each setting that `choose` tries.
 CANDIDATES = {
-    "white_balance": (0.0, 0.25, 0.5, 0.75, 1.0),
-    "level": (0.4, 0.6, 0.8, 1.0),
-    "percentile": (90.0, 95.0, 98.0, 99.5),
+    "white_balance": (0.0, 0.25, 0.5, 1.0),
+    "level": (0.6, 0.8, 1.0),
+    "percentile": (95.0, 98.0, 99.5),
     "gamma": (0.8, 1.0, 1.25),
 }
-ROUNDS = 2
 # Metrics of the table.
 SHOWN = ("auc", "recall_at/0.05", "recall", "false_positive_rate")
 # Names of the parts of a split.
@@ -116,6 +118,22 @@ def render(options: argparse.Namespace) -> None:
 # ---------------------------------------------------------------------------- choose
 
 
+@cache
+def read_renders(folder: Path, size: int) -> tuple[list[Photograph], Tensor]:
+    """Read the renders of a folder once.
+
+    Args:
+        folder: Folder of renders.
+        size: Pixels per side of the images.
+
+    Returns:
+        The renders with their labels, and their images, uint8 (N, 3, size, size).
+    """
+    found = find_photographs(folder, [LABEL], LABEL)
+    photographs, images, _ = load_photographs(folder, found, size)
+    return photographs, images
+
+
 def evaluate(network: Classifier, folder: Path) -> Evaluation:
     """Score a network on a folder of renders.
 
@@ -123,19 +141,22 @@ def evaluate(network: Classifier, folder: Path) -> Evaluation:
         network: Network to score.
         folder: Folder of renders.
     """
-    predictor = Predictor(network, network.classes, network.size)
-    pooled = Pooled(predictor.predict(folder, LABEL).predictions)
+    photographs, images = read_renders(folder, network.size)
+    logits = compute_logits(network, images, len(network.classes), "cpu")
+    pooled = Pooled(rank_classes(photographs, logits, network.classes, [LABEL]))
     summary = RunSummary(folder, network.name, {}, {}, None)
     return Evaluation(summary, pools_of(pooled))
 
 
-def mean_auc(networks: Sequence[Classifier], split: Path, light: NormalizedLightSettings) -> float:
-    """Average the AUC over networks and the parts of a split, in normalized light.
+def mean_auc(
+    networks: Sequence[Classifier], split: Path, light: NormalizedLightSettings | None
+) -> float:
+    """Average the AUC over networks and the parts of a split.
 
     Args:
         networks: Networks without normalized light.
         split: Folder of the split.
-        light: How the light is normalized.
+        light: How the light is normalized. None if it is not.
     """
     areas = []
     for network in networks:
@@ -144,6 +165,7 @@ def mean_auc(networks: Sequence[Classifier], split: Path, light: NormalizedLight
             pool = evaluate(normalizing, split / part).pools[ALL]
             auc, *_ = auc_and_recalls(*pool.scores)
             areas.append(float(auc))
+    print([round(area, 3) for area in areas], flush=True)
     return fmean(areas)
 
 
@@ -166,16 +188,10 @@ def choose(options: argparse.Namespace) -> None:
         return areas[key]
 
     best = NormalizedLightSettings(percentile=98.0, level=0.8, white_balance=0.5, gamma=1.0)
-    for _ in range(ROUNDS):
-        for name, values in CANDIDATES.items():
-            candidates = [replace(best, **{name: value}) for value in values]
-            best = max([best, *candidates], key=measure)
-    plain = [
-        float(auc_and_recalls(*evaluate(network, split / part).pools[ALL].scores)[0])
-        for network in networks
-        for part in PARTS
-    ]
-    print(f"without normalized light: {fmean(plain):.4f}")
+    for name, values in CANDIDATES.items():
+        candidates = [replace(best, **{name: value}) for value in values]
+        best = max([best, *candidates], key=measure)
+    print(f"{mean_auc(networks, split, None):.4f} without normalized light")
     print(f"best: {asdict(best)}")
 
 

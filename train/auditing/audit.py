@@ -174,7 +174,7 @@ def _audit_photographs(
         paths = {name: out / key for key, name in names.items()}
         screen = photographs_screen(paths)
         path = write_photographs_page(screen, paths, out, caveats)
-        return page.Audited(path, screen, "", names)
+        return page.Audited(path, screen, "", names, None)
 
 
 def _measure_photographs(network: Classifier, settings: AuditSettings, own: Path) -> None:

@@ -14,7 +14,13 @@ from train.auditing.audit_screen import attack_pictures, charts, plain_sentence,
 from train.auditing.lights import ADDITIONAL_STEPS, KINDS, RANDOM, SIDE, STEPS
 from train.auditing.plain_light import PlainViews
 from train.auditing.relit_audit import relit_sections
-from train.auditing.remedies import CLASSIFIER, NORMALIZED, Recommendation, recommend
+from train.auditing.remedies import (
+    CLASSIFIER,
+    HARDENING,
+    NORMALIZED,
+    Recommendation,
+    recommend,
+)
 from train.evaluation.scores.metrics import bootstrap, estimate, read_metric, weighted_mean
 from train.evaluation.scores.predictions import PREDICTIONS, Prediction, read_predictions
 from train.evaluation.scores.scoring import SUMMARY
@@ -116,7 +122,11 @@ def write_audit_page(
     screen = _first_screen(label, paths, folders, counts, plain)
     recommendation = _recommendation(remedies, folders, out)
     if recommendation is not None:
-        screen = replace(screen, sentences=[*screen.sentences, recommendation.sentence])
+        sentence = recommendation.sentence
+        if recommendation.remedy == HARDENING:
+            # The first screen has the gain by hardening already.
+            sentence = f"Recommended: {HARDENING}."
+        screen = replace(screen, sentences=[*screen.sentences, sentence])
     path = write_page(
         out,
         "audit.html.jinja",

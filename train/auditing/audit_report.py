@@ -73,7 +73,7 @@ class AuditReport:
         network: Numbers of the audited network.
         hardened: Numbers of the hardened network. None without one.
         recommendation: Sentence that recommends normalized light, hardening,
-            both or nothing, by the recall at 5% false positives. Empty if no
+            both or nothing, by the recall at 10% false positives. Empty if no
             images were scored.
         page: The report as HTML, which loads nothing else.
     """

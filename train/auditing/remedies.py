@@ -10,7 +10,7 @@ from augment.classifiers import Classifier
 from train.evaluation.scores.metrics import metric_title
 from train.evaluation.tables import Table, format_interval
 from train.report.comparison import ALL, Evaluation, Evaluations, difference, mean_metric
-from train.report.first_screen import gain_sentence
+from train.report.first_screen import EQUAL_RATE, gain_sentence
 
 # Keys of the networks of an audit, and names of the folders of their parts.
 CLASSIFIER = "classifier"
@@ -23,8 +23,7 @@ ORIGINAL = "the original network"
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
-# Metric for one class under study, and for several.
-RECALL = "recall_at/0.05"
+# Metric for several classes under study. For one class, it is EQUAL_RATE.
 TOP1 = "class_top1"
 
 
@@ -89,7 +88,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     A remedy counts only if the 95% interval of its gain over the original
     network is above 0. A more expensive remedy replaces a cheaper one only if
     the interval of its gain over the cheaper one is above 0, too. The metric is
-    the recall at 5% false positives for one class under study, and top-1 for
+    the recall at 10% false positives for one class under study, and top-1 for
     several.
 
     Args:
@@ -115,7 +114,8 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     subject = metric_title(metric)
     gain = gains.get(chosen)
     if gain is None:
-        sentence = f"Recommended: nothing. No gain in {subject} is proven for {_listed(remedies)}."
+        listed = ", ".join(remedies)
+        sentence = f"Recommended: nothing. No gain in {subject} is proven for: {listed}."
     else:
         sentence = f"Recommended: {chosen}. " + gain_sentence(f"With it, {subject}", gain)
     rows = []
@@ -129,16 +129,10 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
 def _metric_for(group: Sequence[Evaluation]) -> str:
     """Return the metric by which remedies are compared."""
     labels = {prediction.label for prediction in group[0].pools[ALL].positives}
-    return TOP1 if len(labels) > 1 else RECALL
+    return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 
 def _is_gain(evaluations: Evaluations, name: str, reference: str, metric: str) -> bool:
     """Return whether the interval of the gain of a remedy over another network is above 0."""
     gain = difference(evaluations[name], evaluations[reference], ALL, metric)
     return gain is not None and gain.low is not None and gain.low > 0
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Write names in a sentence, such as "a, b or c"."""
-    *others, last = names
-    return f"{', '.join(others)} or {last}" if others else last
