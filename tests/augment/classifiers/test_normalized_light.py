@@ -31,9 +31,10 @@ def radiance() -> np.ndarray:
 
 
 def normalized(linear: np.ndarray, **settings) -> np.ndarray:
-    """Normalize linear images, and return linear images."""
+    """Normalize linear images, with half of a white balance, and return linear images."""
     images = torch.from_numpy(srgb(linear))
-    result = normalize_light(images, NormalizedLightSettings(**settings))
+    defaults = {"white_balance": 0.5, "gamma": 1.0}
+    result = normalize_light(images, NormalizedLightSettings(**(defaults | settings)))
     return linear_of(result.numpy())
 
 
