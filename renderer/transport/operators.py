@@ -556,10 +556,21 @@ class _Image(torch.autograd.Function):
         return images
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
+        # Gradients are recorded only with create_graph. Without this test,
+        # once_differentiable would take several percent of a step in small images.
+        if torch.is_grad_enabled():
+            return _Image._backward_once(ctx, upstream)
+        return _Image._backward(ctx, upstream)
+
+    @staticmethod
+    def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
+        """Compute the gradient by the lights."""
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_passing, ctx.clamped)
         return gradient, None, None
+
+    # A second derivative raises an error.
+    _backward_once = staticmethod(once_differentiable(_backward))
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
