@@ -37,7 +37,7 @@ from renderer.io.images import read_square
 from train.command_settings import LabSettings
 from train.data.photographs import TABLE
 from train.evaluation.laboratory.laboratory import write_laboratory
-from train.evaluation.tables import Estimate, Table, format_interval
+from train.evaluation.tables import Estimate, Table, format_fraction, format_interval, fraction
 
 TEST = "test"
 SAME = "objects trained on"
@@ -403,12 +403,27 @@ def score(options: argparse.Namespace) -> None:
     title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:
-        paths = sorted(options.photographs.iterdir())
-        predicted = {name: predict(network, paths) for name, network in networks.items()}
-        first = next(iter(predicted.values()))
-        for name, classes in predicted.items():
-            agreement = np.mean(np.array(classes) == np.array(first))
-            print(f"agreement of {name} on {len(paths)} photographs: {agreement:.3f}")
+        print(photograph_table(networks, sorted(options.photographs.iterdir())))
+
+
+def photograph_table(networks: Mapping[str, Classifier], paths: Sequence[Path]) -> Table:
+    """Return a table of top-1 accuracy and of agreement with the first network.
+
+    Args:
+        networks: Networks by name, with the same classes.
+        paths: Photographs, each named by the index of its class, such as
+            "954_banana.jpg".
+    """
+    original = next(iter(networks.values()))
+    shown = np.array([original.classes[int(path.stem.partition("_")[0])] for path in paths])
+    answers = np.array(predict(original, paths))
+    rows = []
+    for name, network in networks.items():
+        predicted = np.array(predict(network, paths))
+        accuracy = fraction(int((predicted == shown).sum()), len(paths))
+        agreement = fraction(int((predicted == answers).sum()), len(paths))
+        rows.append([name, format_fraction(accuracy), format_fraction(agreement)])
+    return Table("photographs", ["network", "top-1", "same prediction as the original"], rows)
 
 
 # ------------------------------------------------------------------------- command
@@ -434,7 +449,7 @@ def make_parser() -> argparse.ArgumentParser:
     scoring.add_argument("networks", nargs="+", help="a classifier, and folders of runs")
     scoring.add_argument("--objects", type=Path, required=True, help="--out of make")
     scoring.add_argument("--split", choices=[*OBJECTS], default="validation")
-    scoring.add_argument("--photographs", type=Path, help="folder of photographs for agreement")
+    scoring.add_argument("--photographs", type=Path, help="folder of photographs INDEX_NAME.jpg")
     scoring.add_argument("--interpolate", nargs="*", type=float, default=[], help="factors")
     scoring.add_argument("--network-size", type=int, default=224)
     return parser

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from torch import nn
 
 from augment.classifiers import Classifier
@@ -95,3 +96,15 @@ def test_weights_between_two_networks_of_one_layer_give_logits_between():
     between = many_objects.interpolate(*networks, 0.25)
     expected = 0.75 * networks[0](images) + 0.25 * networks[1](images)
     torch.testing.assert_close(between(images), expected)
+
+
+def test_photographs_count_as_right_by_the_number_in_their_name(tmp_path):
+    classifiers = {
+        "original": Classifier(lambda images: images[:, :, 0, 0], 4, CLASSES),
+        "other": Classifier(lambda images: -images[:, :, 0, 0], 4, CLASSES),
+    }
+    for name, color in (("0_a", (200, 100, 0)), ("1_b", (200, 100, 0)), ("002_c", (0, 100, 200))):
+        Image.new("RGB", (4, 4), color).save(tmp_path / f"{name}.png")
+    table = many_objects.photograph_table(classifiers, sorted(tmp_path.iterdir()))
+    assert [row[1][:6] for row in table.rows] == ["2 of 3", "0 of 3"]
+    assert [row[2][:6] for row in table.rows] == ["3 of 3", "0 of 3"]

@@ -40,6 +40,7 @@ from train.training.baselines import Baseline
 from train.training.loss import TrainingLoss
 from train.training.recipe import build_optimizer, learning_rate
 from train.training.relit_batches import RelitBatches
+from train.training.shared_teacher import share_layers
 
 # Images that are evaluated at a time.
 EVALUATION_BATCH = 512
@@ -193,7 +194,12 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=is_scaled)
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
-        self._loss = TrainingLoss(replica, settings, positive_classes, teacher, labeled).compute
+        with keyed(choice="compile"):
+            is_compiled = compiles(settings.compile, self.device)
+        answering: nn.Module | None = teacher
+        if teacher is not None and not is_compiled:
+            answering = share_layers(settings, self.model, teacher, self.architecture["size"])
+        self._loss = TrainingLoss(replica, settings, positive_classes, answering, labeled).compute
         self._baseline: Baseline | RelitBatches = Baseline(
             settings.augmentation,
             self.model,
@@ -204,8 +210,6 @@ class Trainer:
             self._baseline = RelitBatches(settings, self.model, teacher, self.seed)
         self._attacked: nn.Module = self.model
         self._validated: nn.Module = self.averages.selected
-        with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, self.device)
         if is_compiled:
             torch.compiler.reset()  # torch limits the graphs of all runs of a process.
             self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)

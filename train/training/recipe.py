@@ -92,6 +92,19 @@ def build_optimizer(model: nn.Module, settings: TrainSettings) -> torch.optim.Op
     return torch.optim.AdamW(groups, settings.learning_rate, fused=True)
 
 
+def last_layer(network: nn.Module) -> str:
+    """Return the name of the module that has the last parameter of a network.
+
+    Args:
+        network: Network with parameters.
+
+    Returns:
+        Name, such as "head.fc". Empty for the network itself.
+    """
+    *_, (name, _) = network.named_parameters()
+    return name.rpartition(".")[0]
+
+
 def freeze(network: nn.Module, stage: str) -> None:
     """Freeze the parameters of a network from the first one to the end of a module.
 
@@ -108,7 +121,8 @@ def freeze(network: nn.Module, stage: str) -> None:
     names = [name for name, _ in network.named_parameters()]
     modules = [name.rpartition(".")[0] for name in names]
     if stage == ALL_BUT_LAST:
-        frozen = [index for index, module in enumerate(modules) if module != modules[-1]]
+        last = last_layer(network)
+        frozen = [index for index, module in enumerate(modules) if module != last]
         if not frozen:
             return
     else:
