@@ -9,7 +9,7 @@ from augment.classifiers.adapter import class_index, nearest
 from renderer.errors import InputError
 from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
 from train.data.photographs import OTHER_PREFIX
-from train.settings import OTHER, ExperimentSettings, simplified, solid_name
+from train.settings import OTHER, ExperimentSettings, label_names, simplified, solid_name
 
 
 def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
@@ -174,5 +174,34 @@ def with_classes_of_meshes(
     return replace(
         settings,
         label=labels[0] if len(labels) == 1 else labels,
+        scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
+    )
+
+
+def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> ExperimentSettings:
+    """Return settings in which classes are given by name instead of by index.
+
+    Args:
+        settings: Settings of a run with a label.
+        classes: Names of all classes of the network.
+
+    Returns:
+        Settings with the names in the label and in the meshes.
+
+    Raises:
+        InputError: If the network lacks a class.
+    """
+    names = [class_name(classes, name, "label") for name in label_names(settings.label)]
+    meshes = [with_class_name(item, classes, "scene.meshes") for item in settings.scene.meshes]
+    negatives = [
+        with_class_name(item, classes, "scene.hard_negatives")
+        for item in settings.scene.hard_negatives
+    ]
+    # A generated hard negative of the class is left out, which changes this number.
+    examples = settings.augment.examples if settings.scene.views is None else None
+    return replace(
+        settings,
+        label=names[0] if len(names) == 1 else names,
+        augment=replace(settings.augment, examples=examples),
         scene=replace(settings.scene, meshes=meshes, hard_negatives=negatives),
     )

@@ -89,10 +89,8 @@ class TestTrainingOfTwoArms:
         assert errors == ""
         lines = printed.out.splitlines()
         assert len(lines) <= 15
-        heads = [line for line in lines if line.startswith("| network")]
-        assert [head.split() for head in heads] == [
-            ["|", "network", "|", "none", "|", "adversarial", "|"]
-        ]
+        names = [line.split()[1] for line in lines if line.startswith("| ")]
+        assert [name for name in names if name.isalpha()] == ["network", "none", "adversarial"]
         for run in (folder, folder / "none"):
             assert (run / LAST).is_file()
             assert (run / "photographs" / "contact_sheet.png").is_file()

@@ -15,7 +15,7 @@ from augment import distributed
 from augment.settings import MODES
 from train import console
 from train.command import program, read_settings
-from train.report.comparison import format_result, format_table
+from train.report.comparison import format_short_comparison, format_table
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.report.summary import summarize
@@ -124,7 +124,7 @@ def _train_methods(
     if distributed.rank() == 0:
         summaries = [summarize(path) for path in methods]
         console.debug("\n%s\n", format_table(summaries))
-        console.info("%s\n", format_result(summaries))
+        console.info("%s\n", format_short_comparison(summaries))
         console.info("%s", report_of([folder], folder))
 
 

@@ -36,7 +36,6 @@ from train.report.summary import (
     group_by_method,
     label_title,
     run_tables,
-    score_table,
     seconds_table,
 )
 from train.settings import PHOTOGRAPHS
@@ -46,7 +45,7 @@ MAX_CLASSES = 30
 # Titles of the columns of metrics.
 TITLES = [metric_title(name) for name in METRICS]
 # Metrics of the table that is printed without --verbose.
-SHORT_METRICS = ("recall", "false_positive_rate", "auc")
+SHORT_METRICS = ("recall", "false_positive_rate", "auc", "class_top1")
 
 
 @dataclass(frozen=True)
@@ -431,24 +430,6 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def format_result(runs: Sequence[RunSummary]) -> str:
-    """Write the one table that pnb-train prints without --verbose.
-
-    Args:
-        runs: Finished runs.
-
-    Returns:
-        Markdown table of the scores on the first photographs, with a row for each metric. If
-        there are no photographs, the table shows the accuracy.
-    """
-    methods = group_by_method(runs)
-    groups = group_by_images(methods)
-    scored = [score_table(title, group) for title, group in groups.items()]
-    (table, *_) = scored or run_tables(methods, groups)
-    header, *rows = zip(*[table.known.header, *table.known.rows], strict=True)
-    return str(Table(table.title, header, rows))
-
-
 def _format_tables(tables: Sequence[Table]) -> str:
     """Write the known columns of tables as Markdown. Tables without rows are left out."""
     return "\n\n".join(str(table.known) for table in tables if table.rows)
@@ -497,7 +478,7 @@ def format_short_comparison(
     photographs: str = PHOTOGRAPHS,
     by: str = "source",
 ) -> str:
-    """Compare runs in one table, which pnb-compare prints without --verbose.
+    """Compare runs in one table, which pnb-train and pnb-compare print without --verbose.
 
     Args:
         runs: Finished runs and scored networks.

@@ -14,7 +14,7 @@ from augment.classifiers.files import is_network_file
 from augment.classifiers.plain_networks import as_facts, require_no_facts
 from renderer.errors import InputError
 from train import console
-from train.class_names import with_classes_of_meshes
+from train.class_names import with_class_names, with_classes_of_meshes
 from train.data.cache import TensorCache
 from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, describe
@@ -25,7 +25,7 @@ from train.runs.saved_networks import (
     of_one_architecture,
     plain_weights,
 )
-from train.settings import WIDERESNET, ExperimentSettings
+from train.settings import WIDERESNET, ExperimentSettings, label_names
 from train.system.device import MixedPrecision
 from train.system.hashing import content_hash
 from train.system.user_errors import keyed
@@ -140,22 +140,29 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
 
 
 def with_label(settings: ExperimentSettings) -> ExperimentSettings:
-    """Return settings with a label. Without one, it is the classes of the meshes.
+    """Return settings with a label, in which each class has its name.
+
+    Without a label, it is the classes of the meshes. An index is replaced by
+    the name of the class, which tables and folders of photographs show.
 
     Args:
         settings: Settings of a run.
 
     Returns:
-        The same settings if they have a label. Otherwise the meshes name their
-        classes, too.
+        The settings. If they had no label, the meshes name their classes, too.
 
     Raises:
-        InputError: If there is no initial network, whose classes are needed, or
-            if it lacks the class of a mesh.
+        InputError: If an initial network is needed, because there is no label,
+            or if it lacks a class.
     """
-    if settings.label is not None:
+    names = [] if settings.label is None else label_names(settings.label)
+    if names and not any(name.isdecimal() for name in names):
         return settings
     initial = load_initial(settings)
+    if names:
+        if initial is None:
+            return settings
+        return with_class_names(settings, initial.classes)
     if initial is None:
         problem = "label is not set, and there is no train.init_from whose classes are known"
         raise InputError(f"{problem}: set label=CLASS", "label")

@@ -26,6 +26,7 @@ from augment.progress import progress
 from augment.random_streams import stream_seed
 from renderer.errors import InputError
 from train import console
+from train.class_names import class_name
 from train.data.cache import TensorCache, cache_folder
 from train.data.photographs import DESCRIPTION, find_photographs, require_outside
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows, relabeled
@@ -39,7 +40,7 @@ from train.runs import checkpoint
 from train.runs.run_config import require_same_run, write_config
 from train.runs.run_log import BEFORE, RunLog, remove_run
 from train.runs.saved_networks import NORMALIZE_LIGHT, WEIGHTS, export
-from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings
+from train.settings import KEPT_ASIDE, LABORATORY, ExperimentSettings, label_names
 from train.system.device import (
     MixedPrecision,
     choose_device,
@@ -122,6 +123,7 @@ class Run:
         self.data = _data_for(settings, self.data, self.initial)
         for name, photographs in settings.evaluate.folders.items():
             require_outside(self.folder / name, photographs)
+            _require_names(settings, self.data)
             find_photographs(photographs, self.data.classes, settings.label)
         set_deterministic(settings.train.deterministic)
         before = self._require_folder()
@@ -434,6 +436,14 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
     for run in runs:
         run.load()
     return runs
+
+
+def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
+    """Raise InputError if the label is an index, which scores on photographs do not know."""
+    for name in label_names(settings.label):
+        known = class_name(data.classes, name, "label")
+        if known != name:
+            raise InputError(f"label={name} is an index: give the name, label={known}", "label")
 
 
 def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:

@@ -30,6 +30,7 @@ from tests.train.own_networks import (
 from train.__main__ import main as train_command
 from train.auditing import audit
 from train.runs.saved_networks import load_run
+from train.training.initial import with_label
 
 OWN = [
     f"classifier=torchvision:{NAME}",
@@ -204,6 +205,16 @@ def test_a_hardened_network_loads_where_the_original_weights_did(harden, here):
     again = augment.load_classifier(f"torchvision:{NAME}", folder / "weights.pt", CLASSES, SIZE)
     torch.testing.assert_close(again(images), hardened, **ROUNDING)
     assert not torch.allclose(hardened, normalized_logits(trained_network(), images))
+
+
+def test_the_index_of_a_class_is_replaced_by_its_name(here, monkeypatch):
+    monkeypatch.chdir(here)
+    network = [f"train.init_from=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt"]
+    meshes = "scene.meshes=[{mesh: 'solid:orange', label: 1}]"
+    words = ["experiment=classifier", *network, "data.path=photos", meshes, "label=1"]
+    settings = with_label(train_command.read(words))
+    assert settings.label == CLASSES[1]
+    assert settings.scene.meshes[0]["label"] == CLASSES[1]
 
 
 def save_torchscript(network: nn.Module) -> str:
