@@ -39,9 +39,9 @@ def shade_by_face(
     """
     normals = reference.face_normals(vertices[fragments.corners])
     irradiance = reference.irradiance(normals * fragments.facing.to(vertices), light)
-    radiance_of_samples = irradiance[fragments.face] * albedo / fragments.samples**2
+    radiance_of_samples = irradiance[fragments.sample_to_seen_face] * albedo / fragments.samples**2
     black = radiance_of_samples.new_zeros(len(fragments.pixels), 3)
-    return black.index_add(0, fragments.pixel, radiance_of_samples).T
+    return black.index_add(0, fragments.sample_to_pixel, radiance_of_samples).T
 
 
 ANALYTIC = "analytic"

@@ -1,26 +1,27 @@
-"""Angles in files: in degrees, or in radians in the files of earlier versions."""
+"""Convert the angles in files to degrees. Files of earlier versions have angles in radians."""
 
 import math
 from collections.abc import Mapping
 from typing import Any
 
-# A description with angles in degrees has this key, with this value.
+# Files with angles in degrees have the entry `ANGLE_UNIT` with the value `DEGREES`.
 ANGLE_UNIT = "angle_unit"
 DEGREES = "degrees"
-# The entries of a description that are angles.
+# Names of the entries of a file that are angles.
 ANGLES = ("polar", "azimuth", "fov")
 
 
 def angles_in_degrees(description: Mapping[str, Any], unit: str | None) -> dict[str, Any]:
-    """Return the description of a camera or of a projector with its angles in degrees.
+    """Convert the angles of a camera or of a projector from a file to degrees.
 
     Args:
-        description: The entries of a file. Those named in `ANGLES` are angles.
-        unit: The file's entry `ANGLE_UNIT`. Files of earlier versions have none,
-            and their angles are in radians.
+        description: Entries of the file. Entries with names in `ANGLES` are
+            angles.
+        unit: Value of the entry `ANGLE_UNIT` of the file. None for files of
+            earlier versions, whose angles are in radians.
 
     Returns:
-        A copy with the angles in degrees.
+        Copy of the entries, with angles in degrees.
 
     >>> angles_in_degrees({"polar": math.pi, "width": 2.0}, unit=None)
     {'polar': 180.0, 'width': 2.0}

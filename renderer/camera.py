@@ -208,7 +208,7 @@ class Camera(ABC):
         cos_azimuth = math.cos(azimuth)
         back_x = sin_polar * cos_azimuth
         back_y = sin_polar * sin_azimuth
-        # This equals the sine of the polar angle.
+        # This sum is the sine of the polar angle.
         up_z = back_x * cos_azimuth + back_y * sin_azimuth
         right = [-sin_azimuth, cos_azimuth, 0.0]
         up = [-cos_polar * cos_azimuth, -cos_polar * sin_azimuth, up_z]
@@ -360,14 +360,28 @@ class OrthographicCamera(Camera):
         return 2 * self.clip_range
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points to normalized device coordinates, see `Camera.project`."""
+        """Project points to normalized device coordinates, see `Camera.project`.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            x to the right, y up and depth, shape (V, 3).
+        """
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.clip_range])
         coordinates = (self.axes() * scale[:, None]) @ points.T
         coordinates += (np.array([self.right, self.up, 0.0]) * scale)[:, None]
         return coordinates.T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w = 1, and the coordinate toward the camera as nearness. See `Camera`."""
+        """Return w = 1, and the coordinate toward the camera as nearness.
+
+        Args:
+            back: Coordinate of points along the axis to the camera, shape (V,).
+
+        Returns:
+            w and nearness of `Camera.homogeneous`, shape (V,) each.
+        """
         return torch.ones_like(back), back
 
 
@@ -404,7 +418,14 @@ class PerspectiveCamera(Camera):
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points to normalized device coordinates, see `Camera.project`."""
+        """Project points to normalized device coordinates, see `Camera.project`.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            x to the right, y up and depth, shape (V, 3).
+        """
         depths = self.depths(points)
         right, up, back = self.axes() @ points.T
         scale = 2 / self.width * (self.distance / depths)
@@ -423,7 +444,15 @@ class PerspectiveCamera(Camera):
         return w, 1 / w
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Compute the depths of points, see `Camera.depths`."""
+        """Compute the depths of points, and check them, see `Camera.depths`.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            Distance from the camera along the viewing direction, in world
+            units, shape (V,).
+        """
         depths = self.distance - points @ self.axes()[2]
         if not (depths >= NEAREST * self.distance).all():
             raise InputError(
@@ -569,14 +598,14 @@ class PinholeCamera(PerspectiveCamera):
         return replace(moved, center_x=0.0, center_y=0.0, center_z=0.0)
 
     def axes(self) -> np.ndarray:
-        """Return the axes of the camera as rows, see `Camera.axes`."""
+        """Return the unit vectors right, up and back as rows, shape (3, 3)."""
         right, up, back = super().axes()
         cosine = math.cos(math.radians(self.roll))
         sine = math.sin(math.radians(self.roll))
         return np.array([cosine * right + sine * up, cosine * up - sine * right, back])
 
     def pose(self) -> np.ndarray:
-        """Return the matrix from camera to world coordinates, see `Camera.pose`."""
+        """Return the matrix from camera to world coordinates, shape (4, 4)."""
         pose = super().pose()
         pose[:3, 3] += [self.center_x, self.center_y, self.center_z]
         return pose
@@ -589,6 +618,12 @@ class PinholeCamera(PerspectiveCamera):
         """Project points to normalized device coordinates, see `Camera.project`.
 
         The near plane and the far plane enclose the points.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            x to the right, y up and depth, shape (V, 3).
         """
         depths = self.depths(points)
         right, up, _ = self.axes() @ self._from_center(points).T
@@ -601,7 +636,14 @@ class PinholeCamera(PerspectiveCamera):
         return np.stack([x, y, normalized_depth]).T
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points to homogeneous image coordinates, see `Camera.homogeneous`."""
+        """Project points to homogeneous image coordinates, see `Camera.homogeneous`.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            (x w, y w, w), shape (V, 3), and the nearness, shape (V,).
+        """
         positions, nearness = super().homogeneous(points)
         x, y, w = positions.T
         x = x + self.principal_right * w
@@ -626,7 +668,15 @@ class PinholeCamera(PerspectiveCamera):
         return torch.stack([cosine * right + sine * up, cosine * up - sine * right, back])
 
     def depths(self, points: np.ndarray) -> np.ndarray:
-        """Compute the depths of points, see `Camera.depths`."""
+        """Compute the depths of points, and check them, see `Camera.depths`.
+
+        Args:
+            points: Points in world coordinates, shape (V, 3).
+
+        Returns:
+            Distance from the camera along the viewing direction, in world
+            units, shape (V,).
+        """
         depths = self.distance - self._from_center(points) @ self.axes()[2]
         if not (depths >= MIN_DEPTH_RATIO * np.abs(depths).max()).all():
             position = self.pose()[:3, 3].round(3).tolist()

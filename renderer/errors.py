@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-# Largest magnitude in tensors that `require_bounded` accepts. The product of
-# three such float32 values does not overflow. An overflow would lead to infinity
-# minus infinity, which is NaN.
+# Largest magnitude of the values of tensors that `require_bounded` accepts. In float32, the
+# product of three such values does not overflow. An overflow would give infinity, and then
+# NaN.
 MAX_MAGNITUDE = 1e12
-# Largest factor for a light or an albedo in settings. Products then stay below
-# MAX_MAGNITUDE.
+# Largest factor for lights, albedo and lengths in settings. Products of such factors stay
+# below MAX_MAGNITUDE.
 MAX_SCALE = 1e5
-# Parts of error messages of torch, CUDA, cuDNN and cuBLAS if memory runs out.
+# Texts by which `is_out_of_memory` recognizes the errors of torch, CUDA, cuDNN and cuBLAS
+# when memory runs out.
 OUT_OF_MEMORY = (
     "out of memory",
     "can't allocate memory",
@@ -63,7 +64,7 @@ class InputError(ValueError):
         self.argument = argument
 
     def within(self, key: str, names: Collection[str]) -> InputError:
-        """Return an error that names the settings that contain the argument.
+        """Return a copy of the error whose message names the settings that contain the argument.
 
         Args:
             key: Key of the settings, such as "scene". Empty for settings at the
@@ -141,11 +142,11 @@ def as_device(device: torch.device | str) -> torch.device:
 
 
 def require_file(path: str | Path, advice: str) -> None:
-    """Check that a path is a regular file. Reading a pipe would block.
+    """Check that a path is a regular file, and no pipe, which would block when it is read.
 
     Args:
         path: Path of the file.
-        advice: What to do otherwise, for the error.
+        advice: Advice at the end of the error, such as "give a mesh file".
 
     Raises:
         InputError: If the path is not a regular file.
@@ -268,13 +269,13 @@ def is_number(value: object) -> bool:
 
 
 def is_flag(value: object) -> bool:
-    """Return whether a value is True or False, or the number 1 or 0.
+    """Tell whether a value is True, False, 1 or 0, as a value of Python or NumPy.
 
     Args:
         value: Any value.
 
     Returns:
-        True for these values of Python or NumPy, and False for all others.
+        True if it is one of the four. False for any other value, such as None.
     """
     if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():
         value = value.item()  # type: ignore[attr-defined]
@@ -308,22 +309,22 @@ def describe(value: Any) -> str:
 
 
 def _short(value: object) -> str:
-    """Return a short text of one line for a value, without quotes around strings."""
+    """Convert a value to a short text of one line, without quotes around strings."""
     return " ".join(value.split()) if isinstance(value, str) else _short_repr(value)
 
 
 def _short_repr(value: object) -> str:
-    """Return a short representation of a value in one line."""
+    """Convert a value to its `repr` in one line, shortened if it is long."""
     return " ".join(reprlib.repr(value).split())
 
 
 def _largest_magnitude(tensor: Tensor) -> float:
-    """Return the largest magnitude of a tensor, or NaN if it has one."""
+    """Compute the largest magnitude of the values of a tensor, or NaN if a value is NaN."""
     if not tensor.numel():
         return 0.0
     values = tensor.detach()
-    # aminmax copies a tensor that is not contiguous. The transpose of one whose
-    # columns are contiguous needs no copy.
+    # aminmax copies a tensor that is not contiguous. A matrix that is not contiguous usually
+    # has contiguous columns, so its transpose needs no copy.
     if values.ndim == 2 and not values.is_contiguous():
         values = values.T
     lowest, highest = values.aminmax()

@@ -1,7 +1,6 @@
-"""Conversion of radiance to image values: background, clamping and encoding.
+"""Conversion of linear radiance to image values: background, clamping and encoding.
 
-These steps come last, after all sums of radiance, because clamping is not
-linear.
+Clamping is not linear. These steps therefore come after all sums of radiance.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from renderer.validation import as_tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
 
-# Linear value and encoded value at which the sRGB curve changes from a line to a
-# power.
+# Linear value at which the sRGB curve changes from a straight line to a power function.
 SRGB_KNEE = 0.0031308
+# Encoded value at the same point of the curve.
 SRGB_ENCODED_KNEE = 0.04045
 
 
@@ -31,7 +30,7 @@ def tonemap(
     background: Float[Tensor, "*#batch channels #P"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 P"]:
-    """Convert the radiance of pixels to image values, as a classifier sees them.
+    """Convert the radiance of pixels to image values in front of a background.
 
     Args:
         radiance: Linear radiance of P pixels, already multiplied by the
@@ -136,10 +135,11 @@ def background_term(coverage: Tensor, background: Tensor, encoding: str = "linea
 
 
 def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
-    """Clamp values to [0, ceiling], with a gradient at the limits.
+    """Clamp values to [0, ceiling], with a gradient of 1 at the limits themselves.
 
-    The gradient passes through values at the limits themselves, so that a light
-    of zero on black can grow. `torch.clamp` differs between versions there.
+    With this gradient, an optimization can increase a light of 0 on a black
+    background. The gradient of `torch.clamp` at its limits differs between
+    versions of torch.
 
     Args:
         values: Values to clamp, shape (...).
@@ -153,7 +153,7 @@ def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
 
 
 class _Clamp(torch.autograd.Function):
-    """Clamping to [0, ceiling] whose gradient passes at the limits."""
+    """Clamping to [0, ceiling], with a gradient of 1 at the limits themselves."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, ceiling: Tensor | float) -> Tensor:
@@ -161,33 +161,33 @@ class _Clamp(torch.autograd.Function):
 
         Args:
             ctx: Context of autograd.
-            values: Values to clamp.
-            ceiling: Upper limit.
+            values: Values to clamp, any shape.
+            ceiling: Upper limit, a number or a tensor that broadcasts.
 
         Returns:
-            Clamped values.
+            Clamped values, same shape.
         """
         clamped = values.clamp(min=0).clamp_(max=ceiling)
-        # 1 for values that are unchanged, and 0 for the others. Booleans would
-        # make the comparison and the product several times slower.
-        passes = torch.eq(values, clamped, out=torch.empty_like(values))
-        ctx.save_for_backward(passes)
+        # 1.0 for values that clamping did not change, and 0.0 for other values. With
+        # booleans, the comparison and the product would be several times slower.
+        is_unclamped = torch.eq(values, clamped, out=torch.empty_like(values))
+        ctx.save_for_backward(is_unclamped)
         return clamped
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        """Pass the gradient through unchanged values.
+        """Compute the gradient by the values, which is 0 for values that were clamped.
 
         Args:
             ctx: Context of autograd.
-            upstream: Gradient by the clamped values.
+            upstream: Gradient by the clamped values, any shape.
 
         Returns:
-            Gradient by the values, and None for the ceiling.
+            Gradient by the values, same shape, and None for the ceiling.
         """
-        (passes,) = ctx.saved_tensors
-        return upstream * passes, None
+        (is_unclamped,) = ctx.saved_tensors
+        return upstream * is_unclamped, None
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:
@@ -207,17 +207,18 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
-    # The power would have an infinite derivative at 0, where `where` does not
-    # even select it. The lower limit keeps the derivative finite.
+    # The derivative of the power is infinite at 0. Although `torch.where` selects the
+    # line there, the gradient would be infinity times 0, which is NaN. The lower limit
+    # avoids this.
     curve = 1.055 * linear.clamp(min=SRGB_KNEE) ** (1 / 2.4) - 0.055
     return torch.where(linear <= SRGB_KNEE, 12.92 * linear, curve)
 
 
 def encode_gradient(linear: Tensor, upstream: Tensor, encoding: str) -> Tensor:
-    """Compute the gradient by linear values from the gradient by encoded values.
+    """Convert the gradient by encoded values to the gradient by linear values.
 
-    This needs no graph. The operations and their order are those of autograd
-    for `encode`, so the results are equal to the bit.
+    The result equals that of autograd for `encode` to the bit, because the
+    operations and their order are the same.
 
     Args:
         linear: Linear values in [0, 1], shape (...).
@@ -263,7 +264,7 @@ def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
     Returns:
         Whole numbers from 0 to 255, uint8, same shape.
     """
-    # Rounding in place saves a copy, which matters for many renders.
+    # Rounding in place saves the memory of a copy.
     return (image * 255).round_().to(torch.uint8)
 
 

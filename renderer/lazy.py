@@ -1,15 +1,15 @@
-"""Imports the public names of a package when they are first used (PEP 562).
+"""Import the public names of a package when they are first used (PEP 562).
 
-The names are listed only once, as imports in the stub `__init__.pyi` beside the package's
-`__init__.py`. Type checkers and editors read the same stub.
+The names are listed only once, as imports in the stub file `__init__.pyi` of the package. Type
+checkers and editors read the same stub file.
 """
 
 from __future__ import annotations
 
 import ast
 
-# Type checkers take this for true. To import typing would take longer than all
-# of this module.
+# Type checkers assume that a variable of this name is true. Importing it from `typing`
+# would take longer than the rest of this module.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 def attach(
     package: str, file: str
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """Make the public names of a package from its stub.
+    """Create the module functions that import public names of a package on first use.
 
     Args:
         package: `__name__` of the package.
-        file: `__file__` of the package. The stub lies beside it.
+        file: `__file__` of the package. The stub file is in the same folder.
 
     Returns:
-        `__getattr__`, `__dir__` and `__all__` of the package.
+        Values for `__getattr__`, `__dir__` and `__all__` of the package.
 
     Example:
         >>> import renderer
@@ -36,20 +36,28 @@ def attach(
     names = sorted(modules)
 
     def get_attribute(name: str) -> object:
+        """Import the module with a public name, and return the value of the name."""
         if name == "__version__":
             from importlib.metadata import version
 
             return version("parametric-norm-balls")
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        # The name may be a module, too, as in `from module import name`.
+        # With `fromlist`, __import__ also imports `name` if it is a module itself.
         return getattr(__import__(modules[name], fromlist=[name]), name)
 
     return get_attribute, lambda: names, names
 
 
 def _read_stub(path: str) -> dict[str, str]:
-    """Return the module that each name of a stub is imported from."""
+    """Find the modules from which a stub file imports its names.
+
+    Args:
+        path: Path of the stub file.
+
+    Returns:
+        Names of the modules by the imported names.
+    """
     with open(path, encoding="utf-8") as stub:
         tree = ast.parse(stub.read())
     return {

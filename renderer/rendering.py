@@ -44,14 +44,19 @@ from renderer.visibility.rasterizers import choose
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-LocalLight = (
-    LocalBasis | tuple[LocalBasis, Tensor]
-)  # lamps or a projector, and coefficients (size, 3)
-WHITE = 1 + 1e-4  # the largest albedo, and what rounding adds to it
+# Type of an entry of the argument `lights` of `render`: lamps or a projector, alone or
+# with their coefficients, shape (size, 3).
+LocalLight = LocalBasis | tuple[LocalBasis, Tensor]
+# Largest albedo that `render` accepts. It is 1, and a margin for rounding errors.
+WHITE = 1 + 1e-4
+# Description of the argument `lights` in errors.
 _LOCAL_LIGHTS = "a list of lamps and projectors, alone or in pairs (basis, coefficients)"
-_OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)  # the first of `orbit_cameras`
-_choose = cache(choose)  # "opengl" checks the driver, which takes longer than an image
-_white_ball = cache(lambda: Mesh.plain(*sphere(5)))
+# Default camera of `light_sphere`. It has the direction of the first camera of
+# `orbit_cameras`.
+_OBLIQUE = OrthographicCamera(60.0, 0.0, 2.0)
+# Function `choose` with a cache. Choosing "opengl" tests the driver, which takes longer
+# than rendering an image.
+_choose = cache(choose)
 
 
 def render(
@@ -187,11 +192,29 @@ def render(
     return images[0] if isinstance(cameras, Camera) else torch.stack(images)
 
 
+@cache
+def _white_ball() -> Mesh:
+    """Create a white ball of radius 1."""
+    return Mesh.plain(*sphere(5))
+
+
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
-    """Return a local light with its coefficients (size, 3): by default white, at full power."""
+    """Split an entry of the argument `lights` of `render` into basis and coefficients.
+
+    Args:
+        light: Lamps or a projector, alone or in a pair with coefficients.
+
+    Returns:
+        Basis, and its coefficients, shape (size, 3). They are white light at full
+        power if none were given.
+
+    Raises:
+        InputError: If the entry has another type, or the coefficients have a wrong
+            shape or NaN.
+    """
     pair = light if isinstance(light, tuple) else (light, None)
     if len(pair) != 2:
-        raise InputError(f"lights holds {describe(pair)}: give {_LOCAL_LIGHTS}")
+        raise InputError(f"lights has the entry {describe(pair)}: give {_LOCAL_LIGHTS}")
     basis, given = pair
     require_kind("lights: a basis", basis, LocalBasis, _LOCAL_LIGHTS)
     if given is None:
@@ -200,7 +223,9 @@ def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
     if values.shape != (basis.size, 3):
         shape = tuple(values.shape)
         expected = (basis.size, 3)
-        raise InputError(f"lights: {basis} has coefficients of shape {shape}, give {expected}")
+        raise InputError(
+            f"lights: the coefficients of {basis} have shape {shape}: give the shape {expected}"
+        )
     require_bounded(lights=values)
     return basis, values
 
@@ -338,31 +363,51 @@ def light_sphere(
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> list[Camera]:
-    """Return one camera or several as a list."""
+    """Convert one camera or a sequence of cameras to a list.
+
+    Args:
+        cameras: Camera, or sequence of cameras.
+
+    Returns:
+        List of one or more cameras.
+
+    Raises:
+        InputError: If the sequence is empty or has an entry of another type.
+    """
     advice = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
     listed = as_list(
         "cameras", [cameras] if isinstance(cameras, Camera) else cameras, Camera, advice
     )
     if not listed:
-        raise InputError("cameras is empty: give one camera or several")
+        raise InputError("cameras is empty: give at least one camera")
     return listed
 
 
 def _require_scale(albedo_scale: float) -> None:
-    """Check the factor of the albedo."""
+    """Raise `InputError` if `albedo_scale` is no number from 0 to `MAX_SCALE`."""
     require_number("albedo_scale", albedo_scale)
     require_range("albedo_scale", albedo_scale, 0, MAX_SCALE)
 
 
 def _require_gloss(gloss: Gloss | None) -> None:
-    """Check that gloss is a record of its three values, not one of these."""
+    """Raise `InputError` if `gloss` is neither a `Gloss` nor None."""
     require_kind(
         "gloss", gloss, Gloss | None, "nb.Gloss(roughness, metallic, specular_factor) or None"
     )
 
 
 def _as_light(light: object) -> Tensor:
-    """Convert the coefficients of environment light."""
+    """Convert the argument `light` to a tensor, and check its shape.
+
+    Args:
+        light: SH coefficients as a tensor, an array or a list.
+
+    Returns:
+        SH coefficients, shape ((degree + 1)², 3).
+
+    Raises:
+        InputError: If the argument is a string, or has a wrong shape.
+    """
     if isinstance(light, str):
         raise InputError(f"light is {light!r}: give coefficients, such as nb.load_light({light!r})")
     coefficients = as_tensor("light", light)
@@ -371,26 +416,52 @@ def _as_light(light: object) -> Tensor:
 
 
 def _as_albedo(albedo: object) -> Tensor:
-    """Convert linear albedo, of which nothing is negative or reflects more than it gets."""
+    """Convert the argument `albedo` to a tensor, and check that its values are in [0, 1].
+
+    Args:
+        albedo: Linear albedo as a tensor, an array or a list.
+
+    Returns:
+        Linear albedo.
+
+    Raises:
+        InputError: If a value is NaN or not in [0, 1].
+    """
     values = as_tensor("albedo", albedo)
     require_bounded(albedo=values)
     if values.numel() and not (values.min() >= 0 and values.max() <= WHITE):
         extremes = f"{values.min().item():g} to {values.max().item():g}"
         raise InputError(
-            f"albedo holds values from {extremes}: "
-            "give 0 to 1, and albedo_scale for brighter surfaces"
+            f"albedo has values from {extremes}: give values from 0 to 1, and set albedo_scale "
+            "for brighter surfaces"
         )
     return values
 
 
 def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
-    """Return the linear albedo (S, 3) at the samples of a view."""
+    """Compute the linear albedo at the S covered samples of a view.
+
+    Args:
+        mesh: Mesh that the view shows, with F faces.
+        view: Covered samples of the view.
+        albedo: Albedo to use instead of the colors of the mesh, shape (F, 3) for
+            one color per face, or (H, W, 3) for the only texture of the mesh.
+            None uses the colors of the mesh.
+        encoding: Encoding of the colors of the mesh, "linear" or "srgb".
+
+    Returns:
+        Linear albedo, shape (S, 3).
+
+    Raises:
+        InputError: If the albedo has a wrong shape.
+    """
     if albedo is None:
         return surface_albedo(mesh, view, encoding)
     if albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
     if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
         return surface_albedo(mesh, view, encoding, [albedo])
-    per_face = tuple(mesh.faces.shape)
-    advice = f"give {per_face}, a color per face, or (H, W, 3) for a mesh that has one texture"
-    raise InputError(f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: {advice}")
+    raise InputError(
+        f"albedo has shape {tuple(albedo.shape)}, which does not fit the mesh: give one color per "
+        f"face, {tuple(mesh.faces.shape)}, or a texture (H, W, 3) if the mesh has one texture"
+    )

@@ -206,7 +206,7 @@ class ShadedView:
             silhouettes may move.
         """
         fragments = self.fragments
-        sample_to_pixel = fragments.pixel
+        sample_to_pixel = fragments.sample_to_pixel
         # Shade each sample as a pixel of a finer image.
         finer_fragments = fragments.by_sample()
         direct = [*self._shade_environment(finer_fragments), *self._shade_lamps(finer_fragments)]

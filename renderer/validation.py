@@ -19,9 +19,11 @@ from torch import Tensor
 
 from renderer.errors import InputError, describe, is_flag, is_number
 
-# Letters of NumPy for floating-point numbers, and signed and unsigned integers.
+# Values of `dtype.kind` for arrays of real numbers: "f" is floating-point, "i" signed
+# integers, and "u" unsigned integers.
 _NUMBERS = "fiu"
-# Largest size of a floating-point number in torch, in bytes.
+# Number of bytes of the largest floating-point numbers in torch (float64). NumPy also has
+# larger ones, which `_as_numbers` converts.
 _LARGEST_FLOAT_BYTES = 8
 
 
@@ -71,7 +73,7 @@ def as_tensor(name: str, value: object) -> Tensor:
 
 
 def _is_list_of_tensors(value: object) -> TypeGuard[Sequence[Tensor]]:
-    """Return whether a value is a list or tuple of at least one tensor, and of tensors only."""
+    """Tell whether a value is a list or a tuple with one or more items, which are all tensors."""
     if not isinstance(value, list | tuple) or not value:
         return False
     return all(isinstance(item, Tensor) for item in value)
@@ -108,18 +110,24 @@ def as_integers(name: str, value: object) -> Tensor:
 def _as_numbers(value: object) -> np.ndarray | None:
     """Convert a value to an array of real numbers that torch can read.
 
-    Returns None if the value contains anything else, or rows of unequal lengths.
+    Args:
+        value: Any value, such as an array, a number or nested lists.
+
+    Returns:
+        Contiguous array, or None if the value contains anything but real numbers,
+        or lists of unequal lengths.
     """
+    # NumPy calls methods of the value, which can raise any exception.
     try:
         array = np.asarray(value)
-    except Exception:  # NumPy calls methods of the value, which can raise any error.
+    except Exception:
         return None
     if array.dtype.kind not in _NUMBERS:
         return None
     if array.dtype.kind == "f" and array.dtype.itemsize > _LARGEST_FLOAT_BYTES:
         array = array.astype(np.float64)
     native_dtype = array.dtype.newbyteorder("=")
-    # ascontiguousarray gives a number the shape (1,), which reshape restores.
+    # ascontiguousarray turns the shape () into (1,), so the shape is restored.
     return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
 
 
@@ -129,11 +137,10 @@ def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
     Args:
         name: Name of the argument, for the error.
         value: NumPy array, tensor, number, or nested lists of numbers.
-        kinds: Letters of NumPy for the allowed types, such as "iu" for
-            integers.
+        kinds: Allowed values of `dtype.kind`, such as "iu" for integers.
 
     Returns:
-        The value itself if it is an array, and otherwise a new array.
+        Array. A given array is returned as it is.
 
     Raises:
         InputError: If the value is anything else.
@@ -146,17 +153,17 @@ def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
 
 
 def as_path(name: str, value: object) -> Path:
-    """Convert a path, given as a string or as a `Path`.
+    """Convert an argument to a `Path`.
 
     Args:
         name: Name of the argument, for the error.
-        value: The path.
+        value: Path as a string or as a `Path`.
 
     Returns:
-        The path.
+        Path.
 
     Raises:
-        InputError: If the value is anything else.
+        InputError: If the value has another type.
     """
     if isinstance(value, str | os.PathLike) and isinstance(os.fspath(value), str):
         return Path(value)
@@ -164,27 +171,29 @@ def as_path(name: str, value: object) -> Path:
 
 
 def as_folder(name: str, value: object) -> Path:
-    """Convert the path of a folder that exists or can be created.
+    """Convert an argument to the path of a folder that exists or can be created.
 
     Args:
         name: Name of the argument, for the error.
-        value: The path, as a string or as a `Path`.
+        value: Path as a string or as a `Path`.
 
     Returns:
-        The path.
+        Path.
 
     Raises:
-        InputError: If the value is not a path, or if it or a folder above it is
-            a file.
+        InputError: If the value is no path, or if the path or a folder above it
+            is a file.
     """
     path = as_path(name, value)
     for existing in (path, *path.absolute().parents):
         if not os.path.lexists(existing):
             continue
-        # A broken link exists for lexists alone.
+        # A broken symbolic link is no file, so `exists` is False for it.
         if existing.exists() and not existing.is_dir():
             raise InputError(
-                f"{name}={path}: {existing} is a file, give the path of a folder", name
+                f"{name}={path} cannot be a folder, because {existing} is a file: give the path of "
+                "a folder",
+                name,
             )
         break
     return path
@@ -264,7 +273,9 @@ def require_number(name: str, value: object) -> None:
 
 
 def require_flag(name: str, value: object) -> None:
-    """Check that an argument is True or False. A string such as "no" would count as True.
+    """Check that an argument is True or False.
+
+    Without this check, a string such as "no" would count as True.
 
     Args:
         name: Name of the argument, for the error.

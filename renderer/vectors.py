@@ -1,4 +1,4 @@
-"""Vectors in space: unit vectors, axes at right angles to one, and rotations."""
+"""Vectors in space: unit vectors, tangents, and rotations."""
 
 from typing import Any
 
@@ -8,16 +8,18 @@ from torch.autograd.function import once_differentiable
 
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Divide vectors by their lengths, without overflow or underflow on the way.
+    """Divide vectors by their lengths, without overflow or underflow of squares.
 
-    The components are the first dimension, since a processor adds rows fastest.
+    The three components are along the first axis, because adding rows is faster
+    than adding columns.
 
     Args:
         vectors: Vectors, shape (3, ...).
 
     Returns:
-        Unit vectors (3, ...), in which a zero vector stays zero, and the lengths
-        (...) of the given vectors.
+        A tuple of
+        - the unit vectors, shape (3, ...). A zero vector stays zero;
+        - the lengths of the vectors, shape (...).
 
     Example:
         >>> directions, lengths = unit_vectors(torch.tensor([[3.0], [0.0], [4.0]]))
@@ -26,20 +28,22 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """
     largest = vectors.abs().amax(0)
     scaled = vectors / largest.masked_fill(largest == 0, 1)
-    # The norm is at least 1, unless the vector is zero.
+    # The largest component is now ±1. The norm is therefore at least 1, except for a zero
+    # vector.
     norm = scaled.square().sum(0).sqrt()
     return scaled / norm.clamp(min=1), norm * largest
 
 
 def unit(vectors: Tensor) -> Tensor:
-    """Divide vectors by their lengths, differentiable once.
+    """Divide vectors by their lengths. The result can be differentiated once.
 
     Args:
-        vectors: Vectors, shape (3, ...).
+        vectors: Vectors, with the three components along the first axis,
+            shape (3, ...).
 
     Returns:
-        Unit vectors (3, ...). A zero vector stays zero and has a gradient of
-        zero.
+        Unit vectors, shape (3, ...). A zero vector stays zero, and its gradient
+        is zero.
 
     Example:
         >>> unit(torch.tensor([[0.0], [2.0], [0.0]])).flatten().tolist()
@@ -49,10 +53,19 @@ def unit(vectors: Tensor) -> Tensor:
 
 
 class _Unit(torch.autograd.Function):
-    """`unit` with its analytic derivative, which is finite for a zero vector."""
+    """Unit vectors, with a derivative that is finite for a zero vector. See `unit`."""
 
     @staticmethod
     def forward(ctx: Any, vectors: Tensor) -> Tensor:
+        """Divide vectors by their lengths.
+
+        Args:
+            ctx: Context of autograd.
+            vectors: Vectors, shape (3, ...).
+
+        Returns:
+            Unit vectors, shape (3, ...).
+        """
         directions, lengths = unit_vectors(vectors)
         ctx.save_for_backward(directions, lengths)
         return directions
@@ -60,25 +73,37 @@ class _Unit(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> Tensor:
+        """Compute the gradient by the vectors.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the unit vectors, shape (3, ...).
+
+        Returns:
+            Gradient by the vectors, shape (3, ...).
+        """
         directions, lengths = ctx.saved_tensors
+        # Only the part at right angles to the vector changes the unit vector. Dividing by
+        # infinity gives a zero vector the gradient 0.
         tangential = upstream - directions * (directions * upstream).sum(0)
         return tangential / lengths.masked_fill(lengths == 0, torch.inf)
 
 
 def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
-    """Compute two unit vectors at right angles to unit vectors (x, y, z) and to each other.
+    """Compute two unit vectors that are orthogonal to a unit vector (x, y, z) and to each other.
 
-    Source: Duff et al. 2017, "Building an orthonormal basis, revisited".
+    The source is Duff et al. 2017, "Building an orthonormal basis, revisited".
 
     Args:
-        x: First components, numbers, arrays or tensors of one shape.
-        y: Second components.
-        z: Third components.
-        sign: 1 or -1 for each vector, such that z is not -sign. The axes jump
-            where the sign changes.
+        x: First component, a number, or an array or tensor of any shape for
+            several vectors.
+        y: Second component, same shape.
+        z: Third component, same shape.
+        sign: 1 or -1 for each vector. z must not be equal to -sign. The results
+            are continuous for vectors with the same sign.
 
     Returns:
-        The components [x, y, z] of the first axis and those of the second.
+        Components [x, y, z] of the first and of the second orthogonal vector.
 
     Example:
         >>> tangent_axes(0.0, 0.0, 1.0, 1)
@@ -92,15 +117,15 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
 
 
 def rotation_matrices(vectors: Tensor) -> Tensor:
-    """Return the matrices of rotations that are given by vectors.
+    """Convert rotation vectors to rotation matrices.
 
     Args:
-        vectors: Rotation vectors, shape (..., 3). The direction is the axis,
-            and the length is the angle in degrees.
+        vectors: Rotation vectors, shape (..., 3). The direction of a vector is
+            the axis of the rotation, and its length is the angle in degrees.
 
     Returns:
-        Rotation matrices, shape (..., 3, 3), differentiable with respect to the
-        vectors, per degree.
+        Rotation matrices, shape (..., 3, 3). They are differentiable with respect
+        to the vectors.
 
     Example:
         >>> quarter = torch.tensor([0, 0, 90.0])

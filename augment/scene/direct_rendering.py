@@ -130,7 +130,7 @@ class FrozenTransport:
 
 def _sum_by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
     """Sum the albedo (S, 3) of the samples in each pixel of the image, to shape (3, size²)."""
-    pixel_of_sample = fragments.pixels[fragments.pixel]
+    pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
     sums = albedo.new_zeros(3, fragments.size**2)
     return sums.index_add(1, pixel_of_sample, albedo.T)
 

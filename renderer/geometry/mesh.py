@@ -222,7 +222,7 @@ class Mesh:
 
     def face_areas(self) -> np.ndarray:
         """Compute the areas of the F faces in squared world units, shape (F,)."""
-        # The length of such a vector is twice the area of its face.
+        # The length of the vector of a face is twice the area of the face.
         doubled_vectors = doubled_area_vectors(self.vertices, self.faces)
         return np.linalg.norm(doubled_vectors, axis=1) / 2
 
@@ -612,7 +612,7 @@ def refine(mesh: Mesh, area: float) -> Mesh:
     if is_large.all():
         return refine(_quartered(mesh), area)
     small_faces = select_faces(mesh, ~is_large)
-    # This mesh keeps the old vertices, so the indices of the small faces stay valid.
+    # `divided` has all old vertices, so the vertex indices of the small faces stay valid.
     divided = refine(_quartered(select_faces(mesh, is_large)), area)
     rows_of_all_faces: dict[str, Any] = {}
     for name in PER_FACE:

@@ -27,20 +27,22 @@ from renderer.errors import require_choice, require_range
 from renderer.geometry.mesh import Mesh, concatenate
 from renderer.validation import require_whole
 
+# Colors of stalks and leaves, sRGB-encoded red, green and blue.
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
-# Range of hues of made-up fruit, in turns of the color circle. It leaves out the
-# hues of oranges. Hues above 1 begin again at 0.
+# Smallest and largest hue of the solid `fruit`, as fractions of the color circle. A hue of
+# 1.02 is the same as 0.02. The range does not contain the hues of oranges.
 LOWEST_HUE = 0.14
 HIGHEST_HUE = 1.02
-# Number of vertices around an axis of revolution.
+# Number of vertices that `revolve` places around the axis.
 SEGMENTS = 48
-# Longest edge along a profile in world units.
+# `revolve` divides edges of a profile that are longer than this, in world units.
 STEP = 0.1
-# Number of points of an arc, and of plane waves in a random field.
+# Number of points of an `arc`.
 ARC_POINTS = 13
+# Number of plane waves that `ripples` adds up.
 WAVES = 32
-# Subdivisions of the sphere from which round solids are made.
+# Default number of subdivisions of a `sphere`, from which round solids are made.
 SUBDIVISIONS = 4
 
 
@@ -199,14 +201,14 @@ def cup(rng: np.random.Generator) -> Mesh:
 
 
 def _handle(end_radii: np.ndarray) -> np.ndarray:
-    """Create the rings of a bent tube in the plane of x and z.
+    """Create the rings of the handle of a cup: a tube that is bent in the plane of x and z.
 
     Args:
-        end_radii: x of its lower and its upper end, shape (2,).
+        end_radii: x of the lower and of the upper end of the tube, shape (2,).
 
     Returns:
-        Rings, for `loft`, shape (19, 12, 3). The first and the last ring have
-        the radius 0, which closes the tube.
+        19 rings of 12 points for `loft`, shape (19, 12, 3). The first and the
+        last ring have the radius 0, which closes the tube.
     """
     x_axis = [1, 0, 0]
     y_axis = [0, 1, 0]
@@ -355,15 +357,25 @@ def fruit(rng: np.random.Generator) -> Mesh:
 
 
 def _random_shade(rng: np.random.Generator, hue: float) -> np.ndarray:
-    """Draw a color, RGB (3,), by its saturation and value. Its hue is clipped to that of fruit."""
+    """Draw a color with a given hue and with random saturation and value.
+
+    Args:
+        rng: Random numbers.
+        hue: Hue as a fraction of the color circle. It is clipped to LOWEST_HUE
+            and HIGHEST_HUE.
+
+    Returns:
+        RGB color, shape (3,).
+    """
     clipped_hue = np.clip(hue, LOWEST_HUE, HIGHEST_HUE) % 1
     saturation = rng.uniform(0.1, 0.95)
     value = rng.uniform(0.3, 0.95)
     return np.array(colorsys.hsv_to_rgb(clipped_hue, saturation, value))
 
 
-# Function that creates an instance with random numbers.
+# Type of a function that creates a random instance of a solid.
 Maker = Callable[[np.random.Generator], Mesh]
+# Solids whose names are classes of CIFAR-100.
 SOLIDS: dict[str, Maker] = {
     "orange": orange,
     "apple": apple,
@@ -376,7 +388,8 @@ SOLIDS: dict[str, Maker] = {
     "lamp": lamp,
     "table": table,
 }
-# experiment=best trains on `fruit` alone and is evaluated on the others.
+# Solids that resemble an orange. The training run experiment=best uses `fruit` in training,
+# and the other three in its evaluation.
 HARD_NEGATIVES: dict[str, Maker] = {
     "lemon": lemon,
     "peach": peach,
@@ -396,7 +409,7 @@ def sphere(subdivisions: int = SUBDIVISIONS) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         A tuple of vertices, shape (V, 3), and faces, shape (F, 3).
     """
-    # Importing trimesh takes half a second.
+    # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 
     unit_sphere = icosphere(subdivisions=subdivisions)
@@ -420,33 +433,39 @@ def revolve(
         - faces, shape (F, 3);
         - the index of the stroke of each face, shape (F,).
     """
+    # Points (radius, height) of the whole profile, shape (P, 2), with the P points of all
+    # strokes.
     corners = np.concatenate(strokes)
     stroke_of_corner = np.repeat(np.arange(len(strokes)), [len(stroke) for stroke in strokes])
     edges = np.diff(corners, axis=0)
-    # Edges longer than STEP are divided. A repeated corner has an edge of length
-    # 0, which gets no pieces.
+    # Edges that are longer than STEP are divided into pieces. If a corner is repeated, the
+    # edge between both has the length 0 and no pieces.
     piece_counts = np.ceil(np.linalg.norm(edges, axis=1) / STEP - 1e-9).astype(int)
     edge_of_piece = np.repeat(np.arange(len(edges)), piece_counts)
+    # Position of the start of each piece on its edge, in [0, 1).
     fraction = np.concatenate([np.arange(count) / count for count in piece_counts if count])
     starts = corners[edge_of_piece] + fraction[:, None] * edges[edge_of_piece]
     profile = np.concatenate([starts, corners[-1:]])
     azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
+    # One ring of points for each point of the profile. Adding 0 · azimuth repeats the
+    # height for all points of a ring.
     radius = profile[:, :1]
     height = profile[:, 1:] + 0 * azimuth
     rings = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
     vertices, faces, piece_of_face = loft(rings)
-    # An edge has the color of the stroke at its end.
+    # An edge belongs to the stroke of its last corner.
     stroke_of_piece = stroke_of_corner[edge_of_piece + 1]
     return vertices, faces, stroke_of_piece[piece_of_face]
 
 
 def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Create the closed surface through a sequence of rings.
+    """Create a closed surface that connects each ring of points to the next ring.
 
     Args:
-        rings: Points of n rings with s points each, counter-clockwise about the
-            direction from the first ring to the last, shape (n, s, 3). All
-            points of the first ring are equal, and those of the last ring, too.
+        rings: n rings of s points each, shape (n, s, 3). The points are
+            counter-clockwise about the direction from the first ring to the last.
+            All points of the first ring are the same point, and all points of the
+            last ring are, too, so that the surface is closed.
 
     Returns:
         A tuple of
@@ -459,8 +478,8 @@ def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first_point = rings[0, :1]
     last_point = rings[-1, :1]
     vertices = np.concatenate([first_point, rings[1:-1].reshape(-1, 3), last_point])
-    # Vertex of each point of a ring. Clipping gives all points of the first ring
-    # the first vertex, and all points of the last ring the last vertex.
+    # Index of the vertex of each point, shape (n, s). The clipping gives all points of the
+    # first ring the vertex 0, and all points of the last ring the last vertex.
     consecutive = np.arange(1 - point_count, (ring_count - 1) * point_count + 1)
     last_vertex = (ring_count - 2) * point_count + 1
     vertex = np.clip(consecutive.reshape(ring_count, point_count), 0, last_vertex)
@@ -471,40 +490,42 @@ def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     c = np.roll(d, -1, axis=1)
     faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
     ring_of_face = np.repeat(np.arange(ring_count - 1), 2 * point_count)
-    # Triangles at both ends have two equal corners if they have no area.
+    # At both ends, half of the triangles have two equal corners and no area.
     has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2])
     return vertices, faces[has_area], ring_of_face[has_area]
 
 
 def surface_of_cells(is_filled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Create the surface between the filled and the empty cells of a grid.
+    """Create the surface of a solid that consists of cubic cells of a grid.
 
     Args:
-        is_filled: True for filled cells, shape (X, Y, Z).
+        is_filled: True for the cells of the solid, shape (X, Y, Z).
 
     Returns:
         A tuple of vertices in units of cells, shape (V, 3), and faces,
         shape (F, 3).
     """
     padded = np.pad(is_filled, 1)
-    unit = np.eye(3, dtype=int)
-    quads = []
+    unit_vectors = np.eye(3, dtype=int)
+    squares = []
     for axis in range(3):
-        u = unit[(axis + 1) % 3]
-        v = unit[(axis + 2) % 3]
-        # Corners of a side, counter-clockwise seen from +axis.
+        u = unit_vectors[(axis + 1) % 3]
+        v = unit_vectors[(axis + 2) % 3]
+        # Corners of a side of a cell, counter-clockwise seen from the positive axis.
         square = np.array([0 * u, u, u + v, v])
-        lower_neighbor = np.roll(padded, 1, axis)[1:-1, 1:-1, 1:-1]
-        upper_neighbor = np.roll(padded, -1, axis)[1:-1, 1:-1, 1:-1]
-        lower = np.argwhere(is_filled & ~lower_neighbor)
-        upper = np.argwhere(is_filled & ~upper_neighbor)
-        # Both sides are counter-clockwise seen from outside.
-        quads.append(lower[:, None] + square[::-1])
-        quads.append(upper[:, None] + unit[axis] + square)
-    corners = np.concatenate(quads).reshape(-1, 3)
+        is_lower_neighbor_filled = np.roll(padded, 1, axis)[1:-1, 1:-1, 1:-1]
+        is_upper_neighbor_filled = np.roll(padded, -1, axis)[1:-1, 1:-1, 1:-1]
+        # Cells with a side on the surface, toward the negative and the positive axis.
+        lower_cells = np.argwhere(is_filled & ~is_lower_neighbor_filled)
+        upper_cells = np.argwhere(is_filled & ~is_upper_neighbor_filled)
+        # The reversed order is counter-clockwise seen from the negative axis.
+        squares.append(lower_cells[:, None] + square[::-1])
+        squares.append(upper_cells[:, None] + unit_vectors[axis] + square)
+    corners = np.concatenate(squares).reshape(-1, 3)
     vertices, corner_to_vertex = np.unique(corners, axis=0, return_inverse=True)
-    quads_of_vertices = corner_to_vertex.reshape(-1, 4)
-    triangles = quads_of_vertices[:, [[0, 1, 2], [0, 2, 3]]]
+    # Each square becomes two triangles.
+    square_vertices = corner_to_vertex.reshape(-1, 4)
+    triangles = square_vertices[:, [[0, 1, 2], [0, 2, 3]]]
     return vertices, triangles.reshape(-1, 3)
 
 
@@ -512,29 +533,29 @@ def paint(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, *paints: Ar
     """Create a mesh whose parts have different colors.
 
     Args:
-        vertices: Vertices, shape (V, 3).
-        faces: Faces, shape (F, 3).
-        part: Index in `paints` of each face, shape (F,).
-        *paints: Color of each part: RGB, shape (3,), or one per vertex,
-            shape (V, 3).
+        vertices: Vertex positions, shape (V, 3).
+        faces: Vertex indices of the faces, shape (F, 3).
+        part: Index of the part to which each face belongs, shape (F,).
+        *paints: Color of each part: one RGB color, shape (3,), or one per
+            vertex, shape (V, 3).
 
     Returns:
-        Mesh with corner colors.
+        Mesh with these colors.
     """
-    # Shape (parts, V, 3).
+    # Color of each vertex in each part, shape (parts, V, 3).
     colors = np.stack([np.broadcast_to(color, vertices.shape) for color in paints])
     corner_colors = colors.astype(np.float32)[part[:, None], faces]
     return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
 
 
 def arc(center: ArrayLike, radii: ArrayLike, start: float, stop: float) -> np.ndarray:
-    """Create points of a profile on an ellipse.
+    """Create points of a profile, see `revolve`, on an arc of an ellipse.
 
     Args:
-        center: Radius and height of the center.
-        radii: Semi-axes along radius and height.
-        start: Angle of the first point above the horizontal, in degrees.
-        stop: Angle of the last point above the horizontal, in degrees.
+        center: Center of the ellipse as (radius, height).
+        radii: Semi-axes of the ellipse along the radius and the height.
+        start: Angle of the first point in degrees: 0 is outward, and 90 is up.
+        stop: Angle of the last point in degrees.
 
     Returns:
         Points (radius, height), shape (ARC_POINTS, 2).

@@ -1,4 +1,4 @@
-"""Arrays of numbers as .npy files."""
+"""Read and write arrays of numbers as .npy files."""
 
 import io
 from pathlib import Path
@@ -9,7 +9,7 @@ from renderer.io.files import atomic_write
 
 
 def write_numbers(path: Path, numbers: np.ndarray) -> None:
-    """Write an array as an .npy file, as a whole.
+    """Write an array to an .npy file, see `atomic_write`.
 
     Args:
         path: File to replace or to create.
@@ -26,8 +26,8 @@ def write_numbers(path: Path, numbers: np.ndarray) -> None:
 def read_numbers(path: Path) -> np.ndarray:
     """Read real numbers from an .npy file.
 
-    The file is mapped into memory first. A damaged header can therefore not
-    request more memory than the file has.
+    The file is mapped into memory. If the header is damaged and claims a huge
+    array, this raises an error instead of allocating the memory.
 
     Args:
         path: .npy file.
@@ -41,6 +41,9 @@ def read_numbers(path: Path) -> np.ndarray:
     """
     array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
     if array.dtype.kind not in "fiu" or not array.size:
-        raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
+        raise ValueError(
+            f"the array has the type {array.dtype} and the shape {array.shape}, but real numbers "
+            "are needed"
+        )
     with np.errstate(over="ignore"):
         return array.astype(np.float32)

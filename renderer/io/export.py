@@ -1,4 +1,4 @@
-"""Meshes as .glb files with colors, textures, normals and cameras."""
+"""Write meshes to .glb files with colors, textures, normals and cameras."""
 
 import math
 from collections.abc import Sequence
@@ -24,14 +24,15 @@ if TYPE_CHECKING:
     import trimesh  # It takes half a second, so functions import it where they use it.
     from trimesh.visual.material import PBRMaterial
 
-# Names of vertex colors and normals while trimesh writes them. trimesh writes
-# every attribute whose name begins with an underscore without conversion.
+# Names of the vertex attributes for colors and normals while trimesh writes a file.
+# trimesh writes attributes whose names begin with an underscore without conversion.
+# `_as_one_mesh` then gives the attributes their names in glTF.
 _COLOR = "_COLOR_0"
 _NORMAL = "_NORMAL"
-# Name of the specular factor in glTF. It is passed in the name of a material,
-# because trimesh does not write it elsewhere.
+# Name of the specular factor in glTF. trimesh does not write it. `_material` therefore puts
+# it into the name of a material, and `_as_one_mesh` moves it to the right place.
 SPECULAR = "specularFactor"
-# Roughness and metallic of a mesh without gloss.
+# Roughness and metallic of the material of a mesh without gloss.
 MATTE = (1.0, 0.0)
 
 
@@ -88,13 +89,24 @@ def export_mesh(
 
 
 def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
-    """Return the content of a .glb file. The normals are those of corners, shape (F, 3, 3)."""
+    """Create the content of a .glb file.
+
+    Args:
+        mesh: Mesh with F faces.
+        normals: Unit normals of the three corners of each face,
+            shape (F, 3, 3).
+        cameras: Cameras to write.
+        first: Number of faces that are written before all other faces, or None.
+
+    Returns:
+        Content of the file.
+    """
     import trimesh
 
     first_count = len(mesh.faces) if first is None else first
     is_later = np.arange(len(mesh.faces)) >= first_count
-    # One row for each face. Faces with equal rows are one part. float64 holds
-    # indices and gloss exactly.
+    # One row for each face, with a flag, the texture and the gloss. Faces with equal rows
+    # become one part. float64 stores indices and gloss exactly.
     keys = np.stack([is_later, mesh.texture_ids], axis=1)
     if mesh.gloss is not None:
         keys = np.concatenate([keys, mesh.gloss], axis=1)
@@ -112,11 +124,11 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
 
 @dataclass(frozen=True)
 class _PartSurface:
-    """Texture and gloss of a part.
+    """Texture and gloss that all faces of a part of a file have in common.
 
     Attributes:
-        texture_id: Index of the texture, or -1.
-        gloss: Roughness, metallic and specular factor. Empty if the mesh has no gloss.
+        texture_id: Index in `Mesh.textures`, or -1 for no texture.
+        gloss: Roughness, metallic and specular factor. Empty for a matte mesh.
     """
 
     texture_id: int
@@ -126,27 +138,28 @@ class _PartSurface:
 def _write_part(
     mesh: Mesh, normals: np.ndarray, surface: _PartSurface, is_in_part: np.ndarray
 ) -> "trimesh.Trimesh":
-    """Convert the faces of a part to a mesh of trimesh, with y up.
+    """Convert some faces of a mesh to a mesh of trimesh, with y up.
 
     Args:
         mesh: Mesh with F faces.
-        normals: Normals of all corners, shape (F, 3, 3).
-        surface: Texture and gloss of the part.
-        is_in_part: True for faces of the part, shape (F,).
+        normals: Unit normals of the three corners of each face,
+            shape (F, 3, 3).
+        surface: Texture and gloss of the faces.
+        is_in_part: True for the faces to convert, shape (F,).
 
     Returns:
-        Mesh of the part.
+        Mesh of trimesh.
     """
     import trimesh
     from trimesh.visual.texture import TextureVisuals
 
     colors = mesh.corner_colors[is_in_part]
     uvs = mesh.corner_uvs[is_in_part]
-    # Eight values for each corner.
-    corners = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
-    vertex_ids, values, faces = _split(mesh.faces[is_in_part], corners)
+    # Eight values for each corner: color (3), texture coordinates (2) and normal (3).
+    corner_values = np.concatenate([colors, uvs, normals[is_in_part]], axis=-1)
+    vertex_ids, values, faces = _split_vertices(mesh.faces[is_in_part], corner_values)
     linear_colors = decode(torch.from_numpy(values[:, :3]), "srgb")
-    # Multiplying rows by a rotation matrix applies the inverse rotation.
+    # Row vectors times the matrix from y up to z up are rotated from z up to y up.
     to_y_up = Y_UP_TO_Z_UP[:3, :3]
     return trimesh.Trimesh(
         mesh.vertices[vertex_ids] @ to_y_up,
@@ -161,7 +174,15 @@ def _write_part(
 
 
 def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
-    """Return the material of a part."""
+    """Create the glTF material of a part.
+
+    Args:
+        mesh: Mesh with the textures.
+        surface: Texture and gloss of the part.
+
+    Returns:
+        Material of trimesh.
+    """
     from trimesh.visual.material import PBRMaterial
 
     texture = None
@@ -170,7 +191,7 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
         texture = Image.fromarray(mesh.textures[surface.texture_id])
         if mesh.gloss_textures:
             factors = mesh.gloss_textures[surface.texture_id]
-            # glTF stores roughness in green and metallic in blue. Red is unused.
+            # glTF stores roughness in green and metallic in blue. Red is set to 0.
             gloss_texture = Image.fromarray(np.insert(factors, 0, 0, axis=2))
     # trimesh would merge two images with the same bytes and different sizes if
     # their materials had the same name.
@@ -190,10 +211,15 @@ def _material(mesh: Mesh, surface: _PartSurface) -> "PBRMaterial":
 
 
 def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
-    """Join the parts of a glTF tree in one mesh and add the cameras, in place.
+    """Change the JSON object of a .glb file, in place, before trimesh writes it.
 
-    The colors and normals get their names in glTF. trimesh itself would write
-    colors with 8 bits, which is too coarse for dark linear colors.
+    All parts become one glTF mesh. Colors, normals and specular factors get their
+    names in glTF, and the cameras are added. trimesh itself would write colors
+    with 8 bits, which is too coarse for dark linear colors.
+
+    Args:
+        tree: JSON object of the file.
+        cameras: Cameras to add.
     """
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
@@ -210,8 +236,8 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
     for index, camera in enumerate(cameras):
-        # Cameras of glTF look along their -z, as ours do, and matrices are
-        # stored by columns (glTF 2.0, section 3.10).
+        # Cameras of glTF look along -z, as ours do. Matrices are stored column by column
+        # (glTF 2.0, section 3.10).
         pose = Y_UP_TO_Z_UP.T @ camera.pose()
         matrix = pose.T.ravel().tolist()
         tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": matrix})
@@ -219,11 +245,19 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
-    """Return the glTF description of a camera."""
+    """Convert a camera to the description of a camera in glTF.
+
+    Args:
+        camera: Camera to convert.
+
+    Returns:
+        Entry of "cameras" in the JSON object of the file.
+    """
     planes = {"znear": camera.near, "zfar": camera.far}
     if isinstance(camera, PerspectiveCamera):
-        # The axis of a glTF camera meets the center of its image. For another
-        # principal point, the image is enlarged until it holds the given image.
+        # The principal point of a glTF camera is the image center. For a camera with
+        # another principal point, the image is enlarged until it contains the image of the
+        # camera.
         half_width = math.tan(math.radians(camera.angle) / 2)
         half_height = half_width / camera.pixel_aspect * (1 + abs(camera.principal_up))
         half_width *= 1 + abs(camera.principal_right)
@@ -236,21 +270,30 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
     return {"type": "orthographic", "orthographic": orthographic}
 
 
-def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split_vertices(
+    faces: np.ndarray, corner_values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Repeat each vertex for each combination of values that its corners have.
+
+    In a file, each vertex has one color, one pair of texture coordinates and one
+    normal.
 
     Args:
         faces: Vertex indices of F faces, shape (F, 3).
-        corners: D values of each corner, shape (F, 3, D).
+        corner_values: D values of the three corners of each face,
+            shape (F, 3, D).
 
     Returns:
         A tuple of
-        - the original vertex of each of N new vertices, shape (N,);
+        - the index of the original vertex of each of N new vertices,
+          shape (N,);
         - the values of the new vertices, shape (N, D);
         - the faces with indices of new vertices, shape (F, 3).
     """
-    # float64 holds vertex indices and values exactly.
-    rows = np.concatenate([faces[..., None], corners], axis=-1)
+    # Corners with equal rows become one new vertex. A row has the old vertex and the
+    # values. float64 stores both exactly.
+    rows = np.concatenate([faces[..., None], corner_values], axis=-1)
     flat_rows = rows.reshape(-1, rows.shape[-1])
-    distinct, index = np.unique(flat_rows, axis=0, return_inverse=True)
-    return distinct[:, 0].astype(np.int64), distinct[:, 1:], index.reshape(-1, 3)
+    distinct_rows, corner_to_vertex = np.unique(flat_rows, axis=0, return_inverse=True)
+    original_vertices = distinct_rows[:, 0].astype(np.int64)
+    return original_vertices, distinct_rows[:, 1:], corner_to_vertex.reshape(-1, 3)

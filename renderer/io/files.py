@@ -1,7 +1,7 @@
-"""Files that are replaced as a whole.
+"""Write files so that a reader never sees a part of the new content.
 
-A reader finds the old content or the new content, and never a part of it. The
-same holds after a crash.
+A reader finds either the old content or the new content, also after a crash. The
+new content is written to a temporary file, which then replaces the old file.
 """
 
 import errno
@@ -12,8 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-# Pattern of the names of unfinished files. They lie in the folder of the file
-# that they will replace.
+# Pattern for the names of temporary files. A temporary file is in the folder of the file
+# that it replaces.
 TEMPORARY = ".pnb-*.tmp"
 
 
@@ -21,17 +21,17 @@ TEMPORARY = ".pnb-*.tmp"
 def replacing(
     path: str | Path, durable: bool = False, previous: Path | None = None
 ) -> Iterator[Path]:
-    """Give a temporary path to write to, and move the file to `path` at the end of the block.
+    """Replace a file by a temporary file that is written in a `with` block.
 
-    If the block raises an error, the temporary file is removed, and the old
-    file stays as it was.
+    At the end of the block, the temporary file is moved to `path`. If the block
+    raises an error, the temporary file is removed and the old file stays.
 
     Args:
-        path: File to replace or to create. Its folder exists. A symbolic link
-            stays, and the file that it points to is replaced.
-        durable: Whether to wait until the disk holds the file, so that it
+        path: File to replace or to create. Its folder must exist. If `path` is a
+            symbolic link, the file that it points to is replaced.
+        durable: True waits until the file is stored on the disk, so that it
             survives a loss of power. This takes about 20 ms.
-        previous: Path to which the old file is moved. None deletes it.
+        previous: Path to which the old file is moved. None deletes the old file.
 
     Yields:
         Temporary path in the folder of the file.
@@ -52,11 +52,13 @@ def replacing(
         if previous and target.exists():
             os.replace(target, previous)
         os.replace(temporary, target)
-        # The new name is an entry of the folder. Only POSIX can flush folders.
+        # The name of the file is stored in the folder, so the folder must be flushed, too.
+        # Only POSIX systems can flush folders.
         if durable and os.name == "posix":
             _flush(target.parent)
     except OSError as error:
-        # Libraries raise errors without a number. Their texts are kept.
+        # Errors of libraries have no number and are raised as they are. Other errors name
+        # the temporary file, so `path` is inserted instead.
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -71,15 +73,14 @@ def atomic_write(
     durable: bool = False,
     previous: Path | None = None,
 ) -> None:
-    """Write a file as a whole, see `replacing`.
+    """Write a file so that a reader never sees a part of the content, see `replacing`.
 
     Args:
         path: File to replace or to create.
-        content: New content. Text is encoded as UTF-8. Characters that UTF-8
-            lacks, which file names in other encodings can have, are written as
-            escapes.
-        durable: Whether to wait until the disk holds the file.
-        previous: Path to which the old file is moved. None deletes it.
+        content: New content. Text is encoded as UTF-8. Characters that cannot be
+            encoded, which names of files may contain, are written as escapes.
+        durable: True waits until the file is stored on the disk.
+        previous: Path to which the old file is moved. None deletes the old file.
 
     Raises:
         OSError: If the file cannot be written.
@@ -100,20 +101,20 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def _require_replaceable(target: Path) -> None:
-    """Raise OSError for a folder, a device, or a file that is read-only."""
+    """Raise OSError if a path exists and is a folder, a device or a read-only file."""
     if not target.exists():
         return
     if not target.is_file():
         number = errno.EISDIR if target.is_dir() else errno.EINVAL
         raise OSError(number, os.strerror(number))
-    # The disk would replace even a read-only file. Opening it for writing raises
-    # the error.
+    # `os.replace` would also replace a read-only file. Opening the file for appending
+    # raises the error.
     with target.open("ab"):
         pass
 
 
 def _flush(path: Path) -> None:
-    """Wait until the disk holds a file, or the entries of a folder."""
+    """Wait until a file, or the list of files in a folder, is stored on the disk."""
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""Image files as a classifier sees them."""
+"""Read image files as square images for a classifier, and write image files."""
 
 import io
 import math
@@ -13,9 +13,10 @@ from torch import Tensor
 from renderer.errors import InputError, require_file
 from renderer.io.files import atomic_write
 
-# Suffixes of image files that can be read.
+# Suffixes of files that count as images in a folder.
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-# JPEG files are decoded with at least this multiple of the final size.
+# `read_square` decodes large JPEG files at a reduced size, which is at least this many
+# times the size of the result.
 DECODED_SIZES = 16
 
 
@@ -33,10 +34,13 @@ def read_image(path: str | Path, size: int) -> Tensor:
         InputError: If the file does not exist or cannot be read.
     """
     require_file(path, "give an image file")
+    # Pillow raises many classes of exceptions for damaged files.
     try:
         square = read_square(path, size)
-    except Exception as error:  # Pillow raises many classes for damaged files.
-        raise InputError(f"{path} cannot be read ({error}): give an image file") from error
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as an image ({error}): give an image file"
+        ) from error
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
@@ -44,24 +48,27 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
     """Create a gray image, or read the central square of an image file.
 
     Args:
-        name: Name of the argument that holds the choice, for errors.
-        choice: Gray value in [0, 1], also as text, or path of an image file.
+        name: Name of the argument, for errors.
+        choice: Gray value in [0, 1] as a number or as text, or path of an image
+            file.
         size: Width and height of the result in pixels.
 
     Returns:
-        Values in [0, 1], shape (1, size, size) for gray, and (3, size, size)
-        for a file.
+        Values in [0, 1], shape (1, size, size) for a gray value, and
+        (3, size, size) for a file.
 
     Raises:
-        InputError: If the choice is neither, or the file cannot be read.
+        InputError: If `choice` is neither a gray value nor an image file, or if
+            the file cannot be read.
 
     Example:
         >>> gray_or_image("background", 0.5, 2).tolist()
         [[[0.5, 0.5], [0.5, 0.5]]]
     """
     expected = "give gray values in [0, 1] or image files"
+    # `float` would accept True as 1.
     if isinstance(choice, bool):
-        raise InputError(f"{name}={choice}: {expected}")
+        raise InputError(f"{name}={choice} is no image: {expected}")
     try:
         gray = float(choice)  # type: ignore[arg-type]
     except (ValueError, TypeError, OverflowError):
@@ -73,12 +80,12 @@ def gray_or_image(name: str, choice: float | str | Path, size: int) -> Tensor:
         except InputError as error:
             raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
-        raise InputError(f"{name}={reprlib.repr(choice)}: {expected}")
+        raise InputError(f"{name}={reprlib.repr(choice)} is no image: {expected}")
     return torch.full((1, size, size), gray)
 
 
 def read_square(path: str | Path, size: int) -> np.ndarray:
-    """Read the central square of an image file as bytes.
+    """Read the central square of an image file with 8 bits per channel.
 
     Args:
         path: Image file.
@@ -95,13 +102,13 @@ def read_square(path: str | Path, size: int) -> np.ndarray:
 
 
 def read_rgb(path: str | Path, least: int) -> Image.Image:
-    """Read an image file upright, with transparent parts in front of white.
+    """Read an image file as an upright RGB image on a white background.
 
     Args:
-        path: Image file.
+        path: Image file. It may be rotated (EXIF) and have transparent parts.
         least: Smallest width and height in pixels that are needed. A large JPEG
-            file is decoded at 1/2, 1/4 or 1/8 of its size if the result is not
-            smaller than this, which is several times faster.
+            file is decoded at 1/2, 1/4 or 1/8 of its size, if this is at least
+            `least`. This is several times faster.
 
     Returns:
         RGB image with 8 bits per channel.
@@ -146,9 +153,10 @@ def eight_bits(image: Image.Image) -> Image.Image:
         Exception: If the file is damaged. The class depends on the format.
     """
     if image.mode == "F":
-        raise ValueError("its pixels are floating-point numbers, whose white is unknown")
+        raise ValueError("the pixels are floating-point numbers, so the value of white is unknown")
     if image.mode.startswith("I"):
-        # Such an image has 16 bits per pixel. Pillow would clip them to 8 bits.
+        # The mode "I" means 16 bits per pixel. Pillow would clip the values to 8 bits
+        # instead of scaling them.
         scaled = np.clip(np.asarray(image) // 256, 0, 255)
         return Image.fromarray(scaled.astype(np.uint8))
     image.load()
@@ -156,7 +164,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def write_image(path: Path, image: Image.Image, **options: object) -> None:
-    """Write an image file as a whole, in the format of its suffix.
+    """Write an image file in the format of its suffix, see `atomic_write`.
 
     Args:
         path: File to replace or to create.

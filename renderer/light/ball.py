@@ -19,10 +19,10 @@ _ROUNDING_UNITS = 8
 
 @dataclass(frozen=True)
 class Ball:
-    """Norm-balls with one radius around A centers, one for each row of a batch.
+    """Norm-balls with one radius around N centers, one for each row of a batch.
 
     Attributes:
-        center: Center of each ball, shape (A, ...).
+        center: Center of each ball, shape (N, ...).
         radius: Radius of all balls.
         norm: "linf" for the maximum norm, or "l2" for the Euclidean norm over
             all values of a row.
@@ -33,7 +33,7 @@ class Ball:
     norm: str
 
     def unflatten(self, *shape: int) -> Ball:
-        """Return the same balls for rows that are reshaped from (A, D) to (A, *shape).
+        """Return the same balls for rows that are reshaped from (N, D) to (N, *shape).
 
         Args:
             *shape: New shape of a row. The product of the sizes is D.
@@ -42,7 +42,7 @@ class Ball:
 
     @property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """Lowest and highest values in the balls of the norm "linf", shape (A, ...) each."""
+        """Lowest and highest values in the balls of the norm "linf", shape (N, ...) each."""
         return self.center - self.radius, self.center + self.radius
 
 
@@ -52,13 +52,13 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
     The projection is the nearest point with respect to the Euclidean distance.
 
     Args:
-        values: A rows of values, shape (A, ...).
+        values: N rows of values, shape (N, ...).
         low: Lowest values of the box, a number or a tensor that broadcasts.
         high: Highest values of the box, a number or a tensor that broadcasts.
         within: Norm-balls whose centers lie in the box. None uses the box alone.
 
     Returns:
-        Projections, shape (A, ...).
+        Projections, shape (N, ...).
 
     Example:
         >>> ball = Ball(torch.zeros(1, 2), radius=1.0, norm="l2")
@@ -82,19 +82,19 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
     therefore reaches the squared radius without passing it.
 
     Args:
-        values: A rows v of values, shape (A, ...).
+        values: N rows v of values, shape (N, ...).
         low: Lowest values of the box, a number or a tensor that broadcasts.
         high: Highest values of the box, a number or a tensor that broadcasts.
         ball: L2 balls whose centers lie in the box.
 
     Returns:
-        Projections, shape (A, ...).
+        Projections, shape (N, ...).
     """
     offset = values - ball.center
     squared_radius = ball.radius**2
     rounding = _ROUNDING_UNITS * torch.finfo(values.dtype).eps * squared_radius
     # For each row, the current s, the squared distance, and its derivative by s. The
-    # shapes are (A, 1, ...), or () before the first step.
+    # shapes are (N, 1, ...), or () before the first step.
     s = offset.new_zeros(())
     squared_distance = offset.new_zeros(())
     slope = _squared_norm(offset)
@@ -118,9 +118,9 @@ def _squared_norm(offsets: Tensor) -> Tensor:
     """Compute the squared L2 norm of each row.
 
     Args:
-        offsets: A rows of values, shape (A, ...).
+        offsets: N rows of values, shape (N, ...).
 
     Returns:
-        Squared norms, shape (A, 1, ...), which broadcasts to `offsets`.
+        Squared norms, shape (N, 1, ...), which broadcasts to `offsets`.
     """
     return offsets.square().sum(tuple(range(1, offsets.dim())), keepdim=True)

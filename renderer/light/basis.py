@@ -411,6 +411,12 @@ class SumBasis(Basis):
         return torch.cat(projected, dim=-2)
 
     def moved(self, positions: Tensor) -> Self:
+        """Return a copy in which the movable lights of all parts are at other positions.
+
+        Args:
+            positions: Positions of the L movable lights in world axes,
+                shape (L, 3).
+        """
         return replace(self, parts=tuple(part.moved(positions) for part in self.parts))
 
     def _rows_of_parts(self) -> Iterator[tuple[slice, Harmonics | LocalBasis]]:

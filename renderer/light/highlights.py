@@ -1,8 +1,13 @@
-"""Highlights in environment light of a limited degree: the degree that they need, and their errors.
+"""The degree of environment light that highlights need, and errors of highlights at lower degrees.
 
-A highlight is the light that a rough surface reflects toward the camera (see
-`renderer.surface.microfacets`). In light with few spherical harmonics, it is
-blurred, or it rings: it has dark rings or negative radiance.
+A highlight is the light that a rough surface reflects specularly toward the
+camera (see `renderer.surface.microfacets`). In light with few spherical
+harmonics, a highlight is blurred, or it rings: there are dark rings or negative
+radiance around it.
+
+The amplitude of degree l is the factor by which a specular lobe multiplies the
+coefficients of degree l of a light (as the kernel of a convolution), divided by
+the factor of degree 0.
 """
 
 import math
@@ -18,17 +23,18 @@ from renderer.light.window import best_window
 from renderer.settings import MAX_DEGREE, MIN_ROUGHNESS
 from renderer.surface.microfacets import SCHLICK, reflectance
 
-# Default amplitude in `required_degree`: degrees whose amplitude in a highlight is
-# at most this fraction of the amplitude of degree 0 are not needed.
+# Default of `required_degree`: a light does not need the degrees whose amplitude in a
+# highlight is at most this fraction of the amplitude of degree 0.
 AMPLITUDE = 0.1
-# Factor for α that gives the narrower lobe in `window_without_ringing`. Lobes
-# at grazing angles are narrower than the lobe along the normal.
+# Factor for the width α = roughness² of a highlight. `window_without_ringing` also tests
+# a highlight that is narrower by this factor, because highlights at grazing angles are
+# narrower than those along the normal.
 NARROWER = 0.7
-# Weight of an error of irradiance, relative to an error of a highlight, with
-# which `highlight_window` chooses its window.
+# `highlight_window` weighs an error of the irradiance this many times as much as an error
+# of a highlight.
 IRRADIANCE = 10.0
-# Smallest relative amplitude that `_spectrum` returns, because windows are
-# divided by it.
+# Smallest amplitude that `_spectrum` returns. Windows are computed by dividing by
+# amplitudes, so these must not be 0.
 SMALLEST = 1e-4
 
 
@@ -48,8 +54,8 @@ def required_degree(roughness: float, amplitude: float = AMPLITUDE) -> int:
         Degree, at most MAX_DEGREE.
     """
     amplitudes = _spectrum(max(roughness, MIN_ROUGHNESS), MAX_DEGREE)
-    # The amplitudes fall with the degree, so this count is the last degree
-    # that exceeds the limit.
+    # The amplitudes fall with the degree. The number of degrees from 1 on that exceed the
+    # limit is therefore the last such degree.
     return int(np.count_nonzero(amplitudes[1:] > amplitude))
 
 
@@ -156,12 +162,15 @@ def _spectrum(roughness: float, degree: int) -> np.ndarray:
     """
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     node_count = 2**9 + 4 * degree
+    # Gauss-Legendre nodes in [-1, 1]. The lobe is 0 below the surface, so that the cosine
+    # of the angle to the normal only covers [0, 1].
     nodes, weights = np.polynomial.legendre.leggauss(node_count)
     cosine = torch.from_numpy((nodes + 1) / 2)
     sine = (1 - cosine**2).sqrt()
     light = torch.stack([sine, 0 * cosine, cosine], 1)
     roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
     lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
+    # P_l at each node, shape (nodes, degree + 1).
     legendre = np.polynomial.legendre.legvander(cosine.numpy(), degree)
     amplitudes = (weights * lobe.numpy()) @ legendre
     return np.maximum(amplitudes / amplitudes[0], SMALLEST)

@@ -77,6 +77,18 @@ class Lamps(LocalBasis):
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
+        """Create lamps and their coefficients from settings, see `LocalBasis.from_settings`.
+
+        Args:
+            settings: `LampsSettings` of `augment.settings`. `start` is a number, a
+                list of colors, or the file of saved lamps.
+
+        Returns:
+            Lamps, and their RGB coefficients, shape (L, 3) for L lamps.
+
+        Raises:
+            InputError: If a position or a coefficient is invalid.
+        """
         if isinstance(settings.start, str | Path):
             lamps, powers = read_light(settings.start, cls)
             return lamps, lamps.project_nonnegative(powers)
@@ -107,14 +119,32 @@ class Lamps(LocalBasis):
         return len(self.positions)
 
     def source_positions(self) -> Tensor:
+        """Return the positions of the L lamps in world axes, shape (L, 3)."""
         return torch.tensor(self.positions)
 
     def moved(self, positions: Tensor) -> Self:
+        """Return a copy with the lamps at other positions.
+
+        Args:
+            positions: Positions of the L lamps in world axes, shape (L, 3).
+        """
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 
     def connect(
         self, points: Tensor, normals: Tensor, positions: Tensor | None = None
     ) -> LightPaths:
+        """Find the paths from lamps to surface points, as if nothing blocked the light.
+
+        Args:
+            points: S surface points in world axes, shape (S, 3).
+            normals: Unit normals at the points, shape (S, 3).
+            positions: Positions to which the L lamps have moved, shape (L, 3).
+                None uses the positions of the basis.
+
+        Returns:
+            Paths that arrive at the front of the surface. There is one path for
+            each pair of a point and a lamp, or RAYS paths if lamps are discs.
+        """
         positions = points.new_tensor(self.positions) if positions is None else positions
         # Points on the L lamps, shape (SETS, L, RAYS, 3). A lamp without extent has
         # the shape (1, L, 1, 3).
@@ -135,6 +165,16 @@ class Lamps(LocalBasis):
         )
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
+        """Create an entry of a Mitsuba scene for each lamp.
+
+        Args:
+            coefficients: RGB coefficients of the L lamps, shape (L, 3).
+            albedo_scale: Factor for the intensity, instead of for the albedo.
+
+        Returns:
+            Entries of points or discs.
+        """
+        # Mitsuba reflects albedo / π times the irradiance, so lamps are π times brighter.
         intensities = math.pi * albedo_scale * coefficients
         describe = self._mitsuba_disc if self.radius else self._mitsuba_point
         return [

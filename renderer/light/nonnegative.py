@@ -654,7 +654,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
 
 @per_degree
 def _derivatives(degree: int) -> Array:
-    """Compute the matrix that maps SH coefficients to those of all first and second derivatives.
+    """Compute the matrix that differentiates lights, given by SH coefficients, once and twice.
 
     Args:
         degree: Degree of the light, which has K = (degree + 1)² coefficients.

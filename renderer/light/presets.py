@@ -217,8 +217,10 @@ def perturb(
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        visible = nonzero_coefficients(degree_of(light))
-        offsets = offsets * torch.zeros(len(light), 1).index_fill_(0, visible, 1.0)
+        # 1 for each coefficient that reaches a diffuse surface, and 0 for the others.
+        diffuse_indices = nonzero_coefficients(degree_of(light))
+        mask = torch.zeros(len(light), 1).index_fill_(0, diffuse_indices, 1.0)
+        offsets = offsets * mask
         norms = offsets.flatten(1).norm(dim=1).clamp(min=1e-12)
         offsets = offsets * (radius / norms)[:, None, None]
     return light + offsets.to(light)

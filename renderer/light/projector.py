@@ -67,6 +67,20 @@ class Projector(LocalBasis):
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:
+        """Create a projector and its pattern from settings, see `LocalBasis.from_settings`.
+
+        Args:
+            settings: `ProjectorSettings` of `augment.settings`. `pattern` is a gray
+                value or an image file.
+
+        Returns:
+            Projector, and the RGB coefficients of its pixels,
+            shape (pixels², 3).
+
+        Raises:
+            InputError: If a setting is out of range, or if the image cannot be
+                read.
+        """
         require_range("polar", settings.polar, 0, 180)
         require_range("azimuth", settings.azimuth, -360, 360)
         require_range("fov", settings.fov, 0.1, 170)
@@ -140,6 +154,15 @@ class Projector(LocalBasis):
         )
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
+        """Create the entry of the projector in a Mitsuba scene.
+
+        Args:
+            coefficients: RGB coefficients of the pixels, shape (pixels², 3).
+            albedo_scale: Factor for the pattern, instead of for the albedo.
+
+        Returns:
+            List with one entry.
+        """
         # Mitsuba's `projector` divides by π itself, so no factor π is needed.
         texels = coefficients.view(self.pixels, self.pixels, 3).numpy()
         pattern = {"bitmap": texels, "filter_type": "nearest", "wrap_mode": "clamp"}

@@ -40,8 +40,8 @@ _BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(
 _ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])
 # For each coefficient of degree l and order m, the index of the coefficient of order -m.
 _MIRRORED = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
-# For each coefficient, the index of its polynomial in the fit. The fit has polynomials
-# for the orders m ≥ 0 only, and those of m and -m are the same.
+# For each coefficient, the index of its polynomial in the fit. The orders m and -m share
+# a polynomial.
 _ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
 
 
@@ -190,7 +190,7 @@ def _as_parameters(
     value_by_name = {"zenith": zenith, "azimuth": azimuth, "turbidity": turbidity}
     for name, value in value_by_name.items():
         if not is_number(value):
-            # This raises InputError unless the value is a tensor.
+            # `as_tensor` raises InputError if the value is no tensor.
             as_tensor(name, value)
     floating = [value for value in (turbidity, zenith, azimuth) if _is_floating(value)]
     like = floating[0] if floating else torch.zeros((), dtype=torch.float64)

@@ -413,6 +413,7 @@ def sample_gloss(
         gloss = _gloss_of_mesh(mesh)
     if gloss is None:
         return None
+    # Three tensors of shape (1,) or (F,).
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
     roughness, metallic, specular_factor = (_at_faces(column, fragments) for column in columns)
     if gloss_textures:
@@ -466,7 +467,7 @@ def _at_faces(face_values: Tensor, fragments: Fragments) -> Tensor:
     if len(face_values) == 1:
         return face_values
     seen_face_values = face_values.index_select(0, fragments.faces)
-    return seen_face_values.index_select(0, fragments.face)
+    return seen_face_values.index_select(0, fragments.sample_to_seen_face)
 
 
 def toward_camera(fragments: Fragments, vertices: Tensor) -> Tensor:

@@ -148,10 +148,18 @@ class ViewFrame(NamedTuple):
         return coefficients
 
     def _harmonics_in_sample_axes(self, lobes: Tensor, degree: int) -> Tensor:
-        """Compute the coefficients of the lobe in the axes of each sample, shape (K, S).
+        """Compute the SH coefficients of the lobe of each of S samples in the sample's own axes.
 
-        They are c_lm sin^m θ cos mφ for the harmonics of order m ≥ 0, and
-        c_lm sin^m θ sin mφ for those of order -m < 0.
+        The polar angle θ and the azimuth φ of the normal give the coefficients
+        c_lm sin^m θ cos mφ for the harmonics of order m ≥ 0, and
+        c_lm sin^m θ sin mφ for the harmonics of order -m < 0.
+
+        Args:
+            lobes: Values of the lobe functions c_lm at the samples, shape (M, S).
+            degree: Degree of the lobe functions.
+
+        Returns:
+            Coefficients of the K = (degree + 1)² harmonics, shape (K, S).
         """
         function_of_harmonic, order = _functions_and_orders(degree)
         function_of_harmonic = function_of_harmonic.to(lobes.device)
@@ -202,7 +210,8 @@ class ViewFrame(NamedTuple):
         exchanged = _multiply_bands(exchange, without_azimuth)
         without_polar = _rotate_harmonics(exchanged, axis.polar.reversed())
         in_view = _multiply_bands(exchange.T, without_polar)
-        # The inverse of one exchange equals two exchanges, as in `harmonics`.
+        # `harmonics` exchanges the axes twice. Two cyclic exchanges of three axes are the
+        # inverse of one exchange, which is the transposed matrix.
         return in_view if self.tilt is None else _multiply_bands(exchange.T, in_view)
 
 
@@ -459,7 +468,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     sines = powers[:degree]
     # Row degree + m holds sin(ma), which is odd in m.
     signed_sines = torch.cat([-sines, 0 * powers[:1], sines.flip(0)])
-    # The harmonic of order -m comes 2 m rows before that of order m.
+    # In a band, the harmonic of order -m is 2 m rows before the harmonic of order m.
     opposite_harmonic = torch.arange(len(order), device=coefficients.device) - 2 * order
     kept = coefficients * powers.index_select(0, degree + order.abs())
     mixed_in = coefficients.index_select(0, opposite_harmonic)
@@ -538,7 +547,7 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
         return cosine_coefficients @ in_cosine
     # Shape (NODES, P, S).
     products = in_roughness[:, None] * in_cosine
-    # This multiplies shapes (T, M, NODES · P) and (NODES · P, S).
+    # The shapes (T, M, NODES · P) and (NODES · P, S) give (T, M, S).
     return coefficients.flatten(2) @ products.flatten(0, 1)
 
 
@@ -625,27 +634,36 @@ def _coat_coefficients() -> Tensor:
     return _table(USUAL)[DIELECTRIC, 0] * (math.sqrt(4 * math.pi) / math.pi)
 
 
-# Chebyshev polynomials have their argument in [-1, 1]. The following four
-# functions map the cosine and the roughness to arguments and back.
+# Chebyshev polynomials have arguments in [-1, 1]. The following four functions map
+# cosines and values of the roughness to such arguments, and back.
 
 
 def _cosine_to_argument(cosine: Tensor) -> Tensor:
-    """Map cosines from [0, 1] to [-1, 1], with more resolution at grazing angles."""
+    """Map cosines from [0, 1] to arguments in [-1, 1], with finer steps at small cosines.
+
+    Lobes change quickly at grazing angles, where the cosine is small.
+
+    Args:
+        cosine: Cosines, any shape.
+
+    Returns:
+        Arguments, same shape.
+    """
     return 4 * cosine / (cosine + 1) - 1
 
 
 def _argument_to_cosine(argument: Tensor) -> Tensor:
-    """Map arguments of polynomials in the cosine from [-1, 1] to [0, 1]."""
+    """Map arguments in [-1, 1] to cosines in [0, 1]: the inverse of `_cosine_to_argument`."""
     return (argument + 1) / (3 - argument)
 
 
 def _roughness_to_argument(roughness: Tensor) -> Tensor:
-    """Map roughness from [MIN_ROUGHNESS, 1] to [-1, 1]."""
+    """Map values of the roughness from [MIN_ROUGHNESS, 1] to arguments in [-1, 1]."""
     return (2 * roughness - 1 - MIN_ROUGHNESS) / (1 - MIN_ROUGHNESS)
 
 
 def _argument_to_roughness(argument: Tensor) -> Tensor:
-    """Map arguments of polynomials in the roughness from [-1, 1] to [MIN_ROUGHNESS, 1]."""
+    """Map arguments in [-1, 1] to values of the roughness in [MIN_ROUGHNESS, 1]."""
     return (argument * (1 - MIN_ROUGHNESS) + 1 + MIN_ROUGHNESS) / 2
 
 

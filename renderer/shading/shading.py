@@ -95,7 +95,7 @@ def radiance(
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
         shade = irradiance(face_normals, light, wide).index_select(1, seen_face)
     else:
-        pixel = fragments.pixel
+        pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
         shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
     # Shape (3, runs or S).
@@ -141,7 +141,7 @@ def glossy_radiance(
     # three components along the first axis.
     if normals is None:
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shading_normals = unit(face_normals).T[fragments.face].to(wide)
+        shading_normals = unit(face_normals).T[fragments.sample_to_seen_face].to(wide)
     else:
         shading_normals = unit(smooth_normals(fragments, normals.to(wide)).T).T
     to_camera = toward_camera(fragments, vertices.to(wide))
@@ -169,7 +169,7 @@ def glossy_radiance(
     specular = specular / fragments.samples**2
     diffuse = radiance(fragments, vertices, light, diffuse_albedo, normals)
     zeros = specular.new_zeros(COLORS, len(fragments.pixels))
-    return diffuse + zeros.index_add(1, fragments.pixel, specular).to(diffuse)
+    return diffuse + zeros.index_add(1, fragments.sample_to_pixel, specular).to(diffuse)
 
 
 def _lobe_radiance(
@@ -322,7 +322,7 @@ def irradiance(
             ((degree + 1)², 3).
     """
     require_bounded(light=light)
-    # This raises InputError if K is not (degree + 1)².
+    # `degree_of` raises InputError if K is not (degree + 1)².
     harmonics.degree_of(light)
     return _Irradiance.apply(normals, light.to(dtype))
 
@@ -353,7 +353,7 @@ class _Irradiance(torch.autograd.Function):
         # (3 axes, 3 colors, BLOCK).
         pairs = [polynomial.evaluate(block) for block in directions.split(BLOCK, dim=1)]
         value, slope = (torch.cat(blocks, dim=-1) for blocks in zip(*pairs, strict=True))
-        # This releases the memory of the blocks.
+        # Deleting the list releases the memory of the blocks.
         del pairs
         zero_normals = torch.nonzero(lengths == 0).squeeze(1)
         if len(zero_normals):

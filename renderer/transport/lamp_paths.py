@@ -158,7 +158,7 @@ def local_transfer(
     weights = weights / fragments.samples**2
     # Paths with the same pixel and the same basis function are added up into one
     # entry. Sorting one number for both is faster than sorting pairs.
-    pixel_of_path = fragments.pixel[paths.point]
+    pixel_of_path = fragments.sample_to_pixel[paths.point]
     key_of_path = pixel_of_path * basis.size + paths.function
     keys, path_to_entry = key_of_path.unique(return_inverse=True)
     zeros = weights.new_zeros(len(keys), albedo.shape[1])
@@ -196,7 +196,7 @@ def local_radiance(
     # Irradiance in three channels at the end of each of E paths, shape (E, 3).
     irradiance = paths.irradiance[:, None] * light[paths.function]
     radiance = _reflectance(surface, albedo, paths) / fragments.samples**2 * irradiance
-    pixel_of_path = fragments.pixel[paths.point]
+    pixel_of_path = fragments.sample_to_pixel[paths.point]
     zeros = radiance.new_zeros(len(fragments.pixels), 3)
     return zeros.index_add(0, pixel_of_path, radiance).T
 
@@ -284,10 +284,10 @@ class LocalLightView:
         mesh: Mesh that the view shows, with V vertices.
         fragments: Covered samples of the view.
         settings: Settings of the image.
-        vertices: Vertex positions to use instead of those of the mesh,
-            shape (V, 3). None uses those of the mesh.
-        gloss: Gloss to use instead of that of the mesh. None uses that of the
-            mesh.
+        vertices: Vertex positions to use instead of `mesh.vertices`,
+            shape (V, 3). None uses `mesh.vertices`.
+        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
+            of the mesh.
     """
 
     def __init__(
@@ -329,8 +329,8 @@ class LocalLightView:
             light: Coefficients of the K basis functions, shape (K, 3).
             positions: Positions to which the L lamps have moved, shape (L, 3).
                 None uses the positions of the basis.
-            fragments: The same samples, grouped into other pixels. None uses
-                those of the view.
+            fragments: The same samples, grouped into other pixels. None uses the
+                pixels of the view.
 
         Returns:
             Radiance of the P pixels, times their coverage, in the dtype and on

@@ -1,4 +1,4 @@
-"""A view of a mesh as a linear operator on its light.
+"""Views of a mesh as linear operators, which map a light to an image.
 
 Before clamping, the radiance of every pixel is linear in the coefficients U of
 the light (the paper's appendix B.2): radiance = Uᵀ T. The transfer matrix T is
@@ -7,8 +7,9 @@ contains the box filter, the texture and the albedo exactly. It also contains
 gloss (`renderer.shading.gloss`), and shadows and bounces (the package
 `renderer.transport`).
 
-Shapes use these letters: an operator has P covered pixels and K coefficients
-that reach a pixel, and ... are any dimensions of a batch of lights.
+Shapes use these letters: a view has S covered samples in P pixels, which show G
+faces of the mesh. K coefficients of the light reach a pixel. The dots (...) are
+any axes of a batch of lights.
 """
 
 from __future__ import annotations
@@ -45,49 +46,52 @@ from renderer.visibility.rasterizers import Rasterizer
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Fields of a `TransferOperator` that are moved to another device.
+# Names of the tensors of a `TransferOperator`, which `TransferOperator.to` moves.
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")
-# `_box_filter` sums as many pixels at a time, whose sums stay in the CPU cache.
+# Number of pixels that `_box_filter` processes at once. The sums of so many pixels stay
+# in the cache of the processor.
 BLOCK = 2**12
-# `_glossy_box_filter` computes as many coefficients of samples at a time. They
-# need several times as many numbers.
+# Number of products of a sample and a coefficient that `_glossy_box_filter` processes at
+# once. It limits the memory, which is several numbers for each product.
 GLOSSY = 2**20
+# Number of color channels.
 COLORS = 3
-# An operator multiplies equal pixels once if this saves at least so many. In smaller
-# images, copying the pixels takes more time than the product.
+# An operator computes equal pixels only once if this saves at least so many pixels. With
+# fewer pixels, copying the results would take more time than it saves.
 FEWEST_SAVED_PIXELS = 2**12
 
 
 @dataclass(frozen=True)
 class TransferOperator:
-    """The transfer matrix of a view of a mesh.
+    """Transfer matrix of a view of a mesh.
 
-    It maps the coefficients of a light to the linear radiance of the covered
-    pixels, weighted with coverage. All floating tensors have one dtype.
+    The matrix maps the coefficients of a light to the linear radiance of the P
+    covered pixels, times the coverage of each pixel. All floating-point tensors
+    have the same dtype.
 
     Attributes:
-        transfer: Radiance per unit of each coefficient, shape (channels, K, P).
-            Usually, there are 3 channels. There is 1 channel, which takes a
-            third of the memory and the time, if no pixel mixes albedos (one
-            sample per pixel, or a mesh of one color). With gloss, the 1 channel
-            is followed by a second one of white light, which is added to all
-            colors.
-        albedo: Factor of the first channel if colors share it, shape (3, P).
-            Ones if there are 3 channels.
+        transfer: Radiance per unit of each of K coefficients, in C channels,
+            shape (C, K, P). C = 3 is one channel for each color. C = 1 is one
+            channel that all colors share. It takes a third of the memory and
+            the time, but is only possible if no pixel mixes albedos (one sample
+            per pixel, or a mesh of one color). C = 2 is a shared channel, and a
+            channel of specular reflection that is added to all colors.
+        albedo: Factor of each color for the shared channel, shape (3, P). Ones
+            if C = 3.
         coverage: Fraction of the samples of each pixel that show the mesh, in
             (0, 1], shape (P,).
-        pixels: Row-major indices of the covered pixels, shape (P,). Row 0 is the
-            top of the image.
-        nonzero: Ascending indices of the coefficients that reach a pixel, shape
-            (K,). At degree 6 these are 31 of the 49 under an open sky
-            (`Harmonics.nonzero`), and all 49 with shadows or gloss.
+        pixels: Row-major indices of the covered pixels, shape (P,). Row 0 is at
+            the top of the image.
+        nonzero: Ascending indices of the K coefficients that reach a pixel,
+            shape (K,). At degree 6, these are 31 of the 49 coefficients under an
+            open sky (`Harmonics.nonzero`), and all 49 with shadows or gloss.
         settings: Settings of the image.
         basis: Basis of the lights.
-        sparse: Entries in three channels that are added to the dense transfer.
-            They are those of projected patterns, which are mostly zero. None
-            without such entries.
-        distinct: Pixels that differ, so that equal pixels are multiplied once.
-            None if most pixels differ.
+        sparse: Nonzero entries of further rows of the matrix, in three channels.
+            These are rows of projected patterns, which are mostly zero. None
+            without such rows.
+        distinct: Groups of equal pixels. The products are computed once for each
+            group. None if most pixels differ.
 
     Example:
         >>> import torch
@@ -113,29 +117,36 @@ class TransferOperator:
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
     ) -> Float[Tensor, "*lights 3 size size"]:
-        """Render images under B lights, differentiable in the lights and in the background.
+        """Render one image under each light.
+
+        The images are differentiable with respect to the lights and the
+        background.
 
         Args:
-            lights: Coefficients of the operator's basis, shape
-                (..., coefficients, 3).
+            lights: Coefficients in the basis of the operator,
+                shape (..., coefficients, 3).
             background: Gray value, color or images in [0, 1]. See
                 `renderer.image.as_background`.
 
         Returns:
-            Images in [0, 1], shape (..., 3, size, size), in the dtype of the
-            lights.
+            Images in [0, 1] in the dtype of the lights,
+            shape (..., 3, size, size).
 
         Raises:
-            InputError: If the lights hold NaN or have another basis, or the
-                background has another shape.
+            InputError: If `lights` has NaN or another number of coefficients
+                than the basis, or if `background` has a wrong shape.
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
         if isinstance(background, Tensor) and background.requires_grad:
+            # A chain of operations of autograd also gives the gradient by the
+            # background.
             images = as_background(background, self.settings.size, lights)
             coverage = self.coverage.to(lights)
             radiance = self.radiance(lights)
             return composite(radiance, coverage, self.pixels, images, self.settings.encoding)
+        # A single operation of autograd is faster, but only gives the gradient by the
+        # lights.
         return _Image.apply(lights, self, self._prepare_background(background, lights))
 
     def image_and_gradient(
@@ -144,27 +155,31 @@ class TransferOperator:
         loss_gradient: Callable[[Tensor], Tensor],
         background: float | Tensor = 0.5,
     ) -> tuple[Float[Tensor, "*lights 3 size size"], Float[Tensor, "*lights coefficients 3"]]:
-        """Render images under B lights and compute the gradient of a loss, without autograd.
+        """Render images, and compute the gradient of a loss with respect to the lights.
 
-        The results equal those of `image` and `torch.autograd.grad` to the bit.
-        For small images, autograd would take most of the time of a step.
+        The gradient is computed without autograd. The results equal those of
+        `image` and `torch.autograd.grad` to the bit. For small images, autograd
+        would take most of the time of an optimization step.
 
         Args:
-            lights: Coefficients of the operator's basis, shape
-                (..., coefficients, 3).
-            loss_gradient: Function of the images, shape (..., 3, size, size). It
-                returns the gradient of the loss by the images, of the same
-                shape. `torch.func.grad(loss)` makes such a function from a loss.
+            lights: Coefficients in the basis of the operator,
+                shape (..., coefficients, 3).
+            loss_gradient: Function that takes the images, shape
+                (..., 3, size, size), and returns the gradient of the loss with
+                respect to the images, in the same shape.
+                `torch.func.grad(loss)` makes such a function from a loss.
             background: Gray value, color or images in [0, 1]. See
                 `renderer.image.as_background`.
 
         Returns:
-            The images in [0, 1], shape (..., 3, size, size), and the gradient of
-            the loss by the lights, with the shape of the lights.
+            A tuple of
+            - the images in [0, 1], shape (..., 3, size, size);
+            - the gradient of the loss with respect to the lights, in the shape
+              of `lights`.
 
         Raises:
             InputError: If the lights, the background or the gradient of the loss
-                hold NaN or have another shape.
+                has NaN or a wrong shape.
 
         Example:
             >>> import torch
@@ -183,30 +198,30 @@ class TransferOperator:
         if isinstance(background, Tensor):
             background = background.detach()
         prepared = self._prepare_background(background, lights)
-        images, is_passing, clamped = self._images(lights, prepared)
+        images, is_unclamped, clamped = self._images(lights, prepared)
         image_gradient = loss_gradient(images)
         require_image_gradient(image_gradient, images)
-        gradient = self._gradient_of_images(image_gradient.detach(), is_passing, clamped)
+        gradient = self._gradient_of_images(image_gradient.detach(), is_unclamped, clamped)
         return images, gradient
 
     def radiance(
         self, lights: Float[Tensor, "*lights coefficients 3"]
     ) -> Float[Tensor, "*lights 3 P"]:
-        """Compute the linear radiance of the covered pixels, differentiable in the lights.
+        """Compute the linear radiance of the P covered pixels, times their coverage.
 
-        The product is computed in the dtype of the operator.
+        The radiance is differentiable with respect to the lights. It is computed
+        in the dtype of the operator.
 
         Args:
-            lights: Coefficients of the operator's basis, shape
-                (..., coefficients, 3).
+            lights: Coefficients in the basis of the operator,
+                shape (..., coefficients, 3).
 
         Returns:
-            Radiance, weighted with coverage, shape (..., 3, P), in the dtype of
-            the lights.
+            Radiance in the dtype of the lights, shape (..., 3, P).
 
         Raises:
-            InputError: If the lights hold NaN or have another number of
-                coefficients.
+            InputError: If `lights` has NaN or another number of coefficients
+                than the basis.
         """
         lights = as_tensor("lights", lights)
         self.require_lights(lights)
@@ -215,20 +230,21 @@ class TransferOperator:
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
     ) -> Float[Tensor, "*lights coefficients 3"]:
-        """Compute the gradient of a loss by the lights from that by the radiance, without a graph.
+        """Convert the gradient of a loss by the radiance to the gradient by the lights.
 
-        This is the product with the transposed matrix:
-        ∂loss/∂U = T ∂loss/∂radiance.
+        This is a product with the transposed matrix,
+        ∂loss/∂U = T ∂loss/∂radiance, without autograd.
 
         Args:
-            radiance_gradient: Gradient by the radiance, shape (..., 3, P).
+            radiance_gradient: Gradient by the radiance of the P covered pixels,
+                shape (..., 3, P).
 
         Returns:
-            Gradient by the lights, shape (..., coefficients, 3). It is exactly
-            zero for coefficients that reach no pixel.
+            Gradient by the lights, shape (..., coefficients, 3). It is exactly 0
+            for coefficients that reach no pixel.
 
         Raises:
-            InputError: If the gradient holds NaN or has another shape.
+            InputError: If the gradient has NaN or a wrong shape.
         """
         radiance_gradient = as_tensor("radiance_gradient", radiance_gradient)
         require_bounded(radiance_gradient=radiance_gradient)
@@ -236,182 +252,244 @@ class TransferOperator:
             given = tuple(radiance_gradient.shape)
             expected = tuple(self.albedo.shape)
             raise InputError(
-                f"radiance_gradient of shape {given} is not of the operator's pixels: "
-                f"give {expected}"
+                f"radiance_gradient has shape {given}, but the operator needs (..., 3, P) for its "
+                f"P = {expected[1]} covered pixels: give a gradient of this shape"
             )
         if self._compact is None:
             return self._light_gradient(radiance_gradient)
-        return self._compact._light_gradient(self._sum_equal(radiance_gradient))
+        return self._compact._light_gradient(self._sum_equal_pixels(radiance_gradient))
 
     def _images(
         self, lights: Tensor, background: _PreparedBackground
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Render without a graph.
+        """Render images without autograd, and keep what the gradient needs.
 
-        Returns the images (..., 3, size, size), ones and zeros where the clamp
-        lets the gradient pass or not (..., 3, U), and the clamped linear values
-        (..., 3, U) of the U distinct pixels.
+        Args:
+            lights: Coefficients, shape (..., coefficients, 3).
+            background: Background of the images.
+
+        Returns:
+            A tuple of
+            - the images in [0, 1], shape (..., 3, size, size);
+            - 1 for values of pixels that clamping did not change, and 0 for other
+              values, shape (..., 3, U). U is the number of groups of equal pixels
+              (`distinct`), or P without such groups;
+            - the clamped linear values of these pixels, shape (..., 3, U).
         """
         operator = self._compact or self
         unclamped = operator._radiance(lights).add_(background.term)
         clamped = unclamped.clamp(0, 1)
-        # The gradient passes at the bounds themselves, as in `renderer.image.clamp`.
-        is_passing = unclamped.eq_(clamped)
-        rows = self._pixel_rows
+        # Values at the limits 0 and 1 have a gradient, as in `renderer.image.clamp`.
+        is_unclamped = unclamped.eq_(clamped)
+        pixel_index = self._pixels_by_color
         canvas = background.images
         image_shape: tuple[int, ...] = self._image_shape
         if lights.ndim > 2:
-            batch = lights.shape[:-2]
-            rows = rows.expand(*batch, -1, -1)
-            canvas = canvas.expand(*batch, -1, -1)
-            image_shape = (*batch, *image_shape)
+            batch_shape = lights.shape[:-2]
+            pixel_index = pixel_index.expand(*batch_shape, -1, -1)
+            canvas = canvas.expand(*batch_shape, -1, -1)
+            image_shape = (*batch_shape, *image_shape)
         images = canvas.clone(memory_format=torch.contiguous_format)
         encoded = clamped if self._is_linear else encode(clamped, self.settings.encoding)
         if self._compact is not None:
-            encoded = self._copy_equal(encoded)
-        # index_copy_ takes twice as long as scatter_ on a CPU.
-        images.scatter_(-1, rows, encoded)
-        return images.view(image_shape), is_passing, clamped
+            encoded = self._copy_to_equal_pixels(encoded)
+        # On a CPU, scatter_ takes half the time of index_copy_.
+        images.scatter_(-1, pixel_index, encoded)
+        return images.view(image_shape), is_unclamped, clamped
 
     def _gradient_of_images(
-        self, image_gradient: Tensor, is_passing: Tensor, clamped: Tensor
+        self, image_gradient: Tensor, is_unclamped: Tensor, clamped: Tensor
     ) -> Tensor:
-        """Compute the gradient by the lights from that by the images of `_images`.
+        """Convert the gradient of a loss by the images of `_images` to the gradient by the lights.
 
-        The gradient by the images has the shape (..., 3, size, size).
+        Args:
+            image_gradient: Gradient by the images, shape (..., 3, size, size).
+            is_unclamped: Second result of `_images`, shape (..., 3, U).
+            clamped: Third result of `_images`, shape (..., 3, U).
+
+        Returns:
+            Gradient by the lights, shape (..., coefficients, 3).
         """
-        rows = self._pixel_rows
-        if is_passing.ndim > 2:
-            rows = rows.expand(*is_passing.shape[:-2], -1, -1)
-        # index_select takes longer, and much longer if there are three axes.
-        covered = image_gradient.flatten(-2).gather(-1, rows)
+        pixel_index = self._pixels_by_color
+        if is_unclamped.ndim > 2:
+            pixel_index = pixel_index.expand(*is_unclamped.shape[:-2], -1, -1)
+        # gather is faster than index_select, most of all for tensors with three axes.
+        pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
         operator = self
         if self._compact is not None:
             operator = self._compact
-            covered = self._sum_equal(covered)
+            pixel_gradient = self._sum_equal_pixels(pixel_gradient)
         if not self._is_linear:
-            covered = encode_gradient(clamped, covered, self.settings.encoding)
-        gradient = operator._light_gradient(covered.mul_(is_passing))
-        # A sum takes less time than the largest magnitude of all pixels.
+            pixel_gradient = encode_gradient(clamped, pixel_gradient, self.settings.encoding)
+        gradient = operator._light_gradient(pixel_gradient.mul_(is_unclamped))
+        # The few numbers of the result are checked first, which is fast. If one is not
+        # finite, `require_bounded` checks all pixels and raises the error.
         if not math.isfinite(gradient.sum().item()):
-            require_bounded(image_gradient=covered)
+            require_bounded(image_gradient=pixel_gradient)
         return gradient
 
     def require_lights(self, lights: Tensor) -> None:
-        """Check that lights have the operator's basis and hold no NaN.
+        """Check that lights fit the basis of the operator, and have no NaN.
 
         Args:
             lights: Coefficients, shape (..., coefficients, 3).
 
         Raises:
-            InputError: If the lights hold NaN or have another shape.
+            InputError: If `lights` has NaN or another number of coefficients
+                than the basis.
         """
         if not lights.is_floating_point():
             require_bounded(lights=lights)
         if lights.shape[-2:] != self._light_shape:
             raise InputError(
-                f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
-                f"give {self.basis.size} rows"
+                f"lights has shape {tuple(lights.shape)}, but {self.basis} needs the shape "
+                f"(..., {self.basis.size}, 3): give lights of this basis"
             )
-        # This takes half the time of `require_bounded` in small images.
-        # `require_bounded` finds and names the fault.
+        # In small images, this test takes half the time of `require_bounded`. If it
+        # fails, `require_bounded` raises the error.
         values = lights.detach().reshape(-1)
         if not torch.dot(values, values).item() <= MAX_MAGNITUDE**2:
             require_bounded(lights=lights)
 
     def _radiance(self, lights: Tensor) -> Tensor:
-        """Compute `radiance` without a graph, in a new tensor of the dtype of the lights."""
+        """Compute `radiance` without autograd and without checks.
+
+        Args:
+            lights: Coefficients, shape (..., coefficients, 3).
+
+        Returns:
+            Radiance times coverage, in a new tensor with the dtype of the lights,
+            shape (..., 3, P).
+        """
         dtype = self.transfer.dtype
-        nonzero = lights.index_select(-2, self.nonzero)
-        # Even a call that converts nothing takes notable time in small images.
+        # Shape (..., K, 3).
+        used_lights = lights.index_select(-2, self.nonzero)
+        # In small images, even a call of `to` that converts nothing takes notable time.
         if lights.dtype != dtype:
-            nonzero = nonzero.to(dtype)
+            used_lights = used_lights.to(dtype)
         if self._shared is not None:
-            product = (nonzero.mT @ self._shared).mul_(self.albedo)
+            radiance = (used_lights.mT @ self._shared).mul_(self.albedo)
             if self._white is not None:
-                product.add_(nonzero.mT @ self._white)
+                radiance.add_(used_lights.mT @ self._white)
         else:
-            product = torch.einsum("...kc,ckp->...cp", nonzero, self.transfer)
+            radiance = torch.einsum("...kc,ckp->...cp", used_lights, self.transfer)
         if self.sparse is not None:
-            selected = lights.to(product.dtype).index_select(-2, self.sparse.function)
-            arriving = selected * self.sparse.weight
-            product = product.index_add(-1, self.sparse.pixel, arriving.mT)
-        return product if lights.dtype == dtype else product.to(lights.dtype)
+            # Contribution of each entry to its pixel, shape (..., entries, 3).
+            light_of_entry = lights.to(radiance.dtype).index_select(-2, self.sparse.function)
+            contributions = light_of_entry * self.sparse.weight
+            radiance = radiance.index_add(-1, self.sparse.pixel, contributions.mT)
+        return radiance if lights.dtype == dtype else radiance.to(lights.dtype)
 
     def _light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """Compute `light_gradient` of values that may hold NaN."""
+        """Compute `light_gradient` without checks.
+
+        Args:
+            radiance_gradient: Gradient by the radiance, shape (..., 3, P).
+
+        Returns:
+            Gradient by the lights, shape (..., coefficients, 3).
+        """
         upstream = radiance_gradient
         dtype = self.transfer.dtype
         if upstream.dtype != dtype:
             upstream = upstream.to(dtype)
+        # Gradient by the K used coefficients, shape (..., 3, K). `linear(a, b)` is a bᵀ.
         if self._shared is not None:
-            product = linear(upstream * self.albedo, self._shared)
+            used_gradient = linear(upstream * self.albedo, self._shared)
             if self._white is not None:
-                product = product + linear(upstream, self._white)
+                used_gradient = used_gradient + linear(upstream, self._white)
         else:
-            product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
-        gradient = self._scatter @ product.mT
+            used_gradient = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
+        gradient = self._placement @ used_gradient.mT
         if self.sparse is not None:
-            selected = upstream.mT.index_select(-2, self.sparse.pixel)
-            arriving = selected * self.sparse.weight
-            gradient = gradient.index_add(-2, self.sparse.function, arriving)
+            # Contribution of each entry to its coefficient, shape (..., entries, 3).
+            gradient_of_entry = upstream.mT.index_select(-2, self.sparse.pixel)
+            contributions = gradient_of_entry * self.sparse.weight
+            gradient = gradient.index_add(-2, self.sparse.function, contributions)
         return (
             gradient if dtype == radiance_gradient.dtype else gradient.to(radiance_gradient.dtype)
         )
 
-    def _copy_equal(self, values: Tensor) -> Tensor:
-        """Copy values (..., U) of the distinct pixels to all covered pixels, shape (..., P)."""
-        assert self.distinct is not None
-        source = self.distinct.source.expand(*values.shape[:-1], -1)
-        return values.gather(-1, source)
+    def _copy_to_equal_pixels(self, values: Tensor) -> Tensor:
+        """Copy the values of each group of equal pixels to all pixels of the group.
 
-    def _sum_equal(self, values: Tensor) -> Tensor:
-        """Sum values (..., P) of equal pixels, shape (..., U)."""
+        Args:
+            values: Values of the U groups, shape (..., U).
+
+        Returns:
+            Values of the P covered pixels, shape (..., P).
+        """
         assert self.distinct is not None
-        sums = values.new_zeros(*values.shape[:-1], len(self.distinct.first))
-        source = self.distinct.source.expand(values.shape)
-        return sums.scatter_add_(-1, source, values)
+        pixel_to_group = self.distinct.pixel_to_group.expand(*values.shape[:-1], -1)
+        return values.gather(-1, pixel_to_group)
+
+    def _sum_equal_pixels(self, values: Tensor) -> Tensor:
+        """Add up the values of the pixels of each group of equal pixels.
+
+        Args:
+            values: Values of the P covered pixels, shape (..., P).
+
+        Returns:
+            Sums of the U groups, shape (..., U).
+        """
+        assert self.distinct is not None
+        sums = values.new_zeros(*values.shape[:-1], len(self.distinct.first_pixel))
+        pixel_to_group = self.distinct.pixel_to_group.expand(values.shape)
+        return sums.scatter_add_(-1, pixel_to_group, values)
 
     def _prepare_background(
         self, background: float | Tensor, lights: Tensor
     ) -> _PreparedBackground:
-        """Prepare a background for lights.
+        """Convert a background to images, and compute its part in the covered pixels.
 
-        A gray value behind one light is kept for the next call.
+        The result for a gray value and a single light is cached for the next call,
+        because optimizations call `image` many times with the same background.
+
+        Args:
+            background: Gray value, color or images in [0, 1].
+            lights: Lights of the images, shape (..., coefficients, 3).
+
+        Returns:
+            Background images, and linear values to add to the radiance.
         """
         is_gray = isinstance(background, float | int)
         if not is_gray or lights.ndim > 2:
             images = as_background(background, self.settings.size, lights)
             return self._prepare_background_images(images, lights)
         key = (background, lights.dtype, lights.device)
-        if self._kept_background.get("key") != key:
+        if self._background_cache.get("key") != key:
             images = as_background(background, self.settings.size, lights)
             prepared = self._prepare_background_images(images, lights)
-            self._kept_background.update(key=key, prepared=prepared)
-        return self._kept_background["prepared"]
+            self._background_cache.update(key=key, prepared=prepared)
+        return self._background_cache["prepared"]
 
     def _prepare_background_images(self, images: Tensor, lights: Tensor) -> _PreparedBackground:
-        """Flatten background images, and compute what they add to the covered pixels.
+        """Flatten background images, and compute their part in the covered pixels.
 
-        The images have the shape (..., 3, size, size), and the lights
-        (..., coefficients, 3).
+        Args:
+            images: Background images, shape (..., 3, size, size).
+            lights: Lights of the images, shape (..., coefficients, 3).
+
+        Returns:
+            Background images, and linear values to add to the radiance.
         """
         operator = self._compact or self
-        flat = images.flatten(-2)
-        at_pixels = flat.index_select(-1, operator.pixels)
+        flat_images = images.flatten(-2)
+        at_pixels = flat_images.index_select(-1, operator.pixels)
         if self.settings.encoding != "linear":
-            # The last bit of a power depends on the position in memory, so it is
-            # computed for each light.
+            # The last bit of a power depends on the position of a number in memory. To
+            # get the same bits as `composite`, the background is repeated for each
+            # light before it is decoded.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
         coverage = operator.coverage.to(images)[None]
         term = background_term(coverage, at_pixels, self.settings.encoding)
-        return _PreparedBackground(flat, term)
+        return _PreparedBackground(images=flat_images, term=term)
 
     def to(self, device: torch.device | str) -> TransferOperator:
-        """Return the same operator on another device.
+        """Return a copy of the operator on another device.
 
         Args:
-            device: The device, such as "cuda".
+            device: Device of the copy, such as "cuda".
 
         Raises:
             InputError: If there is no such device.
@@ -421,102 +499,104 @@ class TransferOperator:
             return self
         sparse = self.sparse and self.sparse.to(device)
         tensors = {name: getattr(self, name).to(device) for name in TENSORS}
-        # On a GPU, the order of the sums of equal pixels would differ from run to run.
+        # On a GPU, the gradients of equal pixels would be added up in another order in
+        # each run, so equal pixels are not grouped.
         return replace(self, **tensors, sparse=sparse, distinct=None)
 
     @property
     def by_channel(self) -> Tensor:
-        """Return the transfer of three channels, including the albedo, shape (3, K, P)."""
+        """Transfer in three channels, which include the albedo, shape (3, K, P)."""
         if self._shared is None:
             return self.transfer
         colored = self._shared * self.albedo[:, None]
         return colored if self._white is None else colored + self._white
 
-    # The following are cached. In images of 32² pixels, even an index or a
-    # comparison of dtypes takes notable time.
+    # These properties are cached, because in images of 32² pixels even an indexing
+    # operation or a comparison of dtypes takes notable time.
 
     @cached_property
     def _shared(self) -> Tensor | None:
-        """Return the transfer (K, P) that the colors share, or None if they do not."""
+        """Channel of `transfer` that all colors share, shape (K, P), or None."""
         return self.transfer[0] if len(self.transfer) < COLORS else None
 
     @cached_property
     def _white(self) -> Tensor | None:
-        """Return the white transfer (K, P) of gloss, or None without it."""
+        """Channel of specular reflection that is added to all colors, shape (K, P), or None."""
         return self.transfer[1] if len(self.transfer) == 2 else None
 
     @cached_property
     def _compact(self) -> TransferOperator | None:
-        """Return the operator of the distinct pixels, or None if most pixels differ."""
+        """Operator with one pixel for each group of equal pixels, or None without groups."""
         if self.distinct is None:
             return None
-        first = self.distinct.first
+        first_pixel = self.distinct.first_pixel
         return replace(
             self,
-            transfer=self.transfer.index_select(-1, first),
-            albedo=self.albedo.index_select(-1, first),
-            coverage=self.coverage.index_select(0, first),
-            pixels=self.pixels.index_select(0, first),
+            transfer=self.transfer.index_select(-1, first_pixel),
+            albedo=self.albedo.index_select(-1, first_pixel),
+            coverage=self.coverage.index_select(0, first_pixel),
+            pixels=self.pixels.index_select(0, first_pixel),
             distinct=None,
         )
 
     @cached_property
-    def _kept_background(self) -> dict[str, Any]:
-        """Return the prepared background of the last gray value, and its key in the cache."""
+    def _background_cache(self) -> dict[str, Any]:
+        """Prepared background of the last gray value ("prepared"), and its arguments ("key")."""
         return {}
 
     @cached_property
     def _is_linear(self) -> bool:
-        """Return whether image values are not encoded."""
+        """True if image values are linear, so that they are not encoded."""
         return self.settings.encoding == "linear"
 
     @cached_property
     def _image_shape(self) -> tuple[int, int, int]:
-        """Return the shape of one image, (3, size, size)."""
+        """Shape of one image, (3, size, size)."""
         return COLORS, self.settings.size, self.settings.size
 
     @cached_property
     def _light_shape(self) -> tuple[int, int]:
-        """Return the shape of one light, (coefficients, 3)."""
+        """Shape of one light, (coefficients, 3)."""
         return self.basis.size, COLORS
 
     @cached_property
-    def _pixel_rows(self) -> Tensor:
-        """Return the covered pixels for each color, shape (3, P)."""
+    def _pixels_by_color(self) -> Tensor:
+        """Indices of the covered pixels, repeated for the three colors, shape (3, P)."""
         return self.pixels.expand(COLORS, -1)
 
     @cached_property
-    def _scatter(self) -> Tensor:
-        """Return the matrix (size, K) that puts K coefficients in their place among all.
+    def _placement(self) -> Tensor:
+        """Matrix that writes K coefficients to their places among all coefficients.
 
-        The other coefficients become exactly zero.
+        The product with the K used coefficients has exact zeros in all other
+        places. The shape is (coefficients, K).
         """
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
 class DistinctPixels(NamedTuple):
-    """The U covered pixels of an operator that differ from each other.
+    """Groups of the P covered pixels of an operator whose pixels are equal.
 
-    Equal pixels have the same transfer, albedo and coverage.
+    Equal pixels have the same transfer, albedo and coverage. There are U groups.
 
     Attributes:
-        first: First of the equal pixels, as an index into the P covered pixels,
-            ascending, shape (U,).
-        source: Index into `first` of the pixel that each covered pixel equals,
-            shape (P,).
+        first_pixel: Index of the first covered pixel of each group, ascending,
+            shape (U,).
+        pixel_to_group: Index of the group of each covered pixel, shape (P,).
     """
 
-    first: Int[Tensor, " U"]
-    source: Int[Tensor, " P"]
+    first_pixel: Int[Tensor, " U"]
+    pixel_to_group: Int[Tensor, " P"]
 
 
 class _PreparedBackground(NamedTuple):
-    """A background of an operator.
+    """Background of the images of an operator.
 
     Attributes:
         images: Background images, shape (..., 3, size²).
-        term: Linear values that are added to the radiance of the U distinct
-            pixels, shape (..., 3, U).
+        term: Linear values to add to the radiance of U pixels, shape
+            (..., 3, U). U is the number of groups of equal pixels, or P without
+            such groups.
     """
 
     images: Tensor
@@ -524,96 +604,144 @@ class _PreparedBackground(NamedTuple):
 
 
 class _Radiance(torch.autograd.Function):
-    """`TransferOperator._radiance` with its gradient by the lights."""
+    """Radiance under a light, differentiable with respect to the light."""
 
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
+        """Compute the radiance of the P covered pixels.
+
+        Args:
+            ctx: Context of autograd.
+            lights: Coefficients, shape (..., coefficients, 3).
+            operator: Operator of the view.
+
+        Returns:
+            Radiance times coverage, shape (..., 3, P).
+        """
         ctx.operator = operator
         if operator._compact is None:
             return operator._radiance(lights)
-        return operator._copy_equal(operator._compact._radiance(lights))
+        return operator._copy_to_equal_pixels(operator._compact._radiance(lights))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        """Compute the gradient by the lights.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the radiance, shape (..., 3, P).
+
+        Returns:
+            Gradient, shape (..., coefficients, 3), and None for the operator.
+        """
         return ctx.operator.light_gradient(upstream), None
 
 
 class _Image(torch.autograd.Function):
-    """`TransferOperator._images` with its gradient by the lights.
+    """Images under a light, differentiable with respect to the light.
 
-    It is a single node of autograd, since each node takes time.
+    Product, background, clamping and encoding are one operation of autograd,
+    because autograd takes time for each operation.
     """
 
     @staticmethod
     def forward(
         ctx: Any, lights: Tensor, operator: TransferOperator, background: _PreparedBackground
     ) -> Tensor:
-        images, is_passing, clamped = operator._images(lights, background)
+        """Render the images.
+
+        Args:
+            ctx: Context of autograd.
+            lights: Coefficients, shape (..., coefficients, 3).
+            operator: Operator of the view.
+            background: Background of the images.
+
+        Returns:
+            Images in [0, 1], shape (..., 3, size, size).
+        """
+        images, is_unclamped, clamped = operator._images(lights, background)
         ctx.operator = operator
-        ctx.is_passing = is_passing
+        ctx.is_unclamped = is_unclamped
         ctx.clamped = clamped
         return images
 
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        # Gradients are recorded only with create_graph. Without this test,
-        # once_differentiable would take several percent of a step in small images.
+        """Compute the gradient by the lights.
+
+        Args:
+            ctx: Context of autograd.
+            upstream: Gradient by the images, shape (..., 3, size, size).
+
+        Returns:
+            Gradient, shape (..., coefficients, 3), and None for the other two
+            arguments of `forward`.
+        """
+        # Gradients are recorded in this method only if the caller of autograd gave
+        # create_graph=True. Without this test, once_differentiable would take several
+        # percent of the time of an optimization step with small images.
         if torch.is_grad_enabled():
             return _Image._backward_once(ctx, upstream)
         return _Image._backward(ctx, upstream)
 
     @staticmethod
     def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the gradient by the lights."""
-        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_passing, ctx.clamped)
+        """Compute the result of `backward`, without a protection against second derivatives."""
+        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped)
         return gradient, None, None
 
-    # A second derivative raises an error.
+    # `_backward` that raises an error if a second derivative is computed through it.
     _backward_once = staticmethod(once_differentiable(_backward))
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:
-    """Check that the gradient of a loss by images has their shape.
+    """Check that the gradient that a user's function returned has the shape of the images.
 
     Args:
-        image_gradient: What a function `loss_gradient` returned.
-        images: The images, of any shape.
+        image_gradient: Result of the user's function `loss_gradient`.
+        images: Images, any shape.
 
     Raises:
-        InputError: If it is no tensor or has another shape.
+        InputError: If the result is no tensor, or has another shape.
     """
     is_tensor = isinstance(image_gradient, Tensor)
     if not is_tensor or image_gradient.shape != images.shape:
-        given = tuple(image_gradient.shape) if is_tensor else type(image_gradient).__name__
+        given = f"the shape {tuple(image_gradient.shape)}"
+        if not is_tensor:
+            given = f"the type {type(image_gradient).__name__}"
         raise InputError(
-            f"loss_gradient returned {given}: "
-            f"return a tensor of the images' shape {tuple(images.shape)}"
+            f"loss_gradient returned a value of {given}: "
+            f"return a tensor in the shape of the images, {tuple(images.shape)}"
         )
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
-    """Compute the radiance of views under B lights.
+    """Compute the radiance of P pixels under B lights, with one or more transfer matrices.
 
-    The light comes first in the product, which is several times faster on a CPU.
+    The lights are the left factor of the product, which is several times faster
+    on a CPU.
 
     Args:
-        lights: Nonzero coefficients, shape (..., B, K, 3).
-        transfer: Transfer of C = 1 to 3 channels, as in a `TransferOperator`,
+        lights: The K used coefficients of each light, shape (..., B, K, 3).
+        transfer: Transfer in C = 1 to 3 channels, as in `TransferOperator`,
             shape (..., C, K, P).
-        albedo: Albedo, as in a `TransferOperator`, shape (..., 3, P).
+        albedo: Factors for the shared channel, as in `TransferOperator`,
+            shape (..., 3, P).
 
     Returns:
         Radiance, shape (..., B, 3, P).
     """
     if transfer.shape[-3] == COLORS:
+        # (..., 3, B, K) times (..., 3, K, P) is (..., 3, B, P).
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     shared, *white = transfer.unbind(-3)
-    by_color = lights.mT.flatten(-3, -2)
-    product = (by_color @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
+    # Shape (..., B · 3, K), so that one matrix product does all lights and colors.
+    light_rows = lights.mT.flatten(-3, -2)
+    radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
     if white:
-        product = product + (by_color @ white[0]).unflatten(-2, (-1, COLORS))
-    return product
+        radiance = radiance + (light_rows @ white[0]).unflatten(-2, (-1, COLORS))
+    return radiance
 
 
 def build_operators(
@@ -631,22 +759,23 @@ def build_operators(
     Surfaces are shaded on the side that the camera sees.
 
     Args:
-        mesh: The mesh.
-        cameras: The cameras.
+        mesh: Mesh that the views show.
+        cameras: Cameras of the views.
         settings: Settings of the images.
         rasterizer: Rasterizer that finds the visible faces.
-        albedo_scale: Factor of the albedo, for meshes whose texture is darker
+        albedo_scale: Factor for the albedo, for meshes whose texture is darker
             than the real object.
         basis: Basis of the lights.
-        dtype: Type of the operators. They are computed in float64.
-        gloss: Gloss instead of that of the mesh. None for that of the mesh.
+        dtype: Data type of the operators. The computation uses float64.
+        gloss: Gloss to use instead of the gloss of the mesh. None uses the gloss
+            of the mesh.
 
     Returns:
         One operator per camera, in the order of the cameras.
 
     Raises:
-        InputError: If the basis has local lights and light is to bounce, or the
-            scale is not finite.
+        InputError: If the basis has local lights and `settings.bounces` is not
+            0, or if `albedo_scale` is not finite.
     """
     require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(
@@ -667,17 +796,21 @@ def build_operators(
 
 
 class _Channels(NamedTuple):
-    """The layout of the channels of a view's transfer, and the place of the albedo.
+    """Choice of the channels of a transfer matrix, and of where the albedo is multiplied.
+
+    If each color has a channel, the transfer includes the albedo of the S
+    samples. If all colors share a channel, the albedo of the P pixels is
+    multiplied later.
 
     Attributes:
-        number: Number of channels. It is 3 if each color has a channel, 1 if the
-            colors share a channel, and 2 if the white light of gloss follows the
-            shared channel.
-        is_shared: Whether the colors share a channel.
-        sample_albedo: Albedo that is multiplied into the transfer, shape (S, 3).
-            It is ones (S, 1) if the colors share a channel.
-        pixel_albedo: Albedo that multiplies a shared channel, shape (P, 3). It
-            is ones if each color has a channel.
+        number: Number C of channels: 3 if each color has a channel, 1 if the
+            colors share a channel, and 2 if a channel of specular reflection
+            follows the shared channel.
+        is_shared: True if the colors share a channel.
+        sample_albedo: Albedo that the transfer includes, shape (S, 3), or ones of
+            shape (S, 1) if the colors share a channel.
+        pixel_albedo: Albedo that is multiplied later, shape (P, 3). Ones if each
+            color has a channel.
     """
 
     number: int
@@ -687,10 +820,11 @@ class _Channels(NamedTuple):
 
 
 class _DenseRows(NamedTuple):
-    """The rows of a transfer matrix for some coefficients of the light.
+    """Rows of a transfer matrix, for K of the coefficients of a light.
 
     Attributes:
-        transfer: Radiance per unit of K coefficients, shape (C, K, P).
+        transfer: Radiance of the P pixels per unit of each coefficient, in C
+            channels, shape (C, K, P).
         coefficients: Indices of these coefficients in the light, shape (K,).
     """
 
@@ -700,16 +834,17 @@ class _DenseRows(NamedTuple):
 
 @dataclass(frozen=True)
 class _OperatorBuilder:
-    """Builder of the operators of one mesh, view by view.
+    """Computes the operators of the views of one mesh.
 
     Attributes:
-        mesh: The mesh.
+        mesh: Mesh that the views show.
         settings: Settings of the images.
-        albedo_scale: Factor of the albedo.
+        albedo_scale: Factor for the albedo.
         basis: Basis of the lights.
-        dtype: Type of the operators.
-        gloss: Gloss instead of that of the mesh, or None.
-        transport: Shadows and bounces of environment light, or None without them.
+        dtype: Data type of the operators.
+        gloss: Gloss to use instead of the gloss of the mesh, or None.
+        transport: Shadows and bounces of environment light, or None without
+            shadows and bounces.
         rays: Rays among the faces of the mesh.
     """
 
@@ -723,9 +858,17 @@ class _OperatorBuilder:
     rays: Rays
 
     def build(self, fragments: Fragments) -> TransferOperator:
-        """Compute the operator of one view."""
+        """Compute the operator of one view.
+
+        Args:
+            fragments: The S covered samples of the view, in P pixels.
+
+        Returns:
+            Operator of the view.
+        """
         surface = Surface(self.mesh, fragments, self.settings, given_gloss=self.gloss)
         channels = self._channels(surface)
+        # Rows of the matrix as dense tensors, and as lists of nonzero entries.
         dense = []
         sparse = []
         for part in self.basis.local_lights:
@@ -736,31 +879,45 @@ class _OperatorBuilder:
                 dense.append(self._local_rows(part, entries, surface))
         if self.basis.environment is not None:
             dense.append(self._environment_rows(self.basis.environment, surface, channels))
-        joined_rows = self._join(dense, channels.number, len(fragments.pixels))
+        all_rows = self._concatenate(dense, channels.number, len(fragments.pixels))
         albedo = channels.pixel_albedo.T.to(self.dtype).contiguous()
         distinct = None
-        if self._is_alike_on_faces(surface, channels):
+        if self._is_uniform_on_faces(surface, channels):
             distinct = _distinct_pixels(fragments, albedo)
         return TransferOperator(
-            transfer=joined_rows.transfer,
+            transfer=all_rows.transfer,
             albedo=albedo,
             coverage=fragments.coverage.to(self.dtype),
             pixels=fragments.pixels,
-            nonzero=joined_rows.coefficients,
+            nonzero=all_rows.coefficients,
             settings=self.settings,
             basis=self.basis,
             sparse=concatenate_entries(sparse),
             distinct=distinct,
         )
 
-    def _is_alike_on_faces(self, surface: Surface, channels: _Channels) -> bool:
-        """Return whether all pixels that one face fills have the same transfer."""
+    def _is_uniform_on_faces(self, surface: Surface, channels: _Channels) -> bool:
+        """Tell whether all pixels that are filled by the same face have the same transfer.
+
+        This needs flat normals, no gloss, no shadows, and no local lights.
+
+        Args:
+            surface: Points and gloss at the samples of the view.
+            channels: Channels of the transfer.
+        """
         is_matte = surface.gloss is None and channels.is_shared
-        is_open = self.transport is None and not self.basis.local_lights
-        return is_matte and is_open and self.settings.normals == "flat"
+        has_open_sky = self.transport is None and not self.basis.local_lights
+        return is_matte and has_open_sky and self.settings.normals == "flat"
 
     def _channels(self, surface: Surface) -> _Channels:
-        """Choose the layout with the fewest channels that is exact."""
+        """Choose as few channels as possible, without an error of the radiance.
+
+        Args:
+            surface: Points and gloss at the S samples of the view.
+
+        Returns:
+            Channels and albedo of the transfer.
+        """
         fragments = surface.fragments
         pixel_count = len(fragments.pixels)
         is_glossy = surface.gloss is not None
@@ -783,7 +940,7 @@ class _OperatorBuilder:
                 sample_albedo=sample_albedo,
                 pixel_albedo=torch.ones(pixel_count, COLORS),
             )
-        ones = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
+        ones = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.sample_to_pixel), 1)
         return _Channels(
             number=2 if is_glossy else 1,
             is_shared=True,
@@ -792,26 +949,38 @@ class _OperatorBuilder:
         )
 
     def _needs_three_channels(self, is_glossy: bool) -> bool:
-        """Return whether a factor per pixel cannot express the colors of the radiance.
+        """Tell whether the colors of the radiance cannot be expressed by a factor per pixel.
 
-        This is so if bounced light has another color than the light of the sky.
-        It is also so if gloss meets shadows or local lights, because these add
-        the white light of gloss to the channels of the albedo.
+        This is the case if bounced light is colored. It is also the case for a
+        glossy mesh with shadows or local lights, because `Transport.change` and
+        `local_transfer` add specular reflection to the channels with the albedo.
+
+        Args:
+            is_glossy: True if the mesh reflects specularly.
         """
         if self.transport is not None and self.transport.colors:
             return True
         return is_glossy and (self.transport is not None or bool(self.basis.local_lights))
 
     def _surface_albedo(self, fragments: Fragments) -> Tensor:
-        """Return the scaled albedo (S, 3) at the samples."""
+        """Compute the scaled linear albedo at the S samples of a view, shape (S, 3)."""
         return surface_albedo(self.mesh, fragments, self.settings.encoding) * self.albedo_scale
 
     def _environment_rows(
         self, part: EnvironmentPart, surface: Surface, channels: _Channels
     ) -> _DenseRows:
-        """Compute the rows of environment light, with shadows and bounces."""
+        """Compute the rows of the coefficients of environment light, with shadows and bounces.
+
+        Args:
+            part: Environment light of the basis.
+            surface: Points, normals and gloss at the samples of the view.
+            channels: Channels and albedo of the transfer.
+
+        Returns:
+            Rows of the matrix.
+        """
         harmonics_basis = part.basis
-        everything = torch.arange(harmonics_basis.size)
+        all_coefficients = torch.arange(harmonics_basis.size)
         if surface.gloss is None:
             weights = None if channels.is_shared else channels.sample_albedo
             transfer = _box_filter(surface, weights, harmonics_basis, self.dtype)
@@ -821,37 +990,76 @@ class _OperatorBuilder:
             transfer = _glossy_box_filter(
                 surface, surface.gloss, albedo, harmonics_basis, self.dtype
             )
-            coefficients = everything
+            coefficients = all_coefficients
         change = None
         if self.transport is not None:
             change = self.transport.change(surface, channels.sample_albedo)
         if change is not None:
+            # The change has a row for each coefficient.
             transfer = change.index_add_(1, coefficients, transfer.double())
-            coefficients = everything
+            coefficients = all_coefficients
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
     def _local_entries(
         self, part: LocalPart, surface: Surface, channels: _Channels
     ) -> SparseTransfer:
-        """Compute the nonzero entries of a local light."""
+        """Compute the nonzero entries of the rows of a local light.
+
+        Args:
+            part: Local light of the basis.
+            surface: Points, normals and gloss at the samples of the view.
+            channels: Channels and albedo of the transfer.
+
+        Returns:
+            Nonzero entries, with indices of the functions of this light.
+        """
         return local_transfer(self.rays, surface, channels.sample_albedo, part.basis)
 
     def _local_rows(self, part: LocalPart, entries: SparseTransfer, surface: Surface) -> _DenseRows:
-        """Write the entries of a local light as rows."""
+        """Write the entries of a local light into dense rows.
+
+        Args:
+            part: Local light of the basis.
+            entries: Nonzero entries, with indices of the functions of this light.
+            surface: Samples of the view.
+
+        Returns:
+            Rows of the functions that reach a pixel.
+        """
         transfer, coefficients = entries.dense(len(surface.fragments.pixels))
         return _DenseRows(transfer.to(self.dtype), part.rows.start + coefficients)
 
     def _sparse_rows(
         self, part: LocalPart, entries: SparseTransfer, channels: _Channels
     ) -> SparseTransfer:
-        """Return the entries of a local light in three channels, with their albedo."""
+        """Convert the entries of a local light to three channels that include the albedo.
+
+        Args:
+            part: Local light of the basis.
+            entries: Nonzero entries, with indices of the functions of this light.
+            channels: Channels and albedo of the transfer.
+
+        Returns:
+            Entries with indices of the coefficients of the whole basis.
+        """
         weight = (entries.weight * channels.pixel_albedo[entries.pixel]).to(self.dtype)
         return SparseTransfer(part.rows.start + entries.function, entries.pixel, weight)
 
-    def _join(self, parts: list[_DenseRows], channel_count: int, pixel_count: int) -> _DenseRows:
-        """Join rows in the order of their coefficients."""
+    def _concatenate(
+        self, parts: list[_DenseRows], channel_count: int, pixel_count: int
+    ) -> _DenseRows:
+        """Concatenate the rows of several lights in the order of their coefficients.
+
+        Args:
+            parts: Rows of each light.
+            channel_count: Number C of channels, for a result without rows.
+            pixel_count: Number P of pixels, for a result without rows.
+
+        Returns:
+            Rows of all lights.
+        """
         if len(parts) == 1:
-            # Returning the part avoids a copy.
+            # Concatenating a single part would copy it.
             return parts[0]
         empty = torch.empty(channel_count, 0, pixel_count, dtype=self.dtype)
         ordered = sorted(parts, key=_first_coefficient)
@@ -861,257 +1069,380 @@ class _OperatorBuilder:
 
 
 def _first_coefficient(rows: _DenseRows) -> int:
-    """Return the index of the first coefficient, or 0 without coefficients."""
+    """Return the index of the first coefficient of some rows, or 0 if there are no rows."""
     return int(rows.coefficients[0]) if len(rows.coefficients) else 0
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Return the albedo (P, 3) of each pixel, or None if the samples of a pixel disagree.
+    """Return the albedo of each pixel if all samples of each pixel have the same albedo.
 
-    The albedo of the samples (S, 3) may differ by the rounding of the dtype.
+    Args:
+        fragments: The S covered samples of a view, in P pixels.
+        albedo: Linear albedo of the samples, shape (S, 3).
+        dtype: Data type whose rounding errors are ignored in the comparison.
+
+    Returns:
+        Linear albedo, shape (P, 3). None if two samples of a pixel differ.
     """
-    # Each row holds one channel and is contiguous.
-    by_channel = albedo.T
-    zeros = by_channel.new_zeros(COLORS, len(fragments.pixels))
-    by_pixel = zeros.index_copy(1, fragments.pixel, by_channel)
-    # index_select takes three times as long in float64.
-    pixel_of_sample = fragments.pixel.expand(COLORS, -1)
-    difference = (by_channel - by_pixel.gather(1, pixel_of_sample)).abs_()
-    is_equal = difference <= torch.finfo(dtype).eps * by_channel
-    return by_pixel.T if is_equal.all() else None
+    # Shape (3, S), with contiguous rows.
+    sample_albedo = albedo.T
+    zeros = sample_albedo.new_zeros(COLORS, len(fragments.pixels))
+    # The last sample of each pixel overwrites the other samples.
+    pixel_albedo = zeros.index_copy(1, fragments.sample_to_pixel, sample_albedo)
+    # In float64, gather takes a third of the time of index_select.
+    sample_to_pixel = fragments.sample_to_pixel.expand(COLORS, -1)
+    difference = (sample_albedo - pixel_albedo.gather(1, sample_to_pixel)).abs_()
+    is_equal = difference <= torch.finfo(dtype).eps * sample_albedo
+    return pixel_albedo.T if is_equal.all() else None
 
 
 def _box_filter(
     surface: Surface, albedo: Tensor | None, basis: Harmonics, dtype: torch.dtype
 ) -> Tensor:
-    """Sum albedo × A_l Y_lm(n) over each pixel's samples, in float64.
+    """Compute the transfer of a matte surface under an open sky.
 
-    This is the transfer of a matte surface under an open sky, with the factors
-    A_l of `harmonics.lambertian_factors` and the normals n of the samples.
+    For each pixel, this is the mean of albedo · A_l Y_lm(n) over its samples,
+    which is called the box filter. A_l are the factors of
+    `harmonics.lambertian_factors`, Y_lm the harmonics, and n the normals. Sums
+    are computed in float64.
 
     Args:
-        surface: The S samples of a view, in P pixels.
-        albedo: Linear albedo at the samples, shape (S, C). None stands for 1 in
-            a single channel.
-        basis: Basis with K nonzero functions A_l Y_lm.
-        dtype: Type of the result.
+        surface: Normals at the S samples of a view, in P pixels.
+        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
+            in a single channel.
+        basis: SH basis, in which K functions change the irradiance.
+        dtype: Data type of the result.
 
     Returns:
-        Transfer, shape (C, K, P).
+        Radiance per unit of each of the K coefficients, shape (C, K, P).
     """
     fragments = surface.fragments
     pixel_count = len(fragments.pixels)
     is_flat = surface.settings.normals == "flat"
     if is_flat:
-        face_harmonics = basis.irradiance(surface.face_planes)
-        if albedo is None and _mostly_filled(fragments):
-            return _copied_from_faces(fragments, face_harmonics, dtype)
-        pixel, face, weights = _face_weights(fragments, albedo)
+        # A_l Y_lm(n) of each seen face, shape (G, K).
+        face_values = basis.irradiance(surface.face_planes)
+        if albedo is None and _are_pixels_mostly_filled(fragments):
+            return _copy_from_faces(fragments, face_values, dtype)
+        # Each entry of a pixel's sum is a run of samples that show one face.
+        entry_to_pixel, entry_to_face, weights = _run_weights(fragments, albedo)
     else:
-        pixel = fragments.pixel
+        # Each entry of a pixel's sum is a sample.
+        entry_to_pixel = fragments.sample_to_pixel
         weights = _sample_weights(fragments, albedo)
-    filtered = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
-    row_starts = _row_starts(torch.bincount(pixel, minlength=pixel_count))
-    for first in range(0, pixel_count, BLOCK):
-        rows = row_starts[first : first + BLOCK + 1]
-        entries = slice(int(rows[0]), int(rows[-1]))
+    transfer = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
+    entry_starts = _row_starts(torch.bincount(entry_to_pixel, minlength=pixel_count))
+    for first_pixel in range(0, pixel_count, BLOCK):
+        pixels = slice(first_pixel, first_pixel + BLOCK)
+        block_starts = entry_starts[first_pixel : first_pixel + BLOCK + 1]
+        entries = slice(int(block_starts[0]), int(block_starts[-1]))
         if is_flat:
-            values = face_harmonics
-            value_of_entry = face[entries]
+            values = face_values
+            entry_to_value = entry_to_face[entries]
         else:
             values = basis.irradiance(surface.normals[entries])
-            value_of_entry = torch.arange(len(values))
-        for channel, weight in zip(filtered, weights[entries].T, strict=True):
-            sums = _row_sums(weight, value_of_entry, rows, values)
-            channel[:, first : first + BLOCK] = sums.to(dtype).T
-    return filtered
+            entry_to_value = torch.arange(len(values))
+        for channel, channel_weights in zip(transfer, weights[entries].T, strict=True):
+            sums = _weighted_row_sums(channel_weights, entry_to_value, block_starts, values)
+            channel[:, pixels] = sums.to(dtype).T
+    return transfer
 
 
-def _mostly_filled(fragments: Fragments) -> bool:
-    """Return whether most pixels show a single face."""
+def _are_pixels_mostly_filled(fragments: Fragments) -> bool:
+    """Tell whether more than half of the covered pixels show a single face in all samples."""
     is_filled = fragments.runs.sample_count == fragments.samples**2
     return 2 * int(is_filled.sum()) > len(fragments.pixels)
 
 
-def _copied_from_faces(fragments: Fragments, face_harmonics: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return `_box_filter`, shape (1, K, P), for flat normals and an albedo of 1.
+def _copy_from_faces(fragments: Fragments, face_values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Compute `_box_filter` for flat normals and an albedo of 1.
 
-    `face_harmonics` (G, K) are the functions A_l Y_lm of each seen face. A pixel
-    that one face fills has the values of this face, which are copied. Only the
-    other pixels are summed.
+    A pixel that a single face fills has the transfer of this face, which is
+    copied. Only the other pixels need sums over several faces.
+
+    Args:
+        fragments: Covered samples of a view, in P pixels, which show G faces.
+        face_values: Transfer of each seen face, A_l Y_lm(n) for K functions,
+            shape (G, K).
+        dtype: Data type of the result.
+
+    Returns:
+        Transfer, shape (1, K, P).
     """
-    pixel, face, sample_count = fragments.runs
-    run_count = torch.bincount(pixel, minlength=len(fragments.pixels))
-    first_run = _row_starts(run_count)[:-1]
-    # A sum is never −0.0. Adding 0.0 ensures that a copy is not −0.0 either.
-    positive_zero = face_harmonics + 0.0
-    by_function = positive_zero.T.to(dtype).contiguous()
-    filtered = by_function.index_select(1, face.index_select(0, first_run))
-    is_partial = sample_count < fragments.samples**2
-    partial_runs = _indices(is_partial)
-    partial_face = face.index_select(0, partial_runs)
-    partial_weight = sample_count.index_select(0, partial_runs).double() / fragments.samples**2
-    summed_pixels = _indices(is_partial.index_select(0, first_run))
-    row_starts = _row_starts(run_count.index_select(0, summed_pixels))
-    for first in range(0, len(summed_pixels), BLOCK):
-        rows = row_starts[first : first + BLOCK + 1]
-        entries = slice(int(rows[0]), int(rows[-1]))
-        sums = _row_sums(partial_weight[entries], partial_face[entries], rows, face_harmonics)
-        block = summed_pixels[first : first + BLOCK].expand(len(filtered), -1)
-        filtered.scatter_(1, block, sums.to(dtype).T.contiguous())
-    return filtered[None]
+    run_to_pixel, run_to_face, sample_count = fragments.runs
+    runs_per_pixel = torch.bincount(run_to_pixel, minlength=len(fragments.pixels))
+    first_run = _row_starts(runs_per_pixel)[:-1]
+    # Sums are never -0.0. Adding 0.0 turns -0.0 into 0.0 in copies, too.
+    values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
+    # First give each pixel the values of the face in its first run, shape (K, P).
+    transfer = values_by_function.index_select(1, run_to_face.index_select(0, first_run))
+    # Then replace the pixels with several runs, or with uncovered samples.
+    is_partial_run = sample_count < fragments.samples**2
+    partial_runs = _indices(is_partial_run)
+    partial_to_face = run_to_face.index_select(0, partial_runs)
+    partial_sample_count = sample_count.index_select(0, partial_runs)
+    partial_weights = partial_sample_count.double() / fragments.samples**2
+    partial_pixels = _indices(is_partial_run.index_select(0, first_run))
+    entry_starts = _row_starts(runs_per_pixel.index_select(0, partial_pixels))
+    for first in range(0, len(partial_pixels), BLOCK):
+        block_starts = entry_starts[first : first + BLOCK + 1]
+        entries = slice(int(block_starts[0]), int(block_starts[-1]))
+        sums = _weighted_row_sums(
+            partial_weights[entries], partial_to_face[entries], block_starts, face_values
+        )
+        block_pixels = partial_pixels[first : first + BLOCK].expand(len(transfer), -1)
+        transfer.scatter_(1, block_pixels, sums.to(dtype).T.contiguous())
+    return transfer[None]
 
 
 def _distinct_pixels(fragments: Fragments, albedo: Tensor) -> DistinctPixels | None:
-    """Find equal pixels of a view in which all samples of a face have the same transfer.
+    """Group the pixels that are filled by the same face and therefore are equal.
 
-    The pixels that one face fills are equal if they have the same albedo, given
-    in shape (3, P). None is returned if there are too few to save time.
+    All samples of a face must have the same transfer.
+
+    Args:
+        fragments: Covered samples of a view, in P pixels.
+        albedo: Albedo of each pixel, shape (3, P).
+
+    Returns:
+        Groups of equal pixels. None if the groups would save too little time, or
+        if two pixels of a group differ in albedo.
     """
     pixel_count = len(fragments.pixels)
     if pixel_count < FEWEST_SAVED_PIXELS:
         return None
+    # Runs of samples of one face that fill a pixel.
     filling_runs = _indices(fragments.runs.sample_count == fragments.samples**2)
-    pixel = fragments.runs.pixel.index_select(0, filling_runs)
-    face = fragments.runs.face.index_select(0, filling_runs)
-    first_of_face = face.new_full((len(fragments.faces),), pixel_count)
-    first_of_face.scatter_reduce_(0, face, pixel, "amin")
+    filled_pixel = fragments.runs.run_to_pixel.index_select(0, filling_runs)
+    filling_face = fragments.runs.run_to_seen_face.index_select(0, filling_runs)
+    # First of the pixels that each face fills.
+    face_to_first_pixel = filling_face.new_full((len(fragments.faces),), pixel_count)
+    face_to_first_pixel.scatter_reduce_(0, filling_face, filled_pixel, "amin")
+    # First pixel of the group of each pixel. Other pixels are groups of their own.
     all_pixels = torch.arange(pixel_count)
-    first_equal = all_pixels.index_copy(0, pixel, first_of_face.index_select(0, face))
-    is_first = first_equal == all_pixels
-    first = _indices(is_first)
-    saved = pixel_count - len(first)
-    if saved < FEWEST_SAVED_PIXELS or 2 * saved < pixel_count:
+    pixel_to_first_pixel = all_pixels.index_copy(
+        0, filled_pixel, face_to_first_pixel.index_select(0, filling_face)
+    )
+    is_first = pixel_to_first_pixel == all_pixels
+    first_pixel = _indices(is_first)
+    saved_count = pixel_count - len(first_pixel)
+    if saved_count < FEWEST_SAVED_PIXELS or 2 * saved_count < pixel_count:
         return None
-    if not torch.equal(albedo, albedo.index_select(1, first_equal)):
+    if not torch.equal(albedo, albedo.index_select(1, pixel_to_first_pixel)):
         return None
-    position_in_first = is_first.cumsum(0) - 1
-    return DistinctPixels(first, position_in_first.index_select(0, first_equal))
+    # Number of the group that begins with each first pixel.
+    group_of_first_pixel = is_first.cumsum(0) - 1
+    return DistinctPixels(
+        first_pixel=first_pixel,
+        pixel_to_group=group_of_first_pixel.index_select(0, pixel_to_first_pixel),
+    )
 
 
-def _indices(is_chosen: Tensor) -> Tensor:
-    """Return the indices at which a mask (N,) is true.
+def _indices(mask: Tensor) -> Tensor:
+    """Return the indices of the entries of a mask that are true.
 
-    NumPy takes a quarter of the time of torch.
+    NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
+
+    Args:
+        mask: Mask, shape (N,).
+
+    Returns:
+        Ascending indices, int64.
     """
-    return torch.from_numpy(np.flatnonzero(is_chosen.numpy()))
+    return torch.from_numpy(np.flatnonzero(mask.numpy()))
 
 
 def _row_starts(counts: Tensor) -> Tensor:
-    """Return the first entry of each of N rows and the end of the last one, shape (N + 1,).
+    """Compute where the entries of each row begin, if the entries of all rows are concatenated.
 
-    `counts` (N,) is the number of entries of each row.
+    For example, rows with 2 and 3 entries give 0, 2, 5.
+
+    Args:
+        counts: Number of entries of each of N rows, shape (N,).
+
+    Returns:
+        First entry of each row, and the number of all entries, shape (N + 1,).
     """
     starts = counts.new_zeros(len(counts) + 1)
     torch.cumsum(counts, 0, out=starts[1:])
     return starts
 
 
-def _row_sums(weight: Tensor, value_of_entry: Tensor, row_starts: Tensor, values: Tensor) -> Tensor:
-    """Return N weighted sums of rows of values, shape (N, K).
+def _weighted_row_sums(
+    weights: Tensor, entry_to_value: Tensor, entry_starts: Tensor, values: Tensor
+) -> Tensor:
+    """Compute N weighted sums of rows of a matrix.
+
+    Sum i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1. An
+    entry is a weight and a row of the matrix.
 
     Args:
-        weight: Weight of each entry, shape (E,).
-        value_of_entry: Row of `values` that each entry weights, shape (E,).
-        row_starts: First entry of each sum and the end of the last one, up to a
-            common offset, shape (N + 1,).
-        values: The values, shape (M, K).
+        weights: Weight of each of E entries, shape (E,).
+        entry_to_value: Index of the row of `values` of each entry, shape (E,).
+        entry_starts: First entry of each sum, and the end of the last sum,
+            shape (N + 1,). They may start at another number than 0.
+        values: Matrix, shape (M, K).
+
+    Returns:
+        Sums, shape (N, K).
     """
-    # The weights are a sparse matrix (N, M) in compressed rows.
-    columns = value_of_entry.int().numpy()
-    starts = (row_starts - row_starts[0]).int().numpy()
-    shape = (len(row_starts) - 1, len(values))
-    matrix = csr_array((weight.numpy(), columns, starts), shape=shape)
-    return torch.from_numpy(matrix @ values.numpy())
+    # The weights are a sparse matrix (N, M), in compressed rows.
+    columns = entry_to_value.int().numpy()
+    starts = (entry_starts - entry_starts[0]).int().numpy()
+    shape = (len(entry_starts) - 1, len(values))
+    weight_matrix = csr_array((weights.numpy(), columns, starts), shape=shape)
+    return torch.from_numpy(weight_matrix @ values.numpy())
 
 
-def _face_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pixel, the seen face and the weight of each run of samples of one face.
+def _run_weights(fragments: Fragments, albedo: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the weight of each run of samples, which show the same face, in its pixel.
 
-    The shapes for R runs are (R,), (R,) and (R, C).
+    Args:
+        fragments: The S covered samples of a view, which form R runs.
+        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
+            in a single channel.
+
+    Returns:
+        For each run, its pixel, shape (R,), its seen face, shape (R,), and its
+        weight, shape (R, C).
     """
     if albedo is not None:
         return fragments.merge(albedo)
     runs = fragments.runs
     weights = runs.sample_count.double() / fragments.samples**2
-    return runs.pixel, runs.face, weights[:, None]
+    return runs.run_to_pixel, runs.run_to_seen_face, weights[:, None]
 
 
 def _sample_weights(fragments: Fragments, albedo: Tensor | None) -> Tensor:
-    """Return the weight (S, C) of each sample in its pixel."""
+    """Compute the weight of each sample in the mean of its pixel.
+
+    Args:
+        fragments: The S covered samples of a view.
+        albedo: Linear albedo at the samples, shape (S, C). None uses the albedo 1
+            in a single channel.
+
+    Returns:
+        Albedo divided by the number of samples of a pixel, shape (S, C).
+    """
     if albedo is None:
-        albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.pixel), 1)
+        albedo = torch.ones(1, 1, dtype=torch.float64).expand(len(fragments.sample_to_pixel), 1)
     return albedo / fragments.samples**2
 
 
 def _glossy_box_filter(
     surface: Surface, gloss: SampleGloss, albedo: Tensor, basis: Harmonics, dtype: torch.dtype
 ) -> Tensor:
-    """Return the transfer (channels, K, P) of a glossy surface under an open sky.
+    """Compute the transfer of a glossy surface under an open sky.
 
-    `albedo` (S, C) is given at the samples. K counts all coefficients of the
-    basis. If C is 1, a second channel holds the white light of gloss. Otherwise
-    this white light is added to all channels.
+    Args:
+        surface: Normals at the S samples of a view, in P pixels.
+        gloss: Gloss at the samples.
+        albedo: Linear albedo at the samples, shape (S, 3). Or ones of shape
+            (S, 1), if all colors share a channel.
+        basis: SH basis with K functions.
+        dtype: Data type of the result.
+
+    Returns:
+        Radiance per unit of each of the K coefficients, shape (3, K, P), or
+        (2, K, P) if all colors share a channel. The second channel is then
+        specular reflection with the color of the light, such as that of
+        dielectrics. With 3 channels, this reflection is added to each channel.
     """
     fragments = surface.fragments
     color_count = albedo.shape[1]
     channel_count = 2 if color_count == 1 else color_count
-    filtered = torch.zeros(channel_count, basis.size, len(fragments.pixels), dtype=dtype)
-    # The white light of gloss is added to these channels.
+    transfer = torch.zeros(channel_count, basis.size, len(fragments.pixels), dtype=dtype)
+    # Channels to which reflection with the color of the light is added.
     white_channels = 1 if color_count == 1 else slice(None)
     weights = albedo / fragments.samples**2
     diffuse_degree = min(basis.degree, harmonics.DIFFUSE_DEGREE)
-    pixels_at_once = max(1, GLOSSY // (basis.size * fragments.samples**2))
-    for block in _blocks(fragments.pixel, filtered, pixels_at_once):
+    pixels_per_block = max(1, GLOSSY // (basis.size * fragments.samples**2))
+    for block in _blocks(fragments.sample_to_pixel, transfer, pixels_per_block):
         normals = surface.normals[block.samples]
         to_camera = at_samples(surface.toward, block.samples)
         block_gloss = gloss.at(block.samples)
+        # Metals multiply the `colored` reflection by the albedo.
         colored, white, frame = block_gloss.transfer(normals, to_camera, basis.degree)
-        diffuse = _diffuse_rows(block_gloss, normals, to_camera, diffuse_degree)
-        for channel, weight in zip(block.filtered, weights[block.samples].T, strict=False):
+        diffuse = _diffuse_transfer(block_gloss, normals, to_camera, diffuse_degree)
+        # If all colors share a channel, zip stops before the second channel.
+        for channel, weight in zip(block.transfer, weights[block.samples].T, strict=False):
             channel[: diffuse.shape[1]] = block.sum_by_pixel(diffuse * weight[:, None]).to(dtype)
             if colored is not None:
                 channel += frame.to_world(block.sum_by_pixel((colored * weight).T))
-        shine = frame.to_world(block.sum_by_pixel(white.T)) / fragments.samples**2
-        block.filtered[white_channels] += shine
-    return filtered
+        white_sums = frame.to_world(block.sum_by_pixel(white.T)) / fragments.samples**2
+        block.transfer[white_channels] += white_sums
+    return transfer
 
 
-def _diffuse_rows(gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int) -> Tensor:
-    """Return the diffuse radiance of samples per unit of albedo and of each coefficient.
+def _diffuse_transfer(
+    gloss: SampleGloss, normals: Tensor, to_camera: Tensor, degree: int
+) -> Tensor:
+    """Compute the diffuse radiance of S samples below a coat, for an albedo of 1.
 
-    The shape is (S, K) for unit normals (S, 3) and K coefficients of environment
-    light. The light passes the coat of gloss twice.
+    The light passes the coat when it enters the diffuse layer, and when it leaves.
+
+    Args:
+        gloss: Gloss at the samples.
+        normals: Unit normals, shape (S, 3).
+        to_camera: Unit vectors to the camera, shape (S, 3) or (1, 3).
+        degree: Degree of the light, which has K coefficients.
+
+    Returns:
+        Radiance per unit of each coefficient, shape (S, K).
     """
+    # Irradiance below the coat, shape (S, K).
     entering = harmonics.basis(normals, degree) * gloss.entering_bands(degree).T
     return entering * gloss.diffuse(normals, to_camera)[:, None]
 
 
 class _Block(NamedTuple):
-    """Some neighboring pixels of a view with their samples.
+    """B neighboring pixels of a view, with their S samples.
 
     Attributes:
-        samples: The samples of the pixels.
-        pixel: Pixel of each sample, counted from the first pixel of the block,
-            shape (S,).
-        filtered: Part of the transfer to fill, shape (channels, K, P).
+        samples: Slice of the samples of the view that lie in these pixels.
+        sample_to_pixel: Pixel of each of these samples, counted from the first
+            pixel of the block, shape (S,).
+        transfer: View of the part of the transfer that belongs to these pixels,
+            in C channels for K coefficients, shape (C, K, B).
     """
 
     samples: slice
-    pixel: Tensor
-    filtered: Tensor
+    sample_to_pixel: Tensor
+    transfer: Tensor
 
     def sum_by_pixel(self, rows: Tensor) -> Tensor:
-        """Return the sums (K, P) over the samples of each pixel, of rows (S, K)."""
-        zeros = rows.new_zeros(self.filtered.shape[2], rows.shape[1])
-        return zeros.index_add_(0, self.pixel, rows).T
+        """Add up the values of the samples of each pixel.
+
+        Args:
+            rows: K values for each sample, shape (S, K).
+
+        Returns:
+            Sums, shape (K, B).
+        """
+        zeros = rows.new_zeros(self.transfer.shape[2], rows.shape[1])
+        return zeros.index_add_(0, self.sample_to_pixel, rows).T
 
 
-def _blocks(pixel: Tensor, filtered: Tensor, size: int) -> Iterator[_Block]:
-    """Yield blocks of pixels, given the pixel of each sample and the transfer (channels, K, P)."""
+def _blocks(sample_to_pixel: Tensor, transfer: Tensor, size: int) -> Iterator[_Block]:
+    """Split the P pixels of a view into blocks of neighboring pixels.
+
+    Args:
+        sample_to_pixel: Pixel of each of the S samples of the view, ascending,
+            shape (S,).
+        transfer: Transfer of the view, in C channels for K coefficients,
+            shape (C, K, P).
+        size: Number of pixels of a block.
+
+    Yields:
+        Next block, with a view of its part of the transfer.
+    """
     first_sample = 0
-    for first in range(0, filtered.shape[-1], size):
-        last_sample = int(torch.searchsorted(pixel, first + size))
-        samples = slice(first_sample, last_sample)
-        yield _Block(samples, pixel[samples] - first, filtered[..., first : first + size])
-        first_sample = last_sample
+    for first_pixel in range(0, transfer.shape[-1], size):
+        end_sample = int(torch.searchsorted(sample_to_pixel, first_pixel + size))
+        samples = slice(first_sample, end_sample)
+        yield _Block(
+            samples=samples,
+            sample_to_pixel=sample_to_pixel[samples] - first_pixel,
+            transfer=transfer[..., first_pixel : first_pixel + size],
+        )
+        first_sample = end_sample

@@ -119,11 +119,11 @@ class Patches:
             corners=torch.from_numpy(pieces.faces)[sample_to_piece],
             facing=torch.from_numpy(facing[sample_to_side]),
             outlines=areas.new_tensor(AROUND_CENTER).expand(len(sample_to_piece), 3, 2),
-            pixel=sample_to_patch,
+            sample_to_pixel=sample_to_patch,
             # `faces` has one entry per sample, so sample i shows entry i.
-            face=torch.arange(len(sample_to_piece)),
+            sample_to_seen_face=torch.arange(len(sample_to_piece)),
             # All samples lie at the only sample position of the image.
-            sample=torch.zeros_like(sample_to_piece),
+            sample_numbers=torch.zeros_like(sample_to_piece),
         )
         smallest = torch.finfo(areas.dtype).tiny
         fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
@@ -144,7 +144,7 @@ class Patches:
             Means that are weighted with the areas of the pieces, shape (N, D).
         """
         patch_sums = values.new_zeros(len(self.view.pixels), values.shape[1])
-        return patch_sums.index_add_(0, self.view.pixel, values * self.fractions)
+        return patch_sums.index_add_(0, self.view.sample_to_pixel, values * self.fractions)
 
     def weights_by_patch(self, hits: RayHits, directions: Tensor, weights: Tensor) -> csr_matrix:
         """Add up the weights of the rays of each pixel that hit the same patch.

@@ -89,7 +89,7 @@ class Surface:
 
         The normal points to the side of the face that the camera sees.
         """
-        sample_to_seen_face = self.fragments.face
+        sample_to_seen_face = self.fragments.sample_to_seen_face
         return self.face_planes[sample_to_seen_face]
 
     @cached_property
@@ -204,7 +204,7 @@ class Rays:
             return
         plane_normals = surface.planes
         # The samples of a pixel follow each other.
-        sample_count = fragments.pixel.bincount(minlength=len(fragments.pixels))
+        sample_count = fragments.sample_to_pixel.bincount(minlength=len(fragments.pixels))
         first_sample = sample_count.cumsum(0) - sample_count
         solid_angle = 4 * math.pi / len(directions)
         pixels_per_block = max(1, BLOCK // len(directions))
@@ -299,9 +299,9 @@ class Rays:
         is_below_a_vertex = highest - height_of_face > self.offset
         cosine_of_normals = (surface.normals * surface.planes).sum(1)
         is_bent = cosine_of_normals < 1 - 2 * BENT
-        sample_to_seen_face = fragments.face
+        sample_to_seen_face = fragments.sample_to_seen_face
         casts_rays = is_below_a_vertex[sample_to_seen_face] | is_bent
-        sample_to_pixel = fragments.pixel
+        sample_to_pixel = fragments.sample_to_pixel
         return sample_to_pixel[casts_rays].unique()
 
     def first_hit(

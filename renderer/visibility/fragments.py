@@ -39,14 +39,15 @@ class Runs(NamedTuple):
     The runs are in the order of their samples.
 
     Attributes:
-        pixel: Index into `Fragments.pixels` of each run, ascending, int64,
+        run_to_pixel: Index into `Fragments.pixels` of each run, ascending, int64,
             shape (R,).
-        face: Index into `Fragments.faces` of each run, int64, shape (R,).
+        run_to_seen_face: Index into `Fragments.faces` of each run, int64,
+            shape (R,).
         sample_count: Number of samples in each run, int64, shape (R,).
     """
 
-    pixel: Tensor
-    face: Tensor
+    run_to_pixel: Tensor
+    run_to_seen_face: Tensor
     sample_count: Tensor
 
 
@@ -72,13 +73,13 @@ class Fragments:
         outlines: Positions (x, y) of the three corners of each seen face in the
             image, float64, shape (G, 3, 2). x points to the right and y up, and
             the image is [-1, 1] in x and y.
-        pixel: Index into `pixels` of the pixel of each sample, int64,
+        sample_to_pixel: Index into `pixels` of the pixel of each sample, int64,
             shape (S,).
-        face: Index into `faces` of the face that each sample shows, int64,
-            shape (S,).
-        sample: Number of each sample among all samples of the image, covered or
-            not, int64, shape (S,). The samples are numbered pixel by pixel, and
-            row by row within a pixel.
+        sample_to_seen_face: Index into `faces` of the face that each sample
+            shows, int64, shape (S,).
+        sample_numbers: Number of each sample among all samples of the image,
+            covered or not, int64, shape (S,). The samples are numbered pixel by
+            pixel, and row by row within a pixel.
         depths: Depths of the corners of seen faces (see `Camera.depths`),
             float64, shape (G, 3). None without perspective.
         camera: Camera of the view. None if the samples come from no camera.
@@ -92,9 +93,9 @@ class Fragments:
     corners: Tensor
     facing: Tensor
     outlines: Tensor
-    pixel: Tensor
-    face: Tensor
-    sample: Tensor
+    sample_to_pixel: Tensor
+    sample_to_seen_face: Tensor
+    sample_numbers: Tensor
     depths: Tensor | None = None
     camera: Camera | None = None
 
@@ -136,10 +137,10 @@ class Fragments:
         # first corner is (x₀, y₀). Shape (6, G).
         face_values = torch.cat([outlines[:, 0], edges_by_area.flatten(0, 1)])
         reciprocal_depths = None if self.depths is None else self.depths.T.reciprocal()
-        weights = face_values.new_empty(3, len(self.face))
+        weights = face_values.new_empty(3, len(self.sample_to_seen_face))
         # Each block holds up to BLOCK samples. Writing to `weight` fills `weights`.
         for weight, sample_to_seen_face, position in _blocks(
-            weights, self.face, self.positions().T
+            weights, self.sample_to_seen_face, self.positions().T
         ):
             # gather takes a third of the time of index_select.
             values_at_samples = face_values.gather(
@@ -167,7 +168,7 @@ class Fragments:
         """
         # Integers are divided as floating-point numbers, which takes a tenth of the
         # time.
-        pixel_index, number_in_pixel = _divide(self.sample.double(), self.samples**2)
+        pixel_index, number_in_pixel = _divide(self.sample_numbers.double(), self.samples**2)
         pixel_row, pixel_column = _divide(pixel_index, self.size)
         row_in_pixel, column_in_pixel = _divide(number_in_pixel, self.samples)
         # Row and column among all samples of the image.
@@ -188,19 +189,19 @@ class Fragments:
         # Row-major index in the finer image of each cell. The axes are the row of a
         # pixel, the row in the pixel, the column of a pixel and the column in the
         # pixel, shape (size, s, size, s).
-        cells = torch.arange(resolution**2, device=self.sample.device)
+        cells = torch.arange(resolution**2, device=self.sample_numbers.device)
         cells = cells.view(self.size, self.samples, self.size, -1)
-        # `sample` numbers the cells pixel by pixel, so both pixel axes come first.
+        # `sample_numbers` counts the cells pixel by pixel, so both pixel axes come first.
         cells_by_pixel = cells.transpose(1, 2).flatten()
-        finer_pixels = cells_by_pixel.index_select(0, self.sample)
+        finer_pixels = cells_by_pixel.index_select(0, self.sample_numbers)
         finer = replace(
             self,
             size=resolution,
             samples=1,
             pixels=finer_pixels,
             coverage=self.coverage.new_ones(len(finer_pixels)),
-            pixel=torch.arange(len(finer_pixels), device=finer_pixels.device),
-            sample=finer_pixels,
+            sample_to_pixel=torch.arange(len(finer_pixels), device=finer_pixels.device),
+            sample_numbers=finer_pixels,
         )
         return self._share_weights(finer, slice(None))
 
@@ -213,13 +214,13 @@ class Fragments:
             samples: Indices of the N samples to keep, shape (N,).
 
         Returns:
-            Copy whose `pixel`, `face` and `sample` have N entries.
+            Copy whose tensors of shape (S,) have N entries.
         """
         selected = replace(
             self,
-            pixel=self.pixel.index_select(0, samples),
-            face=self.face.index_select(0, samples),
-            sample=self.sample.index_select(0, samples),
+            sample_to_pixel=self.sample_to_pixel.index_select(0, samples),
+            sample_to_seen_face=self.sample_to_seen_face.index_select(0, samples),
+            sample_numbers=self.sample_numbers.index_select(0, samples),
         )
         return self._share_weights(selected, samples)
 
@@ -253,7 +254,7 @@ class Fragments:
             s = `samples`. Row 0 is at the top.
         """
         image = values.new_full((self.size**2 * self.samples**2,), empty)
-        image.index_copy_(0, self.sample, values)
+        image.index_copy_(0, self.sample_numbers, values)
         # The axes are the row and column of a pixel, and the row and column in the
         # pixel. They become (row, row in pixel, column, column in pixel).
         by_pixel = image.view(self.size, self.size, self.samples, self.samples)
@@ -274,7 +275,7 @@ class Fragments:
         # The axes (row, row in pixel, column, column in pixel) become the row and
         # column of a pixel, and the row and column in the pixel.
         by_row = image.view(self.size, self.samples, self.size, self.samples)
-        return by_row.transpose(1, 2).flatten().index_select(0, self.sample)
+        return by_row.transpose(1, 2).flatten().index_select(0, self.sample_numbers)
 
     def interpolate(self, corners: Tensor) -> Tensor:
         """Interpolate values of face corners at the S samples.
@@ -290,7 +291,7 @@ class Fragments:
         """
         # Shape (3 · D, G), with the D values of the first corner first.
         corner_rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
-        return _Interpolation.apply(corner_rows, self.face, self.barycentric.T).T
+        return _Interpolation.apply(corner_rows, self.sample_to_seen_face, self.barycentric.T).T
 
     def distribute(self, values: Tensor) -> Tensor:
         """Add values at samples to the three corners of the faces that the samples show.
@@ -306,7 +307,9 @@ class Fragments:
             shape (G, 3, D).
         """
         corner_rows_shape = (3 * values.shape[1], len(self.faces))
-        corner_rows = _distribute(values.T, self.face, self.barycentric.T, corner_rows_shape)
+        corner_rows = _distribute(
+            values.T, self.sample_to_seen_face, self.barycentric.T, corner_rows_shape
+        )
         # Shape (3 · D, G), then (3, D, G), then (G, 3, D).
         return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
 
@@ -327,9 +330,9 @@ class Fragments:
               number of samples in a pixel, shape (R, C). It is differentiable
               with respect to `albedo`.
         """
-        if self.samples == 1 or len(self.pixel) == 0:
+        if self.samples == 1 or len(self.sample_to_pixel) == 0:
             # Each sample is a run of its own.
-            return self.pixel, self.face, albedo
+            return self.sample_to_pixel, self.sample_to_seen_face, albedo
         runs = self.runs
         samples_per_run = runs.sample_count.cpu().numpy()
         # NumPy's repeat takes a quarter of the time of torch's.
@@ -339,22 +342,24 @@ class Fragments:
         albedo_of_runs = zeros.index_add(
             1, torch.from_numpy(sample_to_run).to(albedo.device), scaled_albedo
         )
-        return runs.pixel, runs.face, albedo_of_runs.T
+        return runs.run_to_pixel, runs.run_to_seen_face, albedo_of_runs.T
 
     @cached_property
     def runs(self) -> Runs:
         """Runs of neighboring samples that show the same face in the same pixel."""
-        # A run starts where the pixel or the face differs from that of the sample
-        # before. The additional last entry marks the end of the last run.
-        is_start = torch.ones(len(self.pixel) + 1, dtype=torch.bool, device=self.pixel.device)
-        torch.ne(self.pixel[1:], self.pixel[:-1], out=is_start[1:-1])
-        is_start[1:-1] |= self.face[1:] != self.face[:-1]
+        # A run starts at each sample whose pixel or face differs from the sample before
+        # it. The additional last entry marks the end of the last run.
+        pixel = self.sample_to_pixel
+        seen_face = self.sample_to_seen_face
+        is_start = torch.ones(len(pixel) + 1, dtype=torch.bool, device=pixel.device)
+        torch.ne(pixel[1:], pixel[:-1], out=is_start[1:-1])
+        is_start[1:-1] |= seen_face[1:] != seen_face[:-1]
         # NumPy's flatnonzero takes a quarter of the time of torch's nonzero.
         start_indices = np.flatnonzero(is_start.cpu().numpy())
-        starts = torch.from_numpy(start_indices).to(self.pixel.device)
+        starts = torch.from_numpy(start_indices).to(pixel.device)
         return Runs(
-            pixel=self.pixel.index_select(0, starts[:-1]),
-            face=self.face.index_select(0, starts[:-1]),
+            run_to_pixel=pixel.index_select(0, starts[:-1]),
+            run_to_seen_face=seen_face.index_select(0, starts[:-1]),
             sample_count=starts.diff(),
         )
 
@@ -598,9 +603,9 @@ def _fragments_of_view(
         corners=torch.from_numpy(corners).T,
         facing=torch.from_numpy(np.where(is_seen_from_behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        pixel=torch.from_numpy(covered.sample_to_pixel),
-        face=torch.from_numpy(sample_to_seen_face),
-        sample=torch.from_numpy(covered_samples),
+        sample_to_pixel=torch.from_numpy(covered.sample_to_pixel),
+        sample_to_seen_face=torch.from_numpy(sample_to_seen_face),
+        sample_numbers=torch.from_numpy(covered_samples),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
         camera=camera,
     )
@@ -651,7 +656,7 @@ def _compact(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
         - the G distinct values, ascending, shape (G,);
         - the index of each value among the distinct values, shape (S,).
     """
-    # Both lookups below would convert the values, so convert them once.
+    # Two lookups below would convert the values, so they are converted once here.
     values = values.astype(np.intp)
     is_present = np.zeros(limit, dtype=bool)
     is_present[values] = True

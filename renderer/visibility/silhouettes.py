@@ -122,7 +122,9 @@ def moving_outlines(
           the E uncovered pixels, shape (3, P + E).
     """
     positions, nearness = camera.homogeneous(vertices.double())
-    sample_indices = torch.arange(len(fragments.sample), dtype=torch.int32, device=vertices.device)
+    sample_indices = torch.arange(
+        len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device
+    )
     # Index of the covered sample at each sample of the image.
     sample_grid = fragments.image_of_samples(sample_indices, NOT_COVERED)
     crossings_on_cpu = _find_crossings(
@@ -238,7 +240,7 @@ class _MovingView:
             Gradient by the homogeneous positions, shape (V, 3).
         """
         fragments = self.fragments
-        upstream_at_samples = upstream.index_select(1, fragments.pixel)
+        upstream_at_samples = upstream.index_select(1, fragments.sample_to_pixel)
         # Radiance times upstream gradient, summed over the channels, shape (S,).
         weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
         weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
@@ -466,7 +468,7 @@ def _find_crossings(
     # rounded as in the rasterizers.
     places = to_fixed_point(points, len(sample_grid))[0] / SUBSAMPLES
     ends = _silhouette_edges(places, faces)
-    if len(fragments.face) == 0:
+    if len(fragments.sample_to_seen_face) == 0:
         # A mesh outside of the image has no visible silhouettes.
         ends = ends[:, :0]
     start = places[:, ends[0]]
@@ -592,7 +594,7 @@ class _Silhouettes:
             Nearness of the face that each sample shows, shape (2, K). It is minus
             infinity for NOT_COVERED.
         """
-        sample_to_seen_face = self.fragments.face.numpy()
+        sample_to_seen_face = self.fragments.sample_to_seen_face.numpy()
         # Vertices of the three corners, shape (2, K, 3). The index -1 (NOT_COVERED)
         # selects an arbitrary face, whose result is replaced at the end.
         corners = self.fragments.corners.numpy()[sample_to_seen_face[samples]]

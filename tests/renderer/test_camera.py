@@ -250,14 +250,16 @@ def test_a_sample_shows_the_face_that_its_ray_meets_first_and_the_point_there(
     mesh = open_torus()
     view = view_of_torus(mesh, name)
     ids = np.full(64 * 64, -1)
-    ids[view.sample] = view.faces[view.face]
+    ids[view.sample_numbers] = view.faces[view.sample_to_seen_face]
     expected, hits = first_hits(mesh, rays(64))
     assert (expected >= 0).sum() > 1000
     assert (ids != expected).sum() <= 4
 
-    is_same = torch.from_numpy(ids == expected)[view.sample]
+    is_same = torch.from_numpy(ids == expected)[view.sample_numbers]
     points = Surface(mesh, view, ImageSettings(64, 1)).points
-    np.testing.assert_allclose(points[is_same], hits[view.sample[is_same]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        points[is_same], hits[view.sample_numbers[is_same]], rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", RASTERIZERS)
@@ -303,7 +305,7 @@ def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
     [view] = build_fragments(corners, faces, [CAMERA], settings, choose("numpy"))
 
     homography = homography_of(CAMERA.project(corners)[:, :2], uvs)
-    homogeneous = np.column_stack([view.positions(), np.ones(len(view.sample))])
+    homogeneous = np.column_stack([view.positions(), np.ones(len(view.sample_numbers))])
     u, v, w = homography @ homogeneous.T
     expected = torch.from_numpy(np.stack([u / w, v / w], axis=1))
     # Samples at the border of the plane are clipped into their face.

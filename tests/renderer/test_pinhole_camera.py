@@ -115,9 +115,9 @@ def test_a_sample_shows_the_point_of_its_own_pixel(name):
     mesh = replace(torus, vertices=torus.vertices + PLACE)
     settings = ImageSettings(SIZE, 1)
     [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose(name))
-    assert len(seen.sample) > 300
+    assert len(seen.sample_numbers) > 300
     points = Surface(mesh, seen, settings).points.numpy()
-    row, column = np.divmod(seen.sample.numpy(), SIZE)
+    row, column = np.divmod(seen.sample_numbers.numpy(), SIZE)
     centers = np.stack([column, row], axis=1) + 0.5
     errors = np.abs(pixels_of(points, view) - centers).max(axis=1)
     # A corner is rounded by up to 1/512 of a sample.

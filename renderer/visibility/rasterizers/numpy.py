@@ -48,16 +48,21 @@ PARTS = 2**13
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Find the nearest face at each sample, as `renderer.visibility.rasterizers` describes.
+    """Find the nearest face at each sample of each view.
+
+    The docstring of the package `renderer.visibility.rasterizers` defines the
+    coordinates and the rounding.
 
     Args:
-        points: Projected vertices, finite, float64, shape (N, V, 3).
+        points: The V vertices, projected to each of N views, finite, float64,
+            shape (N, V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
         resolution: Number R of samples per side.
-        closed: Whether faces that are clockwise in the image are left out.
+        closed: True leaves out faces that are clockwise in the image.
 
     Returns:
-        Index of the face at each sample, or -1, int32, shape (N, R, R).
+        Index of the nearest face at each sample, or -1 without a face, int32,
+        shape (N, R, R).
     """
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
     for view, view_ids in zip(points, ids, strict=True):
@@ -73,7 +78,7 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
         points: Projected vertices, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
         resolution: Number R of samples per side.
-        closed: Whether faces that are clockwise in the image are left out.
+        closed: True leaves out faces that are clockwise in the image.
 
     Returns:
         Keys in row-major order, int64, shape (R²,).

@@ -56,16 +56,21 @@ FLOAT_BYTES = 4
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Find the nearest face at each sample, as `renderer.visibility.rasterizers` describes.
+    """Find the nearest face at each sample of each view.
+
+    The docstring of the package `renderer.visibility.rasterizers` defines the
+    coordinates and the rounding.
 
     Args:
-        points: Projected vertices, finite, float64, shape (N, V, 3).
+        points: The V vertices, projected to each of N views, finite, float64,
+            shape (N, V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
         resolution: Number R of samples per side.
-        closed: Whether faces that are clockwise in the image are left out.
+        closed: True leaves out faces that are clockwise in the image.
 
     Returns:
-        Index of the face at each sample, or -1, int32, shape (N, R, R).
+        Index of the nearest face at each sample, or -1 without a face, int32,
+        shape (N, R, R).
 
     Raises:
         InputError: If there is no EGL device, or if the driver fails or renders

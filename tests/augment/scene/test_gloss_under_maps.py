@@ -175,7 +175,7 @@ def integrated(
         cosine = (part @ light.T).clip(0)
         samples.append((brdf(part, towards, light, roughness, metallic) * cosine) @ power)
     pixels = np.zeros((len(view.pixels), 3))
-    np.add.at(pixels, view.pixel.numpy(), np.concatenate(samples) / 4)  # 2 × 2 samples
+    np.add.at(pixels, view.sample_to_pixel.numpy(), np.concatenate(samples) / 4)  # 2 × 2 samples
     return pixels
 
 

@@ -407,7 +407,9 @@ def reflected_fraction(beam: np.ndarray, gloss: SampleGloss) -> float:
     directions, solid_angles = half_hemisphere()
     views = torch.from_numpy(directions)
     count = len(views)
-    fragments = SimpleNamespace(samples=1, pixel=torch.arange(count), pixels=torch.arange(count))
+    fragments = SimpleNamespace(
+        samples=1, sample_to_pixel=torch.arange(count), pixels=torch.arange(count)
+    )
     surface: Any = SimpleNamespace(
         gloss=gloss,
         normals=UP.expand_as(views),
@@ -720,7 +722,7 @@ class GlossyView:
     def start(self) -> dict[str, Tensor]:
         """Return a value of each parameter."""
         face_count = len(self.mesh.faces)
-        sample_count = len(self.view.face)
+        sample_count = len(self.view.sample_to_seen_face)
         shapes = {
             "lamp": (1, 3),
             "albedo": (sample_count, 3),

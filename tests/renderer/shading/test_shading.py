@@ -304,7 +304,7 @@ def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surfac
     right, up, back = scene.camera.axes()
     in_plane = fragments.positions().numpy() * scene.camera.width / 2 @ np.stack([right, up])
     # The plane of a face with signs n of its octant is n · p = 1.
-    corners = mesh.vertices[fragments.corners[fragments.face]]
+    corners = mesh.vertices[fragments.corners[fragments.sample_to_seen_face]]
     octants = np.sign(corners.sum(axis=1))
     depths = (1 - (octants * in_plane).sum(axis=1)) / (octants @ back)
     points = in_plane + depths[:, None] * back

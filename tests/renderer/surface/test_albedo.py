@@ -214,7 +214,9 @@ def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale, angle
     expected = paint_faces(mesh, fragments, encoding, albedo_scale, added)
     found = surface_albedo(painted, fragments, encoding) * new_albedo_scale
     error = (found - expected).abs().amax(1)
-    is_untextured = torch.from_numpy(mesh.texture_ids < 0)[fragments.faces][fragments.face]
+    is_untextured = torch.from_numpy(mesh.texture_ids < 0)[fragments.faces][
+        fragments.sample_to_seen_face
+    ]
     assert is_untextured.any()
     assert not is_untextured.all()
     assert error[is_untextured].max() < 1e-6

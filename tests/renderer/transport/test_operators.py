@@ -134,9 +134,9 @@ def test_most_pixels_of_large_faces_are_multiplied_once():
     columns = operator.transfer[0].T
     distinct_columns = len(columns.unique(dim=0))
     mixed_count = int((operator.coverage < 1).sum())
-    assert distinct_columns <= len(operator.distinct.first) < len(operator.pixels) / 4
-    assert mixed_count < len(operator.distinct.first)
-    repeated = columns[operator.distinct.first][operator.distinct.source]
+    assert distinct_columns <= len(operator.distinct.first_pixel) < len(operator.pixels) / 4
+    assert mixed_count < len(operator.distinct.first_pixel)
+    repeated = columns[operator.distinct.first_pixel][operator.distinct.pixel_to_group]
     assert torch.equal(repeated, columns)
 
 

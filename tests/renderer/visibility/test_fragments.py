@@ -83,10 +83,10 @@ def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera
     pixels, counts = np.unique(pixel, return_counts=True)
     np.testing.assert_array_equal(fragments.pixels, pixels)
     np.testing.assert_array_equal(fragments.coverage, counts / samples**2)
-    np.testing.assert_array_equal(fragments.pixels[fragments.pixel], pixel)
+    np.testing.assert_array_equal(fragments.pixels[fragments.sample_to_pixel], pixel)
 
     face = [sample.face for sample in expected]
-    np.testing.assert_array_equal(fragments.faces[fragments.face], face)
+    np.testing.assert_array_equal(fragments.faces[fragments.sample_to_seen_face], face)
 
     positions = [[sample.x, sample.y] for sample in expected]
     np.testing.assert_allclose(fragments.positions(), positions, rtol=0, atol=2 * EPS)
@@ -124,7 +124,7 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
     outside_count = 0
     samples = zip(
         fragments.barycentric,
-        fragments.face,
+        fragments.sample_to_seen_face,
         fragments.positions(),
         strict=True,
     )
@@ -174,7 +174,7 @@ def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(
     assert (culled.facing == 1).all()
     # A face that is seen from behind can be as near as its neighbor along
     # silhouettes only.
-    differs = culled.faces[culled.face] != whole.faces[whole.face]
+    differs = culled.faces[culled.sample_to_seen_face] != whole.faces[whole.sample_to_seen_face]
     assert differs.double().mean() < 0.01
 
 
@@ -186,5 +186,7 @@ def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
     inside = fragments_of(mesh, settings, camera, closed=True)
     assert (inside.facing == -1).any()
     whole = fragments_of(mesh, settings, camera)
-    assert torch.equal(inside.sample, whole.sample)
-    assert torch.equal(inside.faces[inside.face], whole.faces[whole.face])
+    assert torch.equal(inside.sample_numbers, whole.sample_numbers)
+    assert torch.equal(
+        inside.faces[inside.sample_to_seen_face], whole.faces[whole.sample_to_seen_face]
+    )
