@@ -36,8 +36,10 @@ from train.report.summary import RunSummary
 from train.runs.run_config import read_json
 from train.settings import published
 
-# Networks that are scored, by their names for `benchmarks.splits.load`.
+# Networks on which `choose` scores the settings, by their names for `benchmarks.splits.load`.
 NETWORKS = ("efficientnet_lite0", "pretrained/best")
+# Networks in the table of `test`. pretrained/best is pretrained/none after hardening.
+TESTED = ("efficientnet_lite0", "pretrained/none", "pretrained/best")
 # Values of each setting that `choose` tries.
 CANDIDATES = {
     "white_balance": (0.0, 0.25, 0.5, 1.0),
@@ -205,7 +207,7 @@ def test(options: argparse.Namespace) -> None:
         options: Parsed command line.
     """
     rows = []
-    for name in NETWORKS:
+    for name in TESTED:
         network = load(name, SIZE)
         for part in PARTS:
             folder = options.renders / TEST / part
