@@ -333,6 +333,9 @@ class TrainSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        if self.init_from == "":
+            remedy = "give a run folder, or torchvision:NAME with weights=FILE"
+            raise InputError(f"init_from is not set: {remedy}", "init_from")
         super().__post_init__()
         if (self.distillation_weight or self.soup or self.eval_mode) and not self.init_from:
             needed = "distillation_weight, soup and eval_mode need a network to begin with"

@@ -32,7 +32,7 @@ def test_every_experiment_takes_other_data(experiment):
 
 @pytest.mark.parametrize("experiment", ["harden", "best", "classifier", "photographs"])
 def test_an_experiment_that_fine_tunes_asks_for_the_initial_network(experiment):
-    with pytest.raises(InputError, match=r"^train\.init_from is empty"):
+    with pytest.raises(InputError, match=r"^train\.init_from is not set"):
         train_command.read([f"experiment={experiment}", *OTHER_DATA])
 
 

@@ -203,6 +203,19 @@ def selected_file(run: Path) -> Path | None:
     return None
 
 
+def is_state_dict(path: Path) -> bool:
+    """Return whether a file has weights alone, as `torch.save(network.state_dict())` writes it."""
+    if not path.is_file() or path.suffix == ".safetensors":
+        return False
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:  # torch raises many kinds of errors for files of other programs.
+        return False
+    return isinstance(content, dict) and all(
+        isinstance(value, Tensor) for value in content.values()
+    )
+
+
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """Read a run's selected network.
 

@@ -20,7 +20,9 @@ from train.data.sets import HELD_OUT, DataSet
 from train.networks import CLASSIFIER, describe
 from train.runs.saved_networks import (
     NORMALIZE_LIGHT,
+    RUN,
     is_classifier,
+    is_state_dict,
     load_selected,
     of_one_architecture,
     plain_weights,
@@ -128,6 +130,13 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return None
     if is_classifier(name):
         return _classifier(settings, name)
+    source = Path(name.removeprefix(RUN))
+    if is_state_dict(source):
+        example = f"train.init_from=torchvision:resnet50 weights={source}"
+        fault = f"train.init_from={name} contains weights without their network"
+        raise InputError(
+            f"{fault}: give its architecture and the weights, as in {example}", "train.init_from"
+        )
     if settings.weights is not None:
         given = f"weights={settings.weights} is not for train.init_from={name}"
         raise InputError(f"{given}, which has its own: leave it out", "weights")
@@ -135,7 +144,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         f"train.init_from={name}", as_facts(settings.classes, None, settings.normalization)
     )
     with keyed(run="train.init_from"):
-        path, state = load_selected(Path(name))
+        path, state = load_selected(source)
     return Initial(path, state["architecture"], plain_weights(state))
 
 

@@ -221,6 +221,13 @@ def test_settings_that_do_not_fit_the_network_are_refused_in_one_sentence(tuned,
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_of_weights_alone_is_no_network_to_start_from(tuned, tmp_path):
+    weights = tmp_path / "weights.pt"
+    torch.save({"layer.weight": torch.zeros(1)}, weights)
+    with pytest.raises(InputError, match=f"torchvision:resnet50 weights={weights}$"):
+        tuned("unlabelled", "augment=random", f"train.init_from={weights}", "weights=null")
+
+
 def test_photographs_that_stay_on_disk_train_and_score_a_network_of_their_size(tuned):
     folder, scores = tuned("unlabelled", "data.size=96", "data.workers=2", ALMOST_FIXED)
     assert read_metrics(folder)[0]["train/loss"] < 1e-6
