@@ -439,7 +439,14 @@ class PerspectiveCamera(Camera):
         return np.stack([x, y, normalized_depth]).T
 
     def _w_and_nearness(self, back: Tensor) -> tuple[Tensor, Tensor]:
-        """Return w, which is the depth divided by the distance, and 1 / w as nearness."""
+        """Return w, which is the depth divided by the distance, and 1 / w as nearness.
+
+        Args:
+            back: Coordinate of points along the axis to the camera, shape (V,).
+
+        Returns:
+            w and nearness of `Camera.homogeneous`, shape (V,) each.
+        """
         w = 1 - back / self.distance
         return w, 1 / w
 

@@ -673,6 +673,7 @@ class _Descent:
     """
 
     def __init__(self, target: _Target, camera: Camera):
+        """Keep the target and the first camera. `run` starts the descent."""
         self._target = target
         self._first_camera = camera
 

@@ -80,7 +80,8 @@ def composite(
             encoding is unknown.
     """
     batch_shape = radiance.shape[:-2]
-    # Shape (..., 3, size²).
+    # One background for each image, with the pixels along the last axis,
+    # shape (..., 3, size²).
     background_pixels = background.expand(*batch_shape, *background.shape[-3:]).flatten(-2)
     behind = background_pixels.index_select(-1, pixels)
     covered = tonemap(radiance, coverage[None], behind, encoding)

@@ -217,6 +217,7 @@ class Settings:
     """
 
     def __post_init__(self) -> None:
+        """Check the type, the range and the choices of each field."""
         for name, hint, facts in _checked_fields(type(self)):  # type: ignore[arg-type]  # types are hashable
             value = getattr(self, name)
             if facts.checks_type and not _fits(value, hint):
@@ -483,6 +484,7 @@ class ImageSettings(Settings):
     )
 
     def __post_init__(self) -> None:
+        """Check the fields, and the number of samples in a row of the image."""
         super().__post_init__()
         require_range("size × samples", self.size * self.samples, 1, MAX_SAMPLES_PER_ROW)
 

@@ -689,6 +689,6 @@ def _interpolate_quarters(corner_values: np.ndarray) -> np.ndarray:
     """
     # The EDGES select two corners each, shape (F, 3 edges, 2 ends, D).
     midpoint_values = corner_values[:, EDGES].mean(axis=2)
-    # Shape (F, 6, D).
+    # D values at the three corners and the three midpoints of each face, shape (F, 6, D).
     point_values = np.concatenate([corner_values, midpoint_values], axis=1)
     return point_values[:, _QUARTERS].reshape(-1, *corner_values.shape[1:])

@@ -130,7 +130,7 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Returns:
         Outward vectors, shape (F, 3).
     """
-    # Shape (3 components, 3 corners, F).
+    # Positions of the corners of F faces, shape (3 components, 3 corners, F).
     corners = vertices.T.take(faces.T, axis=1)
     # The edges a and b lead from the first corner to the second and the third
     # corner. Their cross product is written out, because np.cross is several times
@@ -221,7 +221,7 @@ class _AreaVectors(torch.autograd.Function):
             Area vectors, float64, shape (3, F).
         """
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double()
-        # Shape (3 components, 3 corners, F).
+        # Positions of the corners of F faces, shape (3 components, 3 corners, F).
         corners = corners.unflatten(1, (3, -1))
         # Both edges of each face, shape (3 components, 2 edges, F).
         edges = corners[:, 1:] - corners[:, :1]

@@ -544,6 +544,7 @@ def paint(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, *paints: Ar
     """
     # Color of each vertex in each part, shape (parts, V, 3).
     colors = np.stack([np.broadcast_to(color, vertices.shape) for color in paints])
+    # Color of the part of a face at each of its corners, shape (F, 3 corners, 3).
     corner_colors = colors.astype(np.float32)[part[:, None], faces]
     return replace(Mesh.plain(vertices, faces), corner_colors=corner_colors)
 

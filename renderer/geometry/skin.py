@@ -73,9 +73,10 @@ class Skin:
             matrices.append(matrix)
         # Multiplying by a matrix minus the identity gives a displacement.
         identity = torch.eye(4, 3).to(rotations)
-        # Shape (4 J, 3).
+        # The matrices of the J joints below each other, shape (4 J, 3).
         displacement_matrix = (torch.stack(matrices) - identity).flatten(0, 1)
-        # Shape (V, 4 J). The product sums over the joints.
+        # `carried` of the V vertices with the joints along one axis, shape (V, 4 J). The
+        # product below therefore sums over the joints.
         carried = torch.from_numpy(self.carried).to(rotations).flatten(1)
         return carried @ displacement_matrix
 

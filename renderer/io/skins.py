@@ -183,6 +183,7 @@ class _Skeleton:
     """
 
     def __init__(self, tree: dict[str, Any], scene: trimesh.Scene) -> None:
+        """Collect the joints of all skins of a file. A joint comes after its parent."""
         nodes = tree["nodes"]
         self._joint_nodes = {joint for skin in tree["skins"] for joint in skin["joints"]}
         self._parent_node = {}

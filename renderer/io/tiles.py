@@ -29,9 +29,9 @@ LINE_HEIGHT = 16
 
 # Color of the background of a sheet.
 PAPER = "white"
-# Color of titles and of the first line of a caption.
+# Color of titles and of the first line of a caption, nearly black.
 INK = "#1a1a1a"
-# Color of the other lines of a caption.
+# Color of the second and further lines of a caption, a gray.
 FAINT = "#6b6b6b"
 
 

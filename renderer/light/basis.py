@@ -148,6 +148,7 @@ class Harmonics(Basis):
     allow_negative: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check the degree."""
         require_whole("degree", self.degree)
         require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
 
@@ -156,10 +157,12 @@ class Harmonics(Basis):
 
     @property
     def size(self) -> int:
+        """Number of harmonics."""
         return (self.degree + 1) ** 2
 
     @property
     def environment(self) -> EnvironmentPart:
+        """These harmonics, with the rows of all coefficients."""
         return EnvironmentPart(slice(0, self.size), self)
 
     @property
@@ -340,6 +343,7 @@ class LocalBasis(Basis):
 
     @property
     def local_lights(self) -> list[LocalPart]:
+        """This light as the only entry, with the rows of all coefficients."""
         return [LocalPart(slice(0, self.size), self)]
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
@@ -375,6 +379,7 @@ class SumBasis(Basis):
     parts: tuple[Harmonics | LocalBasis, ...]
 
     def __post_init__(self) -> None:
+        """Check that at most one part is an environment light."""
         if sum(part.environment is not None for part in self.parts) > 1:
             raise InputError(
                 "parts has two environment lights: use one, and add the coefficients of both"
@@ -385,10 +390,12 @@ class SumBasis(Basis):
 
     @property
     def size(self) -> int:
+        """Number of functions of all parts together."""
         return sum(part.size for part in self.parts)
 
     @property
     def environment(self) -> EnvironmentPart | None:
+        """Environment light of the part that has one, with its rows in the coefficients."""
         for rows, part in self._rows_of_parts():
             if part.environment is not None:
                 return EnvironmentPart(rows, part.environment.basis)
@@ -396,6 +403,7 @@ class SumBasis(Basis):
 
     @property
     def local_lights(self) -> list[LocalPart]:
+        """Lamps and projectors of all parts, with their rows in the coefficients."""
         return [
             LocalPart(rows, light.basis)
             for rows, part in self._rows_of_parts()

@@ -501,7 +501,7 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
     z, z_weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
     radius = np.sqrt(1 - z**2)[:, None]
-    # Shape (values of z, azimuths).
+    # Coordinates of all pairs of a value of z and an azimuth, shape (values of z, azimuths).
     x = radius * np.cos(azimuth)
     y = radius * np.sin(azimuth)
     directions = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], axis=-1)
@@ -636,6 +636,7 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
         raise InputError("rotation is not orthonormal: give an orthonormal matrix (3, 3)")
 
     def rotated_radiance(directions: Tensor) -> Tensor:
+        """Compute the radiance of the rotated light from directions, shape (..., 3)."""
         # Row vectors times R are the vectors Rᵀ ω.
         turned_back = directions @ rotation.to(directions)
         return basis(turned_back, degree) @ coefficients.to(directions)

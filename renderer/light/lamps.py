@@ -62,12 +62,14 @@ class Lamps(LocalBasis):
     is_movable = True
 
     def __post_init__(self) -> None:
+        """Check the fields, and convert the positions to tuples of numbers."""
         positions = as_array("positions", self.positions)
         if positions.shape[1:] != (3,) or not all(map(any, positions)):
             raise InputError(
                 f"lamps.positions={self.positions} are no positions of lamps: give [x, y, z] for "
                 "each lamp, and no lamp at the origin"
             )
+        # A frozen dataclass can only be changed in this way.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
         require_field_types(self, "positions")
         for value in chain(*self.positions):
@@ -116,6 +118,7 @@ class Lamps(LocalBasis):
 
     @property
     def size(self) -> int:
+        """Number of lamps."""
         return len(self.positions)
 
     def source_positions(self) -> Tensor:
@@ -152,7 +155,7 @@ class Lamps(LocalBasis):
         set_of_point = torch.arange(len(points), device=points.device) % len(sources)
         # First find the paths that arrive at the front of a surface, without a graph.
         with torch.no_grad():
-            # Shape (S, L, RAYS, 3).
+            # Vector from each of S points to each source point, shape (S, L, RAYS, 3).
             to_lamp = sources[set_of_point] - points[:, None, None]
             irradiance = self._irradiance(to_lamp, normals[:, None, None], positions[:, None])
             point, lamp, ray = torch.nonzero(irradiance > 0, as_tuple=True)

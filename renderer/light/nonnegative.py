@@ -147,7 +147,7 @@ def project_nonnegative(lights: Tensor) -> Tensor:
     # Equal channels, such as those of a gray light, are projected once.
     channels, row_to_channel = np.unique(_by_channel(lights)[:, 0], axis=0, return_inverse=True)
     dip_to_channel, _ = _find_dips(channels, _dark_radiance(channels), _LOWEST_NODES)
-    # One row of K coefficients for each channel of each light.
+    # One row of K coefficients for each channel of each light, shape (lights · 3, K).
     rows = lights.detach().mT.flatten(0, -2).clone()
     for channel in np.unique(dip_to_channel):
         projected = torch.from_numpy(_project_with_mean(channels[channel])).to(rows)
@@ -331,6 +331,7 @@ class _Program:
         center: Array | float = 0.0,
         radius: float = np.inf,
     ):
+        """Solve the program without directions: the result fulfills the bounds or the ball."""
         self.original = original
         self._center = center
         self._radius = radius
@@ -621,7 +622,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
     for power in range(degree):
         powers[power + 1] = powers[power] * directions.T
     x_powers, y_powers, z_powers = powers.transpose(1, 0, 2)
-    # Shape (J, D).
+    # Values of the J monomials at the D directions, shape (J, D).
     monomials = x_powers[exponents[0]] * y_powers[exponents[1]] * z_powers[exponents[2]]
     return monomials.T @ coefficients
 

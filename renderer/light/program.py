@@ -95,6 +95,7 @@ class _Iterate:
     """
 
     def __init__(self, sides: Array, least: Array):
+        """Start with y = 0, and with positive slacks and multipliers."""
         self._sides = sides
         self._least = least
         self.y = np.zeros(sides.shape[1])
@@ -140,7 +141,7 @@ class _Iterate:
         predicted_multipliers = self.multipliers + predictor_length * predictor.multipliers
         predicted_gap = predicted_slacks @ predicted_multipliers
 
-        # Target of all products for the corrector.
+        # The corrector moves each product of a slack and its multiplier toward this value.
         centering = (predicted_gap / self.gap) ** 3 * self.gap / len(self._sides)
         second_order = predictor.slacks * predictor.multipliers
         corrector = self._newton_change(factor, products + second_order - centering)

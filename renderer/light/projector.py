@@ -59,6 +59,7 @@ class Projector(LocalBasis):
     name = "projector"
 
     def __post_init__(self) -> None:
+        """Check the fields."""
         require_field_types(self)
         require_range("projector.pixels", self.pixels, 1, MAX_PIXELS)
         require_range("projector.distance", self.distance, 2, MAX_SCALE)
@@ -100,6 +101,7 @@ class Projector(LocalBasis):
 
     @property
     def size(self) -> int:
+        """Number of pixels of the projector."""
         return self.pixels**2
 
     def picture(self, coefficients: Tensor) -> Tensor:

@@ -123,7 +123,8 @@ class _FittedSky(torch.autograd.Function):
         turbidity_factors = torch.stack([turbidity_values, turbidity_values, turbidity_slopes])
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
         polynomials = fit.to(products).flatten(2).flatten(0, 1)
-        # Shape (3, ..., 28 coefficients with m ≥ 0, 3 colors).
+        # Coefficients of the 28 harmonics with m ≥ 0, and their two derivatives, for a sun at
+        # the azimuth 0, shape (3, ..., 28, 3 colors).
         at_azimuth_zero = (products.flatten(-2) @ polynomials).unflatten(-1, (-1, 3))
         # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         orders = _ORDERS.to(azimuth)

@@ -355,21 +355,45 @@ class Angle(NamedTuple):
 
 
 def _rotate_about_x(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the x-axis, from y toward z."""
+    """Rotate vectors about the x-axis, from y toward z.
+
+    Args:
+        vectors: Components x, y and z of S vectors, shape (S,) each.
+        angle: Sine and cosine of the angle of rotation.
+
+    Returns:
+        Components of the rotated vectors, shape (S,) each.
+    """
     x, y, z = vectors
     rotated_y, rotated_z = _rotate_in_plane(y, z, angle)
     return x, rotated_y, rotated_z
 
 
 def _rotate_about_y(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the y-axis, from z toward x."""
+    """Rotate vectors about the y-axis, from z toward x.
+
+    Args:
+        vectors: Components x, y and z of S vectors, shape (S,) each.
+        angle: Sine and cosine of the angle of rotation.
+
+    Returns:
+        Components of the rotated vectors, shape (S,) each.
+    """
     x, y, z = vectors
     rotated_z, rotated_x = _rotate_in_plane(z, x, angle)
     return rotated_x, y, rotated_z
 
 
 def _rotate_about_z(vectors: Components, angle: Angle) -> Components:
-    """Rotate vectors about the z-axis, from x toward y."""
+    """Rotate vectors about the z-axis, from x toward y.
+
+    Args:
+        vectors: Components x, y and z of S vectors, shape (S,) each.
+        angle: Sine and cosine of the angle of rotation.
+
+    Returns:
+        Components of the rotated vectors, shape (S,) each.
+    """
     x, y, z = vectors
     rotated_x, rotated_y = _rotate_in_plane(x, y, angle)
     return rotated_x, rotated_y, z
@@ -536,16 +560,19 @@ def lobe_functions(cosine: Tensor, roughness: Tensor, degree: int, terms: Sequen
         return cosine_coefficients @ _cosine_polynomials(cosine, cosine_coefficients.shape[-1])
     function_count = (degree + 1) * (degree + 2) // 2
     table = _table(max(degree, USUAL)).to(cosine)
-    # Shape (T, M, NODES, P).
+    # Coefficients of the products of NODES polynomials in the roughness and P polynomials in
+    # the cosine, for T terms and M functions, shape (T, M, NODES, P).
     coefficients = table[term_indices, :function_count]
-    # Shapes (P, S) and (NODES, S), or (NODES, 1) for one roughness.
+    # Values of the polynomials in the cosine, shape (P, S), and of those in the roughness,
+    # shape (NODES, S), or (NODES, 1) for one roughness.
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = along(roughness)
     if has_one_roughness:
-        # Shape (T, M, P).
+        # The sum over the polynomials in the roughness leaves polynomials in the cosine,
+        # shape (T, M, P).
         cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
         return cosine_coefficients @ in_cosine
-    # Shape (NODES, P, S).
+    # Products of a polynomial in the roughness and one in the cosine, shape (NODES, P, S).
     products = in_roughness[:, None] * in_cosine
     # The shapes (T, M, NODES · P) and (NODES · P, S) give (T, M, S).
     return coefficients.flatten(2) @ products.flatten(0, 1)
@@ -597,9 +624,9 @@ def coat_bands(degree: int) -> Tensor:
     # The nodes of the quadrature lie in [-1, 1], and N cosines in [0, 1].
     cosine = (torch.from_numpy(nodes) + 1) / 2
     coefficients = _coat_coefficients()
-    # Shape (NODES, N).
+    # E(μ) μ in the polynomials of the roughness, at the N cosines μ, shape (NODES, N).
     reflected = coefficients @ _cosine_polynomials(cosine, coefficients.shape[1]) * cosine
-    # Shape (N, degree + 1).
+    # Legendre polynomials P_l at the N cosines, shape (N, degree + 1).
     legendre = torch.from_numpy(np.polynomial.legendre.legvander(cosine.numpy(), degree))
     return math.pi * (legendre.T * torch.from_numpy(weights)) @ reflected.T
 
@@ -738,7 +765,7 @@ def _table(degree: int) -> Tensor:
     """
     roughness_arguments = _chebyshev_nodes(NODES)
     roughnesses = _argument_to_roughness(roughness_arguments)
-    # Shape (NODES, 3, M, P).
+    # One fit for each of NODES values of the roughness, shape (NODES, 3, M, P).
     fits = torch.stack([_fit(degree, float(roughness)) for roughness in roughnesses])
     # There are as many polynomials in the roughness as values of the roughness,
     # so the polynomials pass through all values. This matrix maps values to
@@ -793,12 +820,13 @@ def _fit(degree: int, roughness: float) -> Tensor:
     # multiplied by it too. A division by it would be a quotient of small
     # numbers near θ = 0.
     orders = torch.tensor([m for l in range(fitted_degree + 1) for m in range(l + 1)])
-    # Shape (M', N, 1).
+    # sin^m θ for each pair (l, m) and each cosine, shape (M', N, 1).
     sine_powers = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2)
-    # Shape (M', N, P).
+    # The P polynomials times sin^m θ, which the least squares combine, shape (M', N, P).
     fitted_functions = sine_powers * _chebyshev(cosine_arguments, polynomial_count).T
     fit = torch.linalg.lstsq(fitted_functions, integrals, rcond=1e-9, driver="gelsd")
-    # Shape (3, M', P), and then (3, M, P).
+    # Coefficients up to the fitted degree, shape (3, M', P). Zeros up to `degree` follow at
+    # the end of the function, so that the result has the shape (3, M, P).
     coefficients = fit.solution.permute(2, 0, 1)
     function_count = (degree + 1) * (degree + 2) // 2
     missing_count = function_count - len(orders)
@@ -848,9 +876,9 @@ def _lobe_integrals(cosines: Tensor, roughness: Tensor, degree: int) -> Tensor:
     light_z = (light * toward[:, None]).sum(2)
     harmonic_indices = [l * (l + 1) + m for l in range(degree + 1) for m in range(l + 1)]
     light_in_sample = torch.stack([light_x, light_y, light_z])
-    # Shape (M, N, Q).
+    # The M harmonics at the Q directions of light of each camera direction, shape (M, N, Q).
     harmonics = torch.stack(select_rows(light_in_sample, harmonic_indices))
-    # Shape (3, M, N).
+    # Sum over the Q directions of light, shape (3, M, N).
     return torch.einsum("tnq,mnq->tmn", weighted_lobe, harmonics)
 
 
@@ -859,8 +887,8 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
 
     The half vectors have azimuths φ and polar angles θ_h. The substitution
     tan θ_h = α tan ψ spreads the lobe evenly over ψ. Nodes are equally spaced
-    in φ and are those of Gauss-Legendre quadrature in ψ. Half vectors with
-    larger polar angles are left out, because the light that they mirror to the
+    in φ and are those of Gauss-Legendre quadrature in ψ. Half vectors at
+    large polar angles are left out, because the light that they mirror to the
     camera would come from below the horizon. The lobe is symmetric about the
     plane of n and v, so azimuths on one side of this plane are enough.
 
@@ -888,9 +916,9 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
     # this angle plus twice the polar angle. Shape (N, azimuths).
     camera_lean = torch.atan2(sines[:, None] * azimuth.cos(), cosines[:, None])
     largest_polar = (math.pi / 2 - camera_lean) / 2
-    # Shape (N, 1, azimuths).
+    # The value of ψ at the largest polar angle, shape (N, 1, azimuths).
     largest_psi = (largest_polar.tan() / alpha).atan()[:, None]
-    # Shape (N, nodes, azimuths).
+    # The nodes in [-1, 1] are moved to [0, largest ψ], shape (N, nodes, azimuths).
     psi = largest_psi * (node + 1) / 2
     polar = (alpha * psi.tan()).atan()
     x = polar.sin() * azimuth.cos()

@@ -98,7 +98,7 @@ def radiance(
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
         shade = irradiance(smooth_normals(fragments, normals.to(wide)).T, light, wide)
-    # Shape (3, runs or S).
+    # Reflected radiance of each run or sample in three channels, shape (3, runs or S).
     reflected = shade * weights.T
     # With one sample per pixel, each sample is a pixel, and no sum is needed.
     if fragments.samples > 1:
@@ -263,9 +263,9 @@ class _HarmonicSum(torch.autograd.Function):
         for power in range(max(degree - 1, 1), degree + 1):
             # Gradients of the harmonics in monomials, shape (3 axes, monomials, K).
             harmonic_slopes = _slopes(power).to(coefficients)[..., : len(coefficients)]
-            # Shape (3 axes, monomials, C).
+            # Gradient of the sum in monomials, for the C channels, shape (3 axes, monomials, C).
             slope_coefficients = harmonic_slopes @ coefficients[: harmonic_slopes.shape[2]]
-            # Shape (3 axes, C, N).
+            # Gradient of the sum at the N normals, shape (3 axes, C, N).
             polynomial_slope = slope_coefficients.mT @ harmonics.monomials(normals, power - 1)
             value = value + (polynomial_slope * normals[:, None]).sum(0) / power
             slope = slope + polynomial_slope
@@ -424,15 +424,18 @@ class _IrradiancePolynomial:
             light: SH coefficients, shape (K, 3).
         """
         light_degree = math.isqrt(len(light)) - 1
-        # Shape (3 axes, J + 1, coefficients that reach a diffuse surface).
+        # Slopes per unit of each coefficient that reaches a diffuse surface. The J entries of
+        # ∇p come first, and then the one entry of a, shape (3 axes, J + 1, coefficients).
         slopes_per_light = _slopes_per_light(light_degree, light.dtype, light.device)
-        # Shape (3 axes, J + 1, 3 colors), then (3 axes · 3 colors, J + 1).
+        # Slopes of this light, shape (3 axes, J + 1, 3 colors). They are reordered to the
+        # shape (3 axes · 3 colors, J + 1).
         slopes_by_axis = slopes_per_light @ light[: slopes_per_light.shape[2]]
         slopes = slopes_by_axis.mT.flatten(0, 1)
         self.degree = _even_degree(light_degree)
         self.even_slope = slopes[:, :-1]
         self.linear_slope = slopes[:, -1:]
-        # Band 0 is A_0 U_0 Y_0 = π U_0 / √(4π).
+        # Irradiance from band 0: the factor π of a Lambertian surface, times the coefficient
+        # U_0, times the harmonic Y_0 = 1 / √(4π).
         self.constant = light[:1].T * math.sqrt(math.pi / 4)
 
     def evaluate(self, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -588,8 +591,8 @@ def smooth_normals(fragments: Fragments, normals: Float[Tensor, "V 3"]) -> Float
         Interpolated normals, which are not of unit length, shape (S, 3).
     """
     corner_vertices = fragments.corners.T.flatten()
-    # Shape (3 components, 3 corners, G seen faces).
+    # Vertex normals at the corners of the seen faces, shape (3 components, 3 corners, G).
     corner_normals = normals.T.index_select(1, corner_vertices).unflatten(1, (3, -1))
     facing_normals = corner_normals * fragments.facing.T.to(normals)
-    # Shape (G seen faces, 3 corners, 3 components).
+    # `interpolate` takes the shape (G, 3 corners, 3 components).
     return fragments.interpolate(facing_normals.permute(2, 1, 0))

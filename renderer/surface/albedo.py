@@ -65,7 +65,7 @@ class Texture:
         require_bounded(texture=values)
         height = values.shape[0]
         width = values.shape[1]
-        # Shape (C, H · W).
+        # All texels of each channel in row-major order, shape (C, H · W).
         channels = values.flatten(0, 1).T
         look_up = partial(torch.index_select, channels, 1)
         return Texture(height=height, width=width, look_up=look_up)
@@ -136,7 +136,7 @@ def sample_textures(textures: Sequence[Texture], mesh: Mesh, fragments: Fragment
         uvs = sample_uvs.index_select(1, samples)
         values_by_texture.append(interpolate_texture(texture, uvs))
     textured_samples = torch.cat(samples_by_texture)
-    # Shape (C, number of textured samples).
+    # Values of the samples in the order of `textured_samples`, shape (C, textured samples).
     textured_values = torch.cat(values_by_texture, 1)
     # Samples of faces with NO_TEXTURE keep the value 1.
     channel_count = len(textured_values)

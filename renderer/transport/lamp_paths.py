@@ -105,7 +105,7 @@ class SparseTransfer(NamedTuple):
         light_row = image * lights.shape[1] + self.function
         contributions = lights.flatten(0, 1).index_select(0, light_row) * self.weight
         radiance_row = image * pixel_count + self.pixel
-        # Shape (B · P, 3).
+        # Radiance of the P pixels of all B images, shape (B · P, 3).
         zeros = contributions.new_zeros(len(lights) * pixel_count, 3)
         radiance = zeros.index_add(0, radiance_row, contributions)
         return radiance.unflatten(0, (len(lights), pixel_count)).mT
@@ -299,6 +299,7 @@ class LocalLightView:
         vertices: Tensor | None = None,
         gloss: Gloss | None = None,
     ):
+        """Compute the points and normals at the samples. No ray is cast yet."""
         self._rays = rays
         vertices = None if vertices is None else vertices.cpu()
         self._surface = Surface(mesh, fragments.to("cpu"), settings, vertices, gloss)

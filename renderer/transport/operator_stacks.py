@@ -146,7 +146,7 @@ class TransferOperators(Sequence[TransferOperator]):
                 f"lights has shape {tuple(lights.shape)}, but light_per_view=True needs the shape "
                 f"({len(self)}, ..., {first.basis.size}, 3) for {len(self)} views"
             )
-        # Shape (V, ..., coefficients, 3).
+        # Lights of each of the V views, shape (V, ..., coefficients, 3).
         view_lights = lights if light_per_view else lights.expand(len(self), *lights.shape)
         size = first.settings.size
         image_shape = (*view_lights.shape[:-2], COLORS, size, size)
@@ -465,12 +465,12 @@ class OperatorStack:
         used_lights = lights.index_select(1, self._coefficients)
         light_grid = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
         light_grid = light_grid.index_copy(0, cell, used_lights)
-        # Shape (shown operators, slots, K, 3).
+        # Lights by operator and slot, shape (shown operators, slots, K, 3).
         light_grid = light_grid.unflatten(0, (len(operators), slot_count))
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]
         albedo = self.albedo if shows_all_operators else self.albedo[operators]
-        # Shape (shown operators · slots, 3, P).
+        # Radiance of the P pixels in each slot, shape (shown operators · slots, 3, P).
         radiance = apply_transfer(light_grid, transfer, albedo).flatten(0, 1)
         if not is_ordered:
             radiance = radiance.index_select(0, cell)

@@ -362,7 +362,7 @@ class TransferOperator:
             shape (..., 3, P).
         """
         dtype = self.transfer.dtype
-        # Shape (..., K, 3).
+        # The K coefficients that have columns in the matrix, shape (..., K, 3).
         used_lights = lights.index_select(-2, self.nonzero)
         # In small images, even a call of `to` that converts nothing takes notable time.
         if lights.dtype != dtype:
@@ -687,7 +687,7 @@ class _Image(torch.autograd.Function):
 
     @staticmethod
     def _backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
-        """Compute the result of `backward`, without a protection against second derivatives."""
+        """Compute the result of `backward`, without the error for second derivatives."""
         gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped)
         return gradient, None, None
 
@@ -736,7 +736,8 @@ def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
         # (..., 3, B, K) times (..., 3, K, P) is (..., 3, B, P).
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     shared, *white = transfer.unbind(-3)
-    # Shape (..., B · 3, K), so that one matrix product does all lights and colors.
+    # Rows for each pair of one of B lights and one of three colors, shape (..., B · 3, K).
+    # One matrix product then computes all lights and colors.
     light_rows = lights.mT.flatten(-3, -2)
     radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
     if white:
@@ -958,7 +959,7 @@ class _OperatorBuilder:
         Args:
             is_glossy: True if the mesh reflects specularly.
         """
-        if self.transport is not None and self.transport.colors:
+        if self.transport is not None and self.transport.has_colored_light:
             return True
         return is_glossy and (self.transport is not None or bool(self.basis.local_lights))
 
@@ -1087,7 +1088,8 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     # Shape (3, S), with contiguous rows.
     sample_albedo = albedo.T
     zeros = sample_albedo.new_zeros(COLORS, len(fragments.pixels))
-    # The last sample of each pixel overwrites the other samples.
+    # The albedo of one sample stands for the pixel. The comparison below shows whether the
+    # other samples of the pixel have the same albedo.
     pixel_albedo = zeros.index_copy(1, fragments.sample_to_pixel, sample_albedo)
     # In float64, gather takes a third of the time of index_select.
     sample_to_pixel = fragments.sample_to_pixel.expand(COLORS, -1)
@@ -1172,7 +1174,8 @@ def _copy_from_faces(fragments: Fragments, face_values: Tensor, dtype: torch.dty
     run_to_pixel, run_to_face, sample_count = fragments.runs
     runs_per_pixel = torch.bincount(run_to_pixel, minlength=len(fragments.pixels))
     first_run = _row_starts(runs_per_pixel)[:-1]
-    # Sums are never -0.0. Adding 0.0 turns -0.0 into 0.0 in copies, too.
+    # A value that is copied from one face may be -0.0, but a sum that starts at 0.0 is never
+    # -0.0. Adding 0.0 turns -0.0 into 0.0, so that copies and sums have the same bits.
     values_by_function = (face_values + 0.0).T.to(dtype).contiguous()
     # First give each pixel the values of the face in its first run, shape (K, P).
     transfer = values_by_function.index_select(1, run_to_face.index_select(0, first_run))

@@ -210,7 +210,7 @@ class Transport:
     coefficients of an SH basis.
 
     Attributes:
-        colors: True if bounced light is colored. The change of the transfer
+        has_colored_light: True if bounced light is colored. The change of the transfer
             then differs between the three color channels.
         rays: Rays among the faces of the mesh.
 
@@ -223,6 +223,7 @@ class Transport:
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
+        """Compute the light that the patches of the mesh send, if light bounces."""
         # Only bounces need patches. With patches, rays hit the pieces of the mesh.
         self._patches = Patches.from_mesh(mesh) if settings.bounces else None
         self.rays = Rays(self._patches.pieces if self._patches else mesh)
@@ -230,12 +231,12 @@ class Transport:
         # Radiance from each of D directions per unit of each of K coefficients,
         # shape (D, K).
         self._sky = basis.radiance(self._directions)
-        self.colors = False
+        self.has_colored_light = False
         if self._patches:
             # Radiance that the N patches send, shape (N, K, 3), or (N, K, 1) if
             # the three channels are equal.
             self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
-            self.colors = self._sent.shape[2] > 1
+            self.has_colored_light = self._sent.shape[2] > 1
 
     def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
         """Compute how shadows and bounces change the transfer of a view.
@@ -279,7 +280,8 @@ class Transport:
                     specular = tinted + white / fragments.samples**2
                     reflectance = reflectance * entering + specular
                 blocked = hits.weight * reflectance
-                # Shape (K, B).
+                # Change of the radiance of B pixels because the mesh blocks light from the sky,
+                # per unit of each of K coefficients, shape (K, B).
                 channel_change[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._patches:
                     received = self._received(self._patches, hits, blocked, channel)
@@ -301,7 +303,7 @@ class Transport:
             light, shape (K, B).
         """
         # Radiance that the patches send, shape (N, K).
-        sent = self._sent[..., channel if self.colors else 0].numpy()
+        sent = self._sent[..., channel if self.has_colored_light else 0].numpy()
         received = patches.weights_by_patch(hits, self._directions, blocked) @ sent
         return torch.from_numpy(received).T
 

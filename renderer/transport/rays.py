@@ -121,7 +121,7 @@ class Surface:
     @cached_property
     def points(self) -> Tensor:
         """Position in world axes of each of the S samples, shape (S, 3)."""
-        # Shape (G, 3 corners, 3 coordinates).
+        # Corners of the G seen faces, shape (G, 3 corners, 3 coordinates).
         corner_positions = self.vertices[self.fragments.corners]
         return self.fragments.interpolate(corner_positions)
 

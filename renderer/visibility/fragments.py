@@ -411,7 +411,8 @@ class _Interpolation(torch.autograd.Function):
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
         # Writing to `value` fills `values`, block by block.
         for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
-            # Shape (3, D, samples of the block).
+            # Values of the three corners of the face at each sample of the block. `unflatten`
+            # gives the shape (3, D, samples of the block).
             at_corners = corner_rows.gather(1, seen_face.expand(len(corner_rows), -1))
             at_corners = at_corners.unflatten(0, (3, -1))
             torch.sum(at_corners.mul_(weight[:, None]), 0, out=value)

@@ -74,6 +74,10 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Compute the smallest key of each sample of one view.
 
+    Each face has one key at a sample that it covers: its depth, and in the low
+    FACE_BITS bits its index. The smallest key therefore belongs to the nearest
+    face.
+
     Args:
         points: Projected vertices, shape (V, 3).
         faces: Vertex indices of the faces, shape (F, 3).
