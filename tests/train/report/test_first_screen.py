@@ -3,11 +3,21 @@
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import pytest
+import torch
 from PIL import Image
 
 from train.data.photographs import Photograph
-from train.evaluation.scores.predictions import PREDICTIONS, Prediction, write_predictions
-from train.report.first_screen import contrasts
+from train.evaluation.scores.metrics import Pooled
+from train.evaluation.scores.predictions import (
+    PREDICTIONS,
+    Prediction,
+    rank_classes,
+    write_predictions,
+)
+from train.report.comparison import Evaluation, pools_of
+from train.report.first_screen import NETWORKS, Compared, compare_networks, contrasts
+from train.report.summary import RunSummary
 
 # Classes of the images, and the classes that two networks predict.
 SHOWN = ("banana", "mug", "mug", "other_cup", "other_cup", "banana")
@@ -38,3 +48,32 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
     # The third image is wrong twice, and the last one is right twice.
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
+
+
+def evaluation(predicted: tuple[str, ...], labels: tuple[str, ...]) -> Evaluation:
+    """Make the evaluation of a network that predicts a class for each of the images."""
+    classes = ("banana", "mug", "spoon")
+    photographs = [
+        Photograph(PurePosixPath(f"{number}.png"), shown, None)
+        for number, shown in enumerate(SHOWN)
+    ]
+    logits = torch.tensor([[float(name == other) for other in classes] for name in predicted])
+    pooled = Pooled(rank_classes(photographs, logits, classes, labels))
+    return Evaluation(RunSummary(Path("run"), "", {}, {}, None), pools_of(pooled))
+
+
+@pytest.mark.parametrize("labels", [LABELS, LABELS[:1]])
+def test_top_1_is_shown_if_several_classes_are_under_study(labels):
+    compared = Compared(
+        label="banana",
+        before=[evaluation(BEFORE, labels)],
+        after=[evaluation(AFTER, labels)],
+        names=("before", "after"),
+        subjects=NETWORKS,
+        place="Here",
+    )
+    screen = compare_networks(compared, {})
+    shown = [number for number in screen.numbers if number.title.startswith("Top-1")]
+    # Both networks lack the class of the cups.
+    expected = [((1 / 2 + 1 / 2) / 2, (2 / 2 + 0 / 2) / 2)] if len(labels) > 1 else []
+    assert [(number.before.value, number.after.value) for number in shown] == expected
