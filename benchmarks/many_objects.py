@@ -32,6 +32,7 @@ from PIL import Image
 from scipy.stats import bootstrap
 
 from augment.classifiers import Classifier
+from augment.photographs.projected_light import relight_photographs
 from benchmarks.splits import adapt_texture_or_material, load
 from renderer.io.images import read_square
 from train.command_settings import LabSettings
@@ -294,21 +295,33 @@ def find_renders(folder: Path) -> list[Renders]:
     return found
 
 
-def predict(network: Classifier, paths: Sequence[Path]) -> list[str]:
-    """Return the class that a network gives each image.
+def read_images(paths: Sequence[Path], size: int) -> torch.Tensor:
+    """Read the central squares of images as bytes.
+
+    Args:
+        paths: Image files.
+        size: Pixels per side.
+
+    Returns:
+        Images, uint8, shape (N, 3, size, size).
+    """
+    images = [read_square(path, size) for path in paths]
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+
+
+def predict(network: Classifier, images: torch.Tensor) -> np.ndarray:
+    """Return the name of the class that a network gives each image.
 
     Args:
         network: The network.
-        paths: Image files.
+        images: Images, uint8, shape (N, 3, size, size).
     """
     predicted = []
-    for start in range(0, len(paths), BATCH):
-        images = [read_square(path, network.size) for path in paths[start : start + BATCH]]
-        pixels = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+    for batch in images.split(BATCH):
         with torch.no_grad():
-            indices = network(pixels / 255).argmax(1)
+            indices = network(batch / 255).argmax(1)
         predicted += [network.classes[index] for index in indices.tolist()]
-    return predicted
+    return np.array(predicted)
 
 
 def interpolate(original: Classifier, trained: Classifier, factor: float) -> Classifier:
@@ -395,35 +408,46 @@ def score(options: argparse.Namespace) -> None:
     rows = []
     for part in find_renders(options.objects / options.split):
         labels = np.array(part.labels)
+        images = read_images(part.paths, options.network_size)
         hits = {
-            name: (np.array(predict(network, part.paths)) == labels).astype(float)
+            name: (predict(network, images) == labels).astype(float)
             for name, network in networks.items()
         }
         rows.append([part.group, part.light, len(labels), *compare(hits, part.setups)])
     title = f"{options.split}: top-1 accuracy (and gain), 95% intervals over setups"
     print(Table(title, ["objects", "light", "images", *networks], rows))
     if options.photographs:
-        print(photograph_table(networks, sorted(options.photographs.iterdir())))
+        paths = sorted(options.photographs.iterdir())
+        print(photograph_table(networks, paths, options.network_size))
 
 
-def photograph_table(networks: Mapping[str, Classifier], paths: Sequence[Path]) -> Table:
-    """Return a table of top-1 accuracy and of agreement with the first network.
+def photograph_table(networks: Mapping[str, Classifier], paths: Sequence[Path], size: int) -> Table:
+    """Return a table of scores on photographs of classes that were not trained on.
+
+    The columns are top-1 accuracy, agreement with the first network, and top-1
+    accuracy on the same photographs in the light of a projector.
 
     Args:
         networks: Networks by name, with the same classes.
         paths: Photographs, each named by the index of its class, such as
             "954_banana.jpg".
+        size: Pixels per side of the images.
     """
     original = next(iter(networks.values()))
     shown = np.array([original.classes[int(path.stem.partition("_")[0])] for path in paths])
-    answers = np.array(predict(original, paths))
+    images = read_images(paths, size)
+    relit = relight_photographs(images)
+    answers = predict(original, images)
     rows = []
     for name, network in networks.items():
-        predicted = np.array(predict(network, paths))
-        accuracy = fraction(int((predicted == shown).sum()), len(paths))
-        agreement = fraction(int((predicted == answers).sum()), len(paths))
-        rows.append([name, format_fraction(accuracy), format_fraction(agreement)])
-    return Table("photographs", ["network", "top-1", "same prediction as the original"], rows)
+        predicted = predict(network, images)
+        is_right = predicted == shown
+        is_same = predicted == answers
+        is_right_relit = predict(network, relit) == shown
+        counts = [int(hits.sum()) for hits in (is_right, is_same, is_right_relit)]
+        rows.append([name, *(format_fraction(fraction(hits, len(paths))) for hits in counts)])
+    header = ["network", "top-1", "same prediction as the original", "top-1 in projected light"]
+    return Table("photographs", header, rows)
 
 
 # ------------------------------------------------------------------------- command

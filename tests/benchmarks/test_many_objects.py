@@ -105,6 +105,6 @@ def test_photographs_count_as_right_by_the_number_in_their_name(tmp_path):
     }
     for name, color in (("0_a", (200, 100, 0)), ("1_b", (200, 100, 0)), ("002_c", (0, 100, 200))):
         Image.new("RGB", (4, 4), color).save(tmp_path / f"{name}.png")
-    table = many_objects.photograph_table(classifiers, sorted(tmp_path.iterdir()))
+    table = many_objects.photograph_table(classifiers, sorted(tmp_path.iterdir()), 4)
     assert [row[1][:6] for row in table.rows] == ["2 of 3", "0 of 3"]
     assert [row[2][:6] for row in table.rows] == ["3 of 3", "0 of 3"]
