@@ -295,8 +295,9 @@ def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and
 ):
     """Each method has 26 poses of two views, within 10° and a tenth of the size.
 
-    The grid has all rotations of -10, 0 and 10° about three axes. Mitsuba's images are
-    misclassified too.
+    The grid has all rotations of -10, 0 and 10° about three axes. All methods are compared
+    without the noise of a camera. If the network is fooled in spite of this noise, it also
+    misclassifies Mitsuba's image.
     """
     pytest.importorskip("mitsuba")
     network = augment.load_classifier("efficientnet_lite0")
@@ -325,8 +326,8 @@ def test_descent_near_the_start_fools_an_imagenet_network_as_often_as_random_and
     rotations = pad(torch.cartesian_prod(signs, signs, signs), (0, 6))
     rotations = rotations[rotations.any(1)]
     on_grid = torch.stack([fools(turn.expand(2, -1)) for turn in rotations]).any(0)
-    assert result.success.sum() == fooled
+    assert result.success_without_noise.sum() == fooled
     assert fooled >= max(at_random.sum(), on_grid.sum())
     lines = augment.save(result, tmp_path, verify=["mitsuba"])
-    successes = [line["versions"]["mitsuba"]["success"] for line in lines]
-    assert successes == result.success.tolist()
+    successes = torch.tensor([line["versions"]["mitsuba"]["success"] for line in lines])
+    assert successes[result.success].all()
