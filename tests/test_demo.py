@@ -30,7 +30,8 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
         check=True,
     )
     lines = done.stdout.splitlines()
-    assert len(lines) <= 15
+    # The result fits on a screen.
+    assert len(lines) <= 20
     page = Path(lines[-1].removeprefix("report: "))
     folder = page.parent
     *_, sheet = re.findall(r"^image: (.*)$", (folder / "train.log").read_text(), re.M)
@@ -38,6 +39,7 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
     before = read_auc(folder / "before")
     after = read_auc(folder)
     assert after > before + 0.05
-    for network, value in [("before hardening", before), ("after hardening", after)]:
-        assert re.search(rf"^\| {network} .*\b{value:.3f}\b", done.stdout, re.M)
+    [auc_row] = re.findall(r"^\| AUC .*$", done.stdout, re.M)
+    printed = re.findall(r"(\d\.\d{3}) \[", auc_row)
+    assert printed == [f"{before:.3f}", f"{after:.3f}"]
     assert "Examples of renders" in page.read_text()
