@@ -394,6 +394,8 @@ def fit_scene(
     options = _RenderOptions(albedo_scale, encoding, normals, rasterizer)
     photograph = photograph.double()
     mask = mask.double()
+    # The search for first cameras uses a small copy of the photograph. The best of these
+    # cameras are refined with the photograph in its full size.
     fine_target = _Target.from_photograph(photograph, mask, mesh, size, options)
     if start is None:
         coarse_size = min(COARSE, size)
@@ -403,6 +405,7 @@ def fit_scene(
         starts = [start]
     refined_cameras = [fine_target.refine_camera(camera) for camera in starts]
     _, best_camera = fine_target.rank_cameras(refined_cameras)[0]
+    # Bounces are slow to compute, so only the final light is fitted with bounces.
     target_with_bounces = fine_target._replace(options=replace(options, bounces=bounces))
     return target_with_bounces.fit_final_light(best_camera)
 

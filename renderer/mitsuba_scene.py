@@ -394,6 +394,7 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
         value: Number, flag, string, list of numbers, array or entry of a scene.
     """
     named = {"name": name} if name else {}
+    # Arrays are matrices of transformations. Dictionaries are colors or plugins.
     if isinstance(value, np.ndarray):
         transform = xml.SubElement(parent, "transform", named)
         text = " ".join(f"{entry:.17g}" for entry in value.ravel())

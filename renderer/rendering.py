@@ -141,7 +141,7 @@ def render(
     require_mesh("mesh", mesh)
     per_side = samples_per_side(samples, silhouettes)
     settings = ImageSettings(size, per_side, encoding, normals, shadows, bounces, silhouettes)
-    listed = _listed(cameras)
+    all_cameras = _listed(cameras)
     _require_scale(albedo_scale)
     _require_gloss(gloss)
     require_choice("rasterizer", rasterizer, RASTERIZERS)
@@ -153,25 +153,37 @@ def render(
         raise InputError(
             f"vertices of shape {shape} does not fit the mesh: give {mesh.vertices.shape}"
         )
-    given = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
-    local = [_with_coefficients(member) for member in given]
+    given_lights = as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
+    # Pairs of lamps or a projector with their coefficients.
+    local_lights = [_with_coefficients(local_light) for local_light in given_lights]
     # The images have the dtype and the device of the first light.
     like = torch.zeros(0) if light is None else light
-    if light is None and local:
-        like = local[0][1]
-    split = SplitLight(light, [(basis, values.to(like)) for basis, values in local])
+    if light is None and local_lights:
+        like = local_lights[0][1]
+    split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
+    # Visible faces and blocked rays are found without gradients, so these steps take a mesh
+    # and cameras with plain numbers.
     moved = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
-    fixed = [camera.fixed() for camera in listed]
-    chosen = _choose(rasterizer)
-    views = build_fragments(moved.vertices, mesh.faces, fixed, settings, chosen, closed=mesh.closed)
+    fixed_cameras = [camera.fixed() for camera in all_cameras]
+    views = build_fragments(
+        moved.vertices,
+        mesh.faces,
+        fixed_cameras,
+        settings,
+        _choose(rasterizer),
+        closed=mesh.closed,
+    )
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
+    # Shadows on environment light and bounces. None if neither is rendered.
     transport = build_transport(moved, settings, albedo_scale, split.basis)
     rays = transport.rays if transport else Rays(moved)
     images = []
-    for camera, view, behind in zip(listed, views, backgrounds, strict=True):
+    for camera, view, behind in zip(all_cameras, views, backgrounds, strict=True):
         fragments = view.to(like.device)
+        # Function of the albedo and of the environment light that computes how shadows and
+        # bounces change the radiance.
         indirect = None
         if transport:
             surface = Surface(moved, view, settings, given_gloss=gloss)

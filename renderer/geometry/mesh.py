@@ -381,6 +381,9 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
     Args:
         meshes: One or more meshes.
+
+    Returns:
+        Mesh with all vertices, faces and textures.
     """
     # The indices of vertices and textures of a mesh grow by the numbers of vertices
     # and textures of the meshes before it.

@@ -349,11 +349,12 @@ def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     v, v_error = _difference(c, a)
     ux, uy, uz = u
     vx, vy, vz = v
-    # u × v.
+    # Components of u × v, in which the rounding errors of the products are corrected.
     x = _difference_of_products(uy, vz, uz, vy)
     y = _difference_of_products(uz, vx, ux, vz)
     z = _difference_of_products(ux, vy, uy, vx)
-    # The product of both errors is negligible.
+    # The rounding errors of u and v change the product by u × v_error and u_error × v.
+    # The product u_error × v_error is negligible.
     return torch.stack([x, y, z]) + (_cross(u, v_error) + _cross(u_error, v))
 
 

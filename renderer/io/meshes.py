@@ -214,12 +214,14 @@ def _read_parts(
     # trimesh leaves out a glTF image that it cannot read, without a message.
     if sum(len(part.textures) for part in parts.values()) < textured_count:
         raise ValueError("the image of a texture is missing, or cannot be decoded")
+    # A part occurs once for each node of the scene that shows the part.
     placed_parts = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         if name not in parts:
             continue
         if has_skins:
+            # `skinned` returns vertices in the coordinates of the scene.
             placed_parts.append((skinned(parts[name], node, scene, tree), np.eye(4)))
         else:
             placed_parts.append((parts[name], matrix))

@@ -37,15 +37,15 @@ def save_light(
 ) -> None:
     """Write a light to a .json file.
 
-    `read_light` reads the same float32 numbers back, to the bit.
-
-    The pattern of a projector is also written as a .png file of eight bits
-    beside it, in which white is the projector's power.
+    `read_light` reads the same float32 numbers back, to the bit. The pattern of a
+    projector is also written to an 8-bit .png file with the same name. White in
+    this image is the power of the projector.
 
     Args:
-        path: The .json file.
-        coefficients: Coefficients of the light, RGB, shape (size, 3).
-        basis: The basis of the light. The default is SH of degree 6.
+        path: Path of the .json file.
+        coefficients: RGB coefficients of the light, shape (size, 3), for the
+            `size` functions of the basis.
+        basis: Basis of the light. The default is SH of degree 6.
 
     Raises:
         InputError: If the coefficients have another shape or hold NaN, or the
@@ -87,12 +87,14 @@ def read_light(path: str | Path, *kinds: type[LightBasis]) -> tuple[LightBasis, 
     """Read a light from a .json file.
 
     Args:
-        path: The file, as `save_light` writes it. A file that is only a list of
-            rows [r, g, b] holds SH coefficients.
-        kinds: The classes of bases that the file may describe.
+        path: Path of a file of `save_light`. A file that only has a list of rows
+            [r, g, b] holds SH coefficients.
+        kinds: Classes of bases that the file may describe.
 
     Returns:
-        The basis, and its coefficients (size, 3), float32.
+        A tuple of
+        - the basis;
+        - the coefficients of its `size` functions, float32, shape (size, 3).
 
     Raises:
         InputError: If the file is missing or does not describe such a light.

@@ -133,6 +133,7 @@ def load_light(
         raise InputError(
             f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or {files}"
         )
+    # A higher degree appends zeros. A lower degree may only remove zeros.
     size = len(coefficients) if degree is None else Harmonics(degree).size
     if coefficients[size:].any():
         raise InputError(

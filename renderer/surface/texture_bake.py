@@ -75,6 +75,7 @@ def with_added_albedo(
     """
     corner_albedo = decode(torch.from_numpy(mesh.corner_colors), encoding)
     eight_bit_values = torch.arange(CHANNEL_VALUES, dtype=torch.float32) / (CHANNEL_VALUES - 1)
+    # Linear value of each of the 256 values of an 8-bit texel.
     linear_values = decode(eight_bit_values, encoding)
     painter = _Painter(
         encoding=encoding,

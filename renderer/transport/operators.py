@@ -922,6 +922,9 @@ class _OperatorBuilder:
         fragments = surface.fragments
         pixel_count = len(fragments.pixels)
         is_glossy = surface.gloss is not None
+        # If all samples of each pixel have the same albedo, the three colors can share one
+        # channel: the transfer is computed for the albedo 1, and the images are multiplied
+        # by the albedo of the pixels.
         pixel_albedo = None
         sample_albedo = None
         if self._needs_three_channels(is_glossy):
@@ -934,6 +937,7 @@ class _OperatorBuilder:
                 sample_albedo = self._surface_albedo(fragments)
                 pixel_albedo = _pixel_albedo(fragments, sample_albedo, self.dtype)
         if pixel_albedo is None:
+            # Three channels contain the albedo of the samples. The pixels get the albedo 1.
             assert sample_albedo is not None
             return _Channels(
                 number=COLORS,

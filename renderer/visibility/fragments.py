@@ -409,7 +409,7 @@ class _Interpolation(torch.autograd.Function):
         ctx.save_for_backward(sample_to_seen_face, weights)
         ctx.corner_rows_shape = corner_rows.shape
         values = corner_rows.new_empty(len(corner_rows) // 3, len(sample_to_seen_face))
-        # Writing to `value` fills `values`, block by block.
+        # `value` is a view of one block of `values`. Writing to `value` fills this block.
         for value, seen_face, weight in _blocks(values, sample_to_seen_face, weights):
             # Values of the three corners of the face at each sample of the block. `unflatten`
             # gives the shape (3, D, samples of the block).

@@ -664,9 +664,12 @@ def _cut_edges(
     first_line = np.ceil(lower).clip(0, resolution).astype(np.int64)
     end_line = np.ceil(upper).clip(0, resolution).astype(np.int64)
     cuts_per_edge = end_line - first_line
+    # There is one entry for each pair of an edge and a line that the edge crosses. The lines
+    # of an edge follow each other, from its first line on.
     edge = np.repeat(np.arange(len(start_across)), cuts_per_edge)
     cuts_before_edge = np.cumsum(cuts_per_edge) - cuts_per_edge
     line = np.arange(len(edge)) - (cuts_before_edge - first_line)[edge]
+    # Fraction of the edge from its start to the cut, and coordinate of the cut along the line.
     fraction = (line - start_across[edge]) / (end_across - start_across)[edge]
     position = start_along[edge] + fraction * (end_along - start_along)[edge]
     next_sample = np.ceil(position).astype(np.int64)

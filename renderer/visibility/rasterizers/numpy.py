@@ -189,7 +189,8 @@ def _cull(triangles: np.ndarray, resolution: int, closed: bool) -> _Drawn:
         Triangles that may cover samples.
     """
     areas = _doubled_areas(triangles)
-    # Columns and rows, shape (2, F).
+    # First column and first row of the samples in the bounding box of each triangle,
+    # shape (2, F).
     first = _next_sample(triangles.min(axis=1)).clip(0, None)
     counts = _next_sample(triangles.max(axis=1)).clip(None, resolution) - first
     # y points down, so the areas of counter-clockwise triangles are negative.

@@ -150,6 +150,7 @@ def _check(context: moderngl.Context) -> None:
     small_triangle = [[-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]
     points = np.array([large_triangle + small_triangle])
     faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
+    # Face at each of 4 × 4 samples. Face 0 is left out, because it is seen from behind.
     expected = [
         [2, 2, 1, 1],
         [2, 1, 1, 1],
