@@ -194,7 +194,13 @@ class Run:
         if self.log and CLASSIFIER in self.trainer.architecture:
             path = self.folder / WEIGHTS
             export(path, self.trainer.selected.network)
-            console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
+            network = "network"
+            name = self.trainer.architecture["name"]
+            if name.startswith(PYTHON):
+                # The weights have their names in the network that the function returns.
+                function = name.removeprefix(PYTHON).replace(":", ".")
+                network = f"{function}()[0]"
+            console.info("%s.load_state_dict(torch.load(%r)) loads the result", network, str(path))
             light = light_settings(self.trainer.selected.network)
             if light is not None:
                 given = json.dumps(asdict(light))
