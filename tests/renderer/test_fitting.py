@@ -109,9 +109,9 @@ def test_a_renders_camera_and_light_are_found_from_a_camera_nearby():
 def test_one_gauss_newton_step_removes_most_of_the_error_of_a_camera_nearby():
     """A step of half the length would leave half of the error."""
     mesh = renderer.normalize(renderer.solid("mushroom"))
-    [image] = renderer.render(mesh, FAR, positive_light("eucalyptus"), 32, 0.0, samples=8)
+    image = renderer.render(mesh, FAR, positive_light("eucalyptus"), 32, 0.0, samples=8)
     options = _RenderOptions(1.0, "linear", "flat", "auto")
-    target = _Target.of(image, coverage_of(mesh, FAR, 32), mesh, 32, options)
+    target = _Target.from_photograph(image, coverage_of(mesh, FAR, 32), mesh, 32, options)
     start = replace(FAR, polar=FAR.polar + 2, azimuth=FAR.azimuth - 2)
     descent = _Descent(target, start)
     polar = math.radians(start.polar)
