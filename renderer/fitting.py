@@ -806,11 +806,11 @@ def _nonnegative_light(matrices: Tensor, right_sides: Tensor, grid: int) -> Tens
     Returns:
         Lights x, shape (49, C).
     """
-    # Matrix R, shape (N, 49).
+    # Matrix R: a light times a row gives the radiance in one of N directions, shape (N, 49).
     radiance_rows = _radiance_rows(grid)
     lights = []
     for matrix, right_side in zip(matrices.numpy(), right_sides.numpy(), strict=True):
-        # L, L⁻¹ w and Gᵀ.
+        # Matrix L, vector L⁻¹ w and matrix Gᵀ of the docstring.
         lower = np.linalg.cholesky(matrix)
         unconstrained = solve_triangular(lower, right_side, lower=True)
         constraints = solve_triangular(lower, radiance_rows.T, lower=True)

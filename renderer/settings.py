@@ -396,6 +396,8 @@ def _fits(value: object, hint: Any) -> bool:
         value: Value to check.
         hint: Type, union of types, or list type such as `list[float]`.
     """
+    # Plain types, such as int, have a function in `_CHECKS`. Any other annotation is a
+    # union, a list or a class.
     check = _CHECKS.get(hint)
     if check is not None:
         return check(value)

@@ -106,6 +106,9 @@ class Basis(ABC):
         Args:
             positions: Positions of the L movable lights in world axes,
                 shape (L, 3).
+
+        Returns:
+            The copy. A basis without movable lights returns itself.
         """
         return self
 

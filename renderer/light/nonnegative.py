@@ -506,12 +506,13 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
     scale = np.linalg.norm(original)
     is_bounded = np.isfinite(low)
     axes = np.eye(size)[is_bounded]
-    # G and h.
+    # Matrix G and vector h of all constraints G d ≥ h: first those of the M directions, then
+    # the lower bounds, and then the upper bounds.
     left_sides = np.concatenate([rows, axes, -axes])
     from_low = (low - original)[is_bounded]
     from_high = (original - high)[is_bounded]
     right_sides = np.concatenate([-rows @ original, from_low, from_high])
-    # E and f.
+    # Matrix E and vector f of the non-negative least squares problem.
     dual_matrix = np.concatenate([left_sides.T, right_sides[None] / scale])
     last_unit_vector = np.eye(size + 1)[size]
     multipliers, _ = nnls(dual_matrix, last_unit_vector)

@@ -515,7 +515,7 @@ def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     """
     products: list[Tensor] = []
     for l in range(math.isqrt(len(coefficients))):
-        # Harmonics of degree l.
+        # Indices of the harmonics of degree l.
         band = slice(l * l, (l + 1) * (l + 1))
         products.append(rotation[band, band].to(coefficients) @ coefficients[band])
     return torch.cat(products)

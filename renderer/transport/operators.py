@@ -1421,10 +1421,10 @@ class _Block(NamedTuple):
         """Add up the values of the samples of each pixel.
 
         Args:
-            rows: K values for each sample, shape (S, K).
+            rows: K values for each of the S samples of this block, shape (S, K).
 
         Returns:
-            Sums, shape (K, B).
+            Sums for the B pixels of this block, shape (K, B).
         """
         zeros = rows.new_zeros(self.transfer.shape[2], rows.shape[1])
         return zeros.index_add_(0, self.sample_to_pixel, rows).T

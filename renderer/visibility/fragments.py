@@ -138,7 +138,8 @@ class Fragments:
         face_values = torch.cat([outlines[:, 0], edges_by_area.flatten(0, 1)])
         reciprocal_depths = None if self.depths is None else self.depths.T.reciprocal()
         weights = face_values.new_empty(3, len(self.sample_to_seen_face))
-        # Each block holds up to BLOCK samples. Writing to `weight` fills `weights`.
+        # `weight` is a view of up to BLOCK columns of `weights`. Writing to `weight` fills
+        # these columns.
         for weight, sample_to_seen_face, position in _blocks(
             weights, self.sample_to_seen_face, self.positions().T
         ):

@@ -113,7 +113,8 @@ def _context() -> Iterator[moderngl.Context]:
         InputError: If there is no EGL device, or if the driver fails or renders
             wrong ids.
     """
-    # See the module docstring.
+    # Triton must be loaded before the driver, because a process that loads Triton second
+    # crashes.
     with suppress(ImportError):
         import triton  # noqa: F401
     import moderngl
