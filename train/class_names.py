@@ -1,11 +1,12 @@
 """Classes as users name them: by name, by index, or by the name of a mesh."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from augment.classifiers.adapter import class_index, nearest
+from augment.settings import ObjectSettings
 from renderer.errors import InputError
 from renderer.geometry.shapes import HARD_NEGATIVES, SOLIDS
 from train.data.photographs import OTHER_PREFIX
@@ -142,6 +143,40 @@ def class_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) -> s
         fault = f"label is not set, and {key} are of the classes {', '.join(sorted(set(found)))}"
         raise InputError(f"{fault}: give the meshes of one class, or label=CLASS", "label")
     return found[0]
+
+
+def require_others(
+    hard_negatives: Mapping[str, ObjectSettings], labels: Sequence[str], classes: Sequence[str]
+) -> None:
+    """Check that no hard negative is of a positive class.
+
+    The class of a mesh without a label is the class that its name tells. If
+    there are several positive classes, a labeled object of one of them is a
+    hard negative for the others.
+
+    Args:
+        hard_negatives: Hard negatives by their keys, as `read_objects` returns
+            them. The label of an object without a class is empty, OTHER, or
+            begins with OTHER_PREFIX.
+        labels: Names of the positive classes.
+        classes: Names of all classes of the network.
+
+    Raises:
+        InputError: If one is of a positive class, or of a class that the
+            network lacks.
+    """
+    for key, item in hard_negatives.items():
+        is_labeled = item.label not in ("", OTHER) and not item.label.startswith(OTHER_PREFIX)
+        if is_labeled:
+            name: str | None = class_name(classes, item.label, f"label of {key}")
+        else:
+            name = class_of_name(name_of_mesh(item.mesh), classes)
+        if name in labels and not (is_labeled and len(labels) > 1):
+            raise InputError(
+                f"{key} is {item.mesh}, which is of the positive class {name}: "
+                "move it to meshes, or remove it",
+                key,
+            )
 
 
 def with_classes_of_meshes(

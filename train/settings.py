@@ -519,24 +519,22 @@ class ExperimentSettings(NetworkSettings):
             raise error.within(key, [error.argument]) from None
 
     @property
-    def objects(self) -> dict[str, ObjectSettings]:
-        """Return the meshes and the hard negatives of the scene by their keys.
+    def hard_negatives(self) -> dict[str, ObjectSettings]:
+        """Return the hard negatives of the scene by their keys. Without a class, it is OTHER."""
+        return read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
 
-        Hard negatives without a class get the class OTHER.
-        """
+    @property
+    def objects(self) -> dict[str, ObjectSettings]:
+        """Return the meshes and the hard negatives of the scene by their keys."""
         labels = label_names(self.label)
         label = labels[0] if len(labels) == 1 else ""
         meshes = read_objects(self.scene.meshes, label, "scene.meshes")
-        negatives = read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
+        negatives = self.hard_negatives
         for key, item in (meshes | negatives).items():
             item.label = item.label or solid_name(item.mesh)
             if not item.label:
                 remedy = f"give {{mesh: {item.mesh}, label: CLASS}}"
                 raise InputError(f"{key} must name its class: {remedy}", key)
-        for key, item in negatives.items():
-            if [item.label] == labels:
-                remedy = "name it in scene.meshes, or leave it out"
-                raise InputError(f"{key} is of the class {item.label}: {remedy}", key)
         named = {item.label for item in (*meshes.values(), *negatives.values())}
         missing = set(labels) - named
         if missing and len(labels) > 1:

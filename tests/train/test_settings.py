@@ -165,8 +165,14 @@ TWO_CLASSES = [
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable"),
         (
             ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
-            "scene.hard_negatives[0] is of the class orange",
+            "scene.hard_negatives[0] is solid:orange, which is of the positive class orange",
         ),
+        (
+            ["scene.hard_negatives=[{mesh: 'solid:lemon', label: 1}]", "augment.examples=6"],
+            "scene.hard_negatives[0]",
+        ),
+        (["scene.hard_negatives=[a/Orange.glb]", "augment.examples=6"], "scene.hard_negatives[0]"),
+        (["scene.hard_negatives=[{mesh: 'solid:orange'}]", "augment.examples=6"], "positive class"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model"),

@@ -40,7 +40,7 @@ from train.auditing.relit_audit import (
     write_photographs_page,
 )
 from train.auditing.remedies import CLASSIFIER, HARDENED, NORMALIZED, name_remedies, normalizing
-from train.class_names import class_name, class_of_meshes, with_class_name
+from train.class_names import class_name, class_of_meshes, require_others, with_class_name
 from train.command import command_line
 from train.command_settings import AuditSettings, LabSettings
 from train.data.photographs import OTHER_PREFIX, find_photographs, find_unlabeled
@@ -287,8 +287,9 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
         are needed.
 
     Raises:
-        InputError: If the classifier lacks a class, or if neither `label` nor
-            the names of the meshes tell the class.
+        InputError: If the classifier lacks a class, if neither `label` nor
+            the names of the meshes tell the class, or if a hard negative is of
+            this class.
     """
     if settings.label is None:
         label = class_of_meshes(settings.meshes, classifier.classes, "meshes")
@@ -302,6 +303,8 @@ def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
         negatives = [
             solid for solid in HARD_NEGATIVES if simplified(solid_name(solid)) != simplified(label)
         ]
+    named = read_objects(negatives, "", "hard_negatives")
+    require_others(named, [label], classifier.classes)
     meshes = [with_class_name(item, classifier.classes, "meshes") for item in settings.meshes]
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
@@ -417,8 +420,7 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
         Settings of the meshes of the label, and of the hard negatives.
 
     Raises:
-        InputError: If a mesh has another label than `settings.label`, or if a
-            hard negative has this label.
+        InputError: If a mesh has another label than `settings.label`.
     """
     meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
     hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
@@ -426,16 +428,11 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
         item.label = item.label or OTHER_PREFIX + (solid_name(item.mesh) or Path(item.mesh).stem)
     for item in meshes:
         if item.label != settings.label:
-            raise _wrong_class("meshes", item, settings.label)
-    for item in hard_negatives:
-        if item.label == settings.label:
-            raise _wrong_class("hard_negatives", item, settings.label)
+            raise InputError(
+                f"meshes: {item.mesh} is of the class {item.label}, and label={settings.label}",
+                "meshes",
+            )
     return meshes, hard_negatives
-
-
-def _wrong_class(key: str, item: ObjectSettings, label: str) -> InputError:
-    """Return the error for a mesh whose class does not fit the key that lists it."""
-    return InputError(f"{key}: {item.mesh} is of the class {item.label}, and label={label}", key)
 
 
 def _own_results(out: Path) -> Collection[str]:

@@ -20,7 +20,7 @@ from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
 from train.command_settings import ENVIRONMENTS, AuditSettings
-from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, studied_classes
 from train.report.results import require_replaceable
 from train.system.folders import folder_or_temporary
 
@@ -121,7 +121,6 @@ def audit(
                     f"meshes are of several classes ({', '.join(positive_classes)}): give one"
                 )
             negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
-            require_others(negatives, positive_classes)
             settings = AuditSettings(
                 classifier=classifier.name,
                 label=positive_classes[0],

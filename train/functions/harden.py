@@ -26,17 +26,19 @@ from renderer.settings import Settings
 from renderer.validation import as_path, require_kind
 from train import console
 from train.__main__ import main
-from train.class_names import with_classes_of_meshes
+from train.class_names import require_others, with_classes_of_meshes
 from train.command import read_settings
-from train.functions.meshes import MeshItem, as_mappings, require_others, studied_classes
+from train.functions.meshes import MeshItem, as_mappings, studied_classes
 from train.report.report_page import report_of
 from train.report.results import require_new_run
 from train.runs.run_lock import sole_writer
 from train.settings import (
+    OTHER,
     DataSettings,
     ExperimentSettings,
     TrainingSceneSettings,
     TrainSettings,
+    read_objects,
 )
 from train.system.folders import folder_or_temporary
 from train.system.user_errors import keyed
@@ -152,7 +154,8 @@ def harden(
         }
         if hard_negatives is not None:
             negatives = as_mappings("hard_negatives", hard_negatives, classifier, folder)
-            require_others(negatives, labels)
+            named = read_objects(negatives, OTHER, "hard_negatives")
+            require_others(named, labels, classifier.classes)
             changes["scene"]["hard_negatives"] = negatives
         if out is None:
             changes["train"]["cache"] = None

@@ -14,7 +14,7 @@ from renderer.geometry.mesh import Mesh
 from renderer.io.export import export_mesh
 from renderer.io.files import atomic_write
 from renderer.validation import as_list
-from train.class_names import classes_of_meshes, name_of_mesh
+from train.class_names import classes_of_meshes
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
@@ -109,25 +109,3 @@ def studied_classes(
                 f"(mesh, {name!r}), or give label={name!r}"
             )
     return list(dict.fromkeys(classes_of_meshes(meshes, classifier.classes, "meshes")))
-
-
-def require_others(hard_negatives: Sequence[dict[str, Any]], labels: Sequence[str]) -> None:
-    """Check that no hard negative is of a positive class.
-
-    Args:
-        hard_negatives: Hard negatives as `as_mappings` returns them.
-        labels: Positive classes.
-
-    Raises:
-        InputError: If one is of such a class, by its label or by its name.
-    """
-    for index, item in enumerate(hard_negatives):
-        name = item.get("label") or name_of_mesh(item["mesh"])
-        # If there are several positive classes, an object of one class is a hard negative for
-        # the others.
-        is_studied = name in labels and (len(labels) == 1 or not item.get("label"))
-        if is_studied:
-            raise InputError(
-                f"hard_negatives[{index}] is {item['mesh']}, of the positive class {name}: "
-                "move it to meshes, or remove it"
-            )

@@ -14,6 +14,7 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from renderer.errors import InputError
 from train import console
+from train.class_names import require_others
 from train.data.photographs import find_photographs, load_photographs
 from train.data.sets import DataSet
 from train.settings import OTHER, ExperimentSettings, label_names
@@ -57,6 +58,8 @@ def build_service(
         labels = labels.to(device)
         is_ranked = len(labels.unique()) > 1
     elif settings.augment.renders:
+        positive_names = [data.classes[index] for index in positive_classes]
+        require_others(settings.hard_negatives, positive_names, data.classes)
         numbers = _class_numbers(settings, data)
         # Objects without a class have a complementary label: they belong to none
         # of the positive_classes classes.

@@ -314,7 +314,7 @@ ORANGE_PEAR = {"mesh": "solid:pear", "label": "orange"}
     [
         ({"label": "pear"}, "'pear' is not a class of the model"),
         ({"meshes": []}, "meshes is empty"),
-        ({"hard_negatives": [ORANGE_PEAR]}, "hard_negatives: solid:pear is of the class orange"),
+        ({"hard_negatives": [ORANGE_PEAR]}, r"hard_negatives\[0\] is solid:pear"),
         ({"hard_negatives": ["pear.glb"]}, "pear.glb"),
         ({"photos": "nowhere"}, "nowhere is not a folder"),
         ({"environments": ["nowhere.hdr"]}, "nowhere.hdr"),

@@ -83,6 +83,7 @@ def test_a_class_that_the_network_lacks_is_refused_with_the_nearest(options):
 
 def test_a_hard_negative_of_the_class_itself_is_refused(options):
     negatives = ["solid:apple", "solid:orange:1"]
+    options |= {"laboratory": None}
     with pytest.raises(nb.InputError, match=r"hard_negatives\[1\]"):
         nb.audit(Brightness().eval(), ["solid:orange"], hard_negatives=negatives, **options)
 
