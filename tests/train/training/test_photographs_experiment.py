@@ -157,6 +157,36 @@ def test_other_arms_run(settings_of, tmp_path, words):
     assert read_metrics(folder)
 
 
+@pytest.mark.slow
+def test_the_last_layer_of_the_result_can_be_hardened_with_meshes(finished, photographs, tmp_path):
+    folder, _ = finished
+    hardened = tmp_path / "run"
+    words = [
+        "experiment=classifier",
+        f"train.init_from={folder}",
+        f"data.path={photographs}",
+        f"data.size={SIZE}",
+        "data.test_fraction=0.25",
+        "data.validation=0.25",
+        "scene.meshes=[solid:orange]",
+        "scene.hard_negatives=[solid:lemon]",
+        "scene.backgrounds=[0.5]",
+        "scene.views=1",
+        "train.device=cpu",
+        "train.precision=float32",
+        "train.threads=1",
+        "train.batch_size=8",
+        "train.epochs=1",
+        "evaluate.laboratory_setups=0",
+        f"run={hardened}",
+    ]
+    completed_run(train_command.read(words), hardened)
+    before = torch.load(folder / "weights.pt")
+    after = torch.load(hardened / "weights.pt")
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"fc.weight", "fc.bias"}
+
+
 def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher():
     torch.manual_seed(0)
     flat = torch.nn.Flatten()
