@@ -14,6 +14,7 @@ from train.report.summary import summarize
 from train.runs.saved_networks import PUBLISHED, load_run, load_selected, publish
 from train.settings import mapped, published
 from train.system.user_errors import keyed, writable_folder
+from train.system.verbosity import shortened
 
 
 def publish_network(settings: PublishSettings) -> None:
@@ -84,7 +85,9 @@ def _calibrate(
             false_positive_rate,
         )
     entries = [asdict(point) for point in points]
+    lines = []
     for entry in entries:
         meaning = scoring.describe_point(entry)
-        print(f"{entry['label']}: threshold {entry['threshold']:.3f} for {meaning}")
+        lines.append(f"{entry['label']}: threshold {entry['threshold']:.3f} for {meaning}")
+    print("\n".join(shortened(lines)))
     return entries
