@@ -49,6 +49,8 @@ CONTACT_SHEET = "contact_sheet.png"
 WRONG_CLASSES = 5
 # Words after the number of negatives, if there are several labels.
 COUNTED_EACH = ", once for each of these classes"
+# Metrics that the table of all images leaves out. `format_scores` shows them.
+DETAILS = ("top5", "recall_at/0.05", "recall_at/0.20")
 
 
 @dataclass(frozen=True)
@@ -404,6 +406,7 @@ def format_overall(scores: Scores) -> str:
 
     Returns:
         The table below a line that counts the images, and notes about thresholds and files.
+        The metrics in `DETAILS` are left out.
     """
     positives = len(scores.pooled.all.positives)
     negatives = len(scores.pooled.all.negatives)
@@ -411,6 +414,8 @@ def format_overall(scores: Scores) -> str:
     rows = []
     for table in (_counted_table(scores), _ranked_table(scores)):
         rows += list(zip(table.header[1:], table.rows[0][1:], strict=True))
+    details = {metric_title(name) for name in DETAILS}
+    rows = [row for row in rows if row[0] not in details]
     table = Table(f"{title}; 95 % intervals", ["metric", scores.label], rows)
     return "\n".join([str(table), *_notes(scores)])
 
