@@ -570,6 +570,8 @@ class _Target(NamedTuple):
             # (3, 49, 49) and right side (3, 49).
             used_transfer = transfer * is_used[:, None]
             normal_matrix = used_transfer @ transfer.mT
+            # Weights of a smoothness penalty. It keeps coefficients that the pixels do
+            # not determine close to `expected_light`.
             penalty = self.penalty(normal_matrix)
             difference = (image - background[pixels])[..., None]
             right_side = (used_transfer @ difference)[..., 0]

@@ -210,7 +210,11 @@ class _AreaVectors(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> Tensor:
-        """Compute u × v of each face, with edges that are scaled by a common power of two.
+        """Compute the area vector u × v of each face from scaled edges u and v.
+
+        All edges are divided by the same power of two, so that products of large
+        edges do not overflow. The area vectors are therefore divided by the
+        square of this power. For positions that are not float64, the power is 1.
 
         Args:
             ctx: Context of autograd.

@@ -381,7 +381,7 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
     Returns:
         Band of each coefficient, int64, shape ((degree + 1)²,).
     """
-    # Band l has 2 l + 1 harmonics.
+    # Band l has 2 l + 1 harmonics, so l is repeated 2 l + 1 times.
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 

@@ -186,8 +186,9 @@ def _project_with_mean(light: Array) -> Array:
             weighted_change = shortest(direction_rows[:, 1:] / weights[1:], -direction_rows @ light)
             nearest = np.concatenate([[mean], light[1:] + weighted_change / weights[1:]])
         else:
-            # Uniform light fills the dips of the windowed light. The windowed light
-            # fills the dips of the last solution.
+            # A dip is a direction with negative radiance. After `_MAX_SOLUTIONS` rounds,
+            # dips are removed by mixing: first, uniform light is mixed into the windowed
+            # light until that has no dips. Then this light is mixed into `nearest`.
             windowed = _mix_to_nonnegative(window * light, uniform, direction_rows)
             windowed = _mix_to_nonnegative(windowed, uniform, dip_rows)
             nearest = _mix_to_nonnegative(nearest, windowed, dip_rows)

@@ -822,7 +822,9 @@ def _fit(degree: int, roughness: float) -> Tensor:
     orders = torch.tensor([m for l in range(fitted_degree + 1) for m in range(l + 1)])
     # sin^m θ for each pair (l, m) and each cosine, shape (M', N, 1).
     sine_powers = (1 - cosines[:, None] ** 2) ** (orders[:, None, None] / 2)
-    # The P polynomials times sin^m θ, which the least squares combine, shape (M', N, P).
+    # The functions whose weights the least squares find: each of the P polynomials
+    # times sin^m θ, for each of the M' pairs (l, m) and each of the N cosines, shape
+    # (M', N, P).
     fitted_functions = sine_powers * _chebyshev(cosine_arguments, polynomial_count).T
     fit = torch.linalg.lstsq(fitted_functions, integrals, rcond=1e-9, driver="gelsd")
     # Coefficients up to the fitted degree, shape (3, M', P). Zeros up to `degree` follow at

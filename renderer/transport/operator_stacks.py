@@ -415,8 +415,8 @@ class OperatorStack:
                 channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
             else:
-                # Operators with fewer channels are written with three channels,
-                # which contain the albedo.
+                # The stack has three channels. `by_channel` is the transfer of this
+                # operator in three channels, already multiplied by its albedo.
                 transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             if operator.sparse is not None:
@@ -465,7 +465,8 @@ class OperatorStack:
         used_lights = lights.index_select(1, self._coefficients)
         light_grid = used_lights.new_zeros(len(operators) * slot_count, *used_lights.shape[1:])
         light_grid = light_grid.index_copy(0, cell, used_lights)
-        # Lights by operator and slot, shape (shown operators, slots, K, 3).
+        # Light coefficients of each slot of each operator, for the K coefficients that
+        # the stack uses, shape (shown operators, slots, K, 3).
         light_grid = light_grid.unflatten(0, (len(operators), slot_count))
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]

@@ -192,7 +192,9 @@ class Fragments:
         # pixel, shape (size, s, size, s).
         cells = torch.arange(resolution**2, device=self.sample_numbers.device)
         cells = cells.view(self.size, self.samples, self.size, -1)
-        # `sample_numbers` counts the cells pixel by pixel, so both pixel axes come first.
+        # `sample_numbers` counts the cells of the first pixel, then the cells of the
+        # second pixel, and so on. The transpose gives the axes (row of a pixel, column
+        # of a pixel, row in the pixel, column in the pixel), which count in this order.
         cells_by_pixel = cells.transpose(1, 2).flatten()
         finer_pixels = cells_by_pixel.index_select(0, self.sample_numbers)
         finer = replace(
