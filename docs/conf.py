@@ -15,6 +15,7 @@ from sphinx.ext.autodoc import Options
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT / "docs"))  # for pictures.py
 
 import norm_balls as nb  # noqa: E402 (The path is set above.)
 from renderer.settings import Settings  # noqa: E402
@@ -33,8 +34,9 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["gallery"]
+exclude_patterns = ["gallery", "auto_gallery/**/*.ipynb"]
 templates_path = ["_templates"]
 # A name in single backticks links to its page, if it is public.
 default_role = "py:obj"
@@ -56,6 +58,30 @@ autodoc_preserve_defaults = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+
+SECTIONS = ("rendering", "light", "attacks", "training")
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "auto_gallery",
+    "filename_pattern": r"\.py$",
+    "subsection_order": [f"gallery/{section}" for section in SECTIONS],
+    "nested_sections": False,
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "image_scrapers": ("pictures.save_figures",),
+    "reset_modules": ("pictures.set_style",),
+    "capture_repr": (),
+    "download_all_examples": False,
+    "notebook_extensions": set(),
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 1e6,
+    "write_computation_times": False,
+    "plot_gallery": True,
+    # The pages of the reference show the pictures that use a name.
+    "backreferences_dir": "api/backreferences",
+    "doc_module": ("norm_balls", "renderer", "augment", "train"),
+}
 
 # Pages of the site that hold a file outside docs/.
 PAGES = {
@@ -80,7 +106,7 @@ def link_to_pages(folder: Path, text: str) -> str:
 
     def replace_target(match: re.Match[str]) -> str:
         text, target, anchor = match.groups()
-        path = (folder / target).resolve()
+        path = Path(os.path.normpath(folder / target))
         if path.is_dir():
             return text
         if not path.is_file():
@@ -101,7 +127,7 @@ def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -
     """Rewrite the links of a file that a page includes."""
     # The README is split into two pages, and its anchors are on the first of them.
     text = re.sub(r"\]\(#", "](README.md#", source[0]) if path.name == "README.md" else source[0]
-    source[0] = link_to_pages((ROOT / "docs" / path).parent, text)
+    source[0] = link_to_pages(ROOT / "docs" / path.parent, text)
 
 
 def list_fields(
