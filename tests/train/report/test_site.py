@@ -34,14 +34,17 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """Build the site from a copy of docs/, without running the scripts of the gallery."""
+    """Build the site from a copy of its pages, without running the scripts of the gallery."""
     pytest.importorskip("sphinx_gallery")
     folder = tmp_path_factory.mktemp("site")
-    for path in ROOT.iterdir():
-        if path.name != "docs":
-            (folder / path.name).symlink_to(path)
     generated = shutil.ignore_patterns("auto_gallery", "generated", "backreferences")
-    shutil.copytree(ROOT / "docs", folder / "docs", ignore=generated)
+    for path in ROOT.iterdir():
+        if path.name in {"docs", "pretrained"}:
+            shutil.copytree(path, folder / path.name, ignore=generated)
+        elif path.suffix == ".md":
+            shutil.copy(path, folder)
+        else:
+            (folder / path.name).symlink_to(path)
     options = ["-q", "-W", "-D", "sphinx_gallery_conf.plot_gallery=0"]
     command = [sys.executable, "-m", "sphinx", *options, "docs", "html"]
     subprocess.run(command, cwd=folder, check=True)
