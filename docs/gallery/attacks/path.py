@@ -16,7 +16,7 @@ scene = nb.build_scene([("solid:orange:3", "orange")], network.size)
 settings = nb.AttackSettings(lighting=nb.StepSettings("l2", radius=2.0))
 result = nb.attack(network, scene, settings=settings)
 start, end = scene.lights[0], result.conditions.light[0]
-[operator] = nb.precompute_transfer(nb.solid("orange", 3), scene.cameras[0][0], size=128)
+operator = nb.precompute_transfer(nb.solid("orange", 3), scene.cameras[0][0], size=128)
 
 figure, axes = plt.subplots(1, 6, figsize=(8, 1.9))
 for axis, fraction in zip(axes, torch.linspace(0, 1, 6), strict=True):

@@ -19,10 +19,10 @@ for column, radius in enumerate(radii):
     ball = nb.StepSettings("l2", radius, step_size=0.2)
     settings = nb.AttackSettings(lighting=ball, max_steps=15, margin=20.0)
     result = nb.attack(network, scene, settings=settings)
-    predicted = network.classes[result.logits[0, 0].argmax()]
+    predicted = network.classes[result.logits[0].argmax()]
     light = nb.light_sphere(result.conditions.light[0], 64)
     axes[0, column].imshow(light.permute(1, 2, 0))
-    axes[1, column].imshow(result.images[0, 0].permute(1, 2, 0))
+    axes[1, column].imshow(result.images[0].permute(1, 2, 0))
     axes[0, column].set(title=f"radius {radius}", xticks=[], yticks=[])
     axes[1, column].set(title=predicted, xticks=[], yticks=[])
 plt.show()

@@ -29,7 +29,7 @@ for gloss in (None, nb.Gloss(0.2, metallic=1.0)):
     for degree in degrees:
         light = nb.harmonics.project(window, degree).float()
         options = {"albedo": gray, "gloss": gloss, "encoding": "srgb"}
-        images.append(nb.render(ball, camera, light, 128, 1.0, **options)[0])
+        images.append(nb.render(ball, camera, light, 128, 1.0, **options))
     rows.append(torch.cat(images, 2))
 
 plt.figure(figsize=(8, 3.6))

@@ -16,7 +16,7 @@ pear = nb.solid("pear")
 names = ["uniform", "grace", "eucalyptus", "st_peters"]
 lights = [nb.load_light(name) for name in names]
 balls = torch.cat([nb.light_sphere(light, 128) for light in lights], 2)
-images = [nb.render(pear, camera, light, 128, 1.0, encoding="srgb")[0] for light in lights]
+images = [nb.render(pear, camera, light, 128, 1.0, encoding="srgb") for light in lights]
 pears = torch.cat(images, 2)
 
 plt.figure(figsize=(8, 4.2))

@@ -12,7 +12,7 @@ import torch
 import norm_balls as nb
 
 [camera] = nb.orbit_cameras(1, width=2.4)
-[operator] = nb.precompute_transfer(nb.solid("mushroom", 1), camera, size=128)
+operator = nb.precompute_transfer(nb.solid("mushroom", 1), camera, size=128)
 left = nb.harmonics.basis(torch.tensor([0.4, -1.0, 0.3]), degree=6).float()
 right = nb.harmonics.basis(torch.tensor([0.4, 1.0, 0.3]), degree=6).float()
 lights = [left[:, None] * torch.tensor([1.5, 1.0, 0.6]), right[:, None] * torch.tensor([0.5, 1, 2])]

@@ -13,7 +13,7 @@ import torch
 import norm_balls as nb
 
 [camera] = nb.orbit_cameras(1, width=2.2)
-[operator] = nb.precompute_transfer(nb.solid("pear"), camera, size=64)
+operator = nb.precompute_transfer(nb.solid("pear"), camera, size=64)
 figure, axes = plt.subplots(3, 5, figsize=(7, 4.3))
 for axis in axes.flat:
     axis.axis("off")

@@ -24,7 +24,7 @@ images = []
 for pattern in (stripes, checkers, rings, window):
     lights = [(projector, pattern.reshape(-1, 1).expand(-1, 3))]
     options = {"lights": lights, "encoding": "srgb"}
-    images.append(nb.render(orange, camera, light, 160, 0.1, **options)[0])
+    images.append(nb.render(orange, camera, light, 160, 0.1, **options))
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
 plt.xticks(80 + 160 * torch.arange(4), ["stripes", "checkers", "rings", "window"])

@@ -14,11 +14,11 @@ import norm_balls as nb
 cup, light = nb.solid("cup"), 0.3 * nb.load_light("grace")
 camera = nb.OrthographicCamera(polar=52.0, azimuth=115.0, width=3.0)
 options = {"size": 64, "samples": 4, "bounces": 2}
-photograph = nb.render(cup, camera, light, background=0.6, **options)[0]
-mask = 1 - nb.render(cup, camera, 0 * light, size=64, background=1.0, samples=4)[0, 0]
+photograph = nb.render(cup, camera, light, background=0.6, **options)
+mask = 1 - nb.render(cup, camera, 0 * light, size=64, background=1.0, samples=4)[0]
 nearby = nb.OrthographicCamera(polar=60.0, azimuth=100.0, width=3.0)
 found = nb.fit_scene(photograph, mask, cup, bounces=2, start=nearby)
-image = nb.render(cup, found.camera, found.light, background=0.6, **options)[0]
+image = nb.render(cup, found.camera, found.light, background=0.6, **options)
 difference = 0.5 + (image - photograph)
 
 plt.imshow(torch.cat([photograph, image, difference], 2).permute(1, 2, 0).clamp(0, 1))

@@ -24,7 +24,7 @@ roughnesses = [0.8, 0.5, 0.35, 0.25]
 images = []
 for gloss in [None, *(nb.Gloss(roughness) for roughness in roughnesses)]:
     options = {"gloss": gloss, "encoding": "srgb"}
-    images.append(nb.render(nb.solid("apple"), camera, light, 128, 1.0, **options)[0])
+    images.append(nb.render(nb.solid("apple"), camera, light, 128, 1.0, **options))
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
 names = ["matte", *(f"roughness {roughness}" for roughness in roughnesses)]

@@ -26,7 +26,7 @@ values = [0.0, 0.25, 0.5, 0.75, 1.0]
 images = []
 for metallic in values:
     options = {"gloss": nb.Gloss(0.3, metallic=metallic), "encoding": "srgb"}
-    images.append(nb.render(ball, camera, light, 128, 1.0, albedo=gold, **options)[0])
+    images.append(nb.render(ball, camera, light, 128, 1.0, albedo=gold, **options))
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
 plt.xticks(64 + 128 * torch.arange(5), [f"metallic {value}" for value in values])

@@ -16,7 +16,7 @@ cup, light = nb.solid("cup"), nb.load_light("grace")
 effects = [{}, {"shadows": True}, {"bounces": 1}, {"bounces": 4}]
 images = []
 for effect in effects:
-    images.append(nb.render(cup, camera, light, 128, 1.0, encoding="srgb", **effect)[0])
+    images.append(nb.render(cup, camera, light, 128, 1.0, encoding="srgb", **effect))
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
 plt.xticks(64 + 128 * torch.arange(4), ["no shadows", "shadows", "one bounce", "four bounces"])

@@ -19,7 +19,7 @@ gray = torch.full((len(pear.faces), 3), 0.3)
 options = {"size": 64, "background": 1.0, "albedo": gray, "samples": 8}
 goal = nb.render(pear, camera, light, **options)
 start = 0.5 * points + torch.tensor([0.0, 0.6, 0.3])
-images = [goal[0], nb.render(pear, camera, light, vertices=start, **options)[0]]
+images = [goal, nb.render(pear, camera, light, vertices=start, **options)]
 for silhouettes in (False, True):
     pose = torch.tensor([0.5, 0.0, 0.6, 0.3], requires_grad=True)
     optimizer = torch.optim.Adam([pose], lr=0.03)
@@ -30,7 +30,7 @@ for silhouettes in (False, True):
         optimizer.zero_grad()
         (image - goal).square().sum().backward()
         optimizer.step()
-    images.append(image[0].detach())
+    images.append(image.detach())
 
 plt.imshow(torch.cat(images, 2).permute(1, 2, 0))
 plt.xticks(32 + 64 * torch.arange(4), ["goal", "start", "silhouettes=False", "silhouettes=True"])

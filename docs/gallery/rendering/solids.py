@@ -19,7 +19,7 @@ for seed in (0, 1):
     images = []
     for name in names:
         solid = nb.solid(name, seed)
-        images.append(nb.render(solid, camera, light, 96, 1.0, encoding="srgb")[0])
+        images.append(nb.render(solid, camera, light, 96, 1.0, encoding="srgb"))
     rows.append(torch.cat(images, 2))
 
 plt.imshow(torch.cat(rows, 1).permute(1, 2, 0))
