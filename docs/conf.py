@@ -91,6 +91,9 @@ PAGES = {
     "pretrained/README.md": "networks.md",
 }
 
+# Sections of the README that are on the page of the quick start.
+QUICK_START = ("#try-it", "#attack-a-network", "#audit-a-network")
+
 
 def link_to_pages(folder: Path, text: str) -> str:
     """Let the links of a Markdown file lead to the pages of the site.
@@ -113,6 +116,8 @@ def link_to_pages(folder: Path, text: str) -> str:
             return match.group()
         name = path.relative_to(ROOT).as_posix()
         page = PAGES.get(name) or os.path.relpath(path, ROOT / "docs")
+        if name == "README.md" and anchor in QUICK_START:
+            page = "quickstart.md"
         return f"[{text}]({page}{anchor or ''})"
 
     return re.sub(r"\[([^]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)", replace_target, text)
@@ -125,7 +130,7 @@ def link_in_source(app: Sphinx, docname: str, source: list[str]) -> None:
 
 def link_in_included(app: Sphinx, path: Path, docname: str, source: list[str]) -> None:
     """Rewrite the links of a file that a page includes."""
-    # The README is split into two pages, and its anchors are on the first of them.
+    # The README is split into two pages.
     text = re.sub(r"\]\(#", "](README.md#", source[0]) if path.name == "README.md" else source[0]
     source[0] = link_to_pages(ROOT / "docs" / path.parent, text)
 
