@@ -44,6 +44,8 @@ default_role = "py:obj"
 html_theme = "furo"
 html_title = f"{project} {version}"
 html_show_sourcelink = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 
 myst_heading_anchors = 4
@@ -149,11 +151,11 @@ def list_fields(
 def resolve_public_name(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Element
 ) -> Element | None:
-    """Let `renderer.render` in a docstring lead to the page of `norm_balls.render`."""
+    """Let `nb.render` and `renderer.render` lead to the page of `norm_balls.render`."""
     package, _, name = node["reftarget"].rpartition(".")
     if node["refdomain"] != "py" or name not in nb.__all__:
         return None
-    if package.partition(".")[0] not in {"renderer", "augment", "train"}:
+    if package.partition(".")[0] not in {"nb", "renderer", "augment", "train"}:
         return None
     target = f"norm_balls.{name}"
     domain = env.domains["py"]

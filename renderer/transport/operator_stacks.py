@@ -180,6 +180,7 @@ class TransferOperators(Sequence[TransferOperator]):
 
         Returns:
             A tuple of
+
             - the images in [0, 1], shape (V, ..., 3, size, size);
             - the gradient of the loss with respect to the lights, in the shape
               of `lights`.

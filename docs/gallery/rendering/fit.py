@@ -11,7 +11,7 @@ import torch
 
 import norm_balls as nb
 
-cup, light = nb.solid("cup"), 0.3 * nb.load_light("grace")
+cup, light = nb.solid("cup"), 0.7 * nb.load_light("grace")
 camera = nb.OrthographicCamera(polar=52.0, azimuth=115.0, width=3.0)
 options = {"size": 64, "samples": 4, "bounces": 2}
 photograph = nb.render(cup, camera, light, background=0.6, **options)
