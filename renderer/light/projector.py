@@ -24,7 +24,7 @@ MAX_PIXELS = 256
 class Projector(LocalBasis):
     """Projector that aims at the origin, with one RGB coefficient for each pixel of its pattern.
 
-    The pattern has `pixels`² pixels. Their coefficients are in row-major order
+    The pattern has pixels² pixels. Their coefficients are in row-major order
     from the top left, as a screen would show the pattern. A white surface at the
     origin that faces the projector gets the radiance 1 from a coefficient of 1.
     The light falls with the squared distance. A pattern with equal coefficients

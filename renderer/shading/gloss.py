@@ -201,6 +201,7 @@ class SampleGloss(NamedTuple):
 
         Returns:
             A tuple of
+
             - the lobe that is multiplied by the albedo, shape (M, S), or None if
               no sample is metallic;
             - the lobe with the color of the light, shape (M, S).
@@ -223,6 +224,7 @@ class SampleGloss(NamedTuple):
 
         Returns:
             A tuple of
+
             - the radiance that is multiplied by the albedo, shape (S,), or None
               if no sample is metallic;
             - the radiance with the color of the light, shape (S,).
@@ -310,6 +312,7 @@ class SampleGloss(NamedTuple):
 
         Returns:
             A tuple of
+
             - the radiance that is multiplied by the albedo, shape (K, S), or
               None if no sample is metallic;
             - the radiance with the color of the light, shape (K, S);
@@ -334,6 +337,7 @@ class SampleGloss(NamedTuple):
 
         Returns:
             A tuple of
+
             - the radiance per irradiance that is multiplied by the albedo,
               shape (...);
             - the radiance per irradiance with the color of the light,

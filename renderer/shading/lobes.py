@@ -433,6 +433,7 @@ def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
 
     Returns:
         A tuple of
+
         - the index of the lobe function of each harmonic, shape (K,);
         - the order m of each harmonic, from -l to l, shape (K,).
     """
@@ -901,6 +902,7 @@ def _half_vectors(cosines: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         A tuple of
+
         - Q unit half vectors for each camera direction, float64,
           shape (N, Q, 3);
         - their solid angles dh on both sides of the plane, float64,

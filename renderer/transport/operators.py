@@ -173,6 +173,7 @@ class TransferOperator:
 
         Returns:
             A tuple of
+
             - the images in [0, 1], shape (..., 3, size, size);
             - the gradient of the loss with respect to the lights, in the shape
               of `lights`.
@@ -270,6 +271,7 @@ class TransferOperator:
 
         Returns:
             A tuple of
+
             - the images in [0, 1], shape (..., 3, size, size);
             - 1 for values of pixels that clamping did not change, and 0 for other
               values, shape (..., 3, U). U is the number of groups of equal pixels
