@@ -39,6 +39,7 @@ from renderer.light.basis import COEFFICIENTS, DEGREE
 from renderer.light.harmonics import bands, basis
 from renderer.photograph import Photograph, Window
 from renderer.rendering import precompute_transfer, render
+from renderer.validation import as_tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
@@ -378,6 +379,11 @@ def fit_scene(
         >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0]
         >>> found = nb.fit_scene(photograph, mask, mesh)  # doctest: +SKIP
     """
+    photograph = as_tensor("photograph", photograph)
+    mask = as_tensor("mask", mask)
+    for name, values in (("photograph", photograph), ("mask", mask)):
+        if not (values.min() >= 0 and values.max() <= 1):
+            raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
     size = photograph.shape[-1]
     if photograph.shape != (COLORS, size, size) or mask.shape != (size, size):
         given = f"{tuple(photograph.shape)} and {tuple(mask.shape)}"

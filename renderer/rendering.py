@@ -366,6 +366,10 @@ def light_sphere(
         >>> image.shape
         torch.Size([3, 16, 16])
     """
+    light = as_tensor("light", light)
+    if light.ndim != 2 or light.shape[1] != 3:
+        shape = tuple(light.shape)
+        raise InputError(f"light has shape {shape}: give coefficients {(basis.size, 3)}")
     sky, local = split_light(basis, light.detach().cpu().float())
     sky = None if sky is None else sky / math.pi
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)

@@ -397,6 +397,8 @@ def attack(
     require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
     require_seed("seed", seed)
     require_flag("force", force)
+    if torch.is_inference_mode_enabled():
+        raise InputError("torch.inference_mode() has no gradients: call nb.attack outside of it")
     size = scene.settings.size
     device = scene.lights.device
     with gradient_flags_kept(classifier):

@@ -109,6 +109,8 @@ class NetworkCall:
         if not fits or classes not in (None, logits.shape[1]):
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
             remedy = f"it must return logits {expected}"
+            if hasattr(logits, "logits") or (isinstance(logits, dict) and "logits" in logits):
+                remedy = "give a function that returns its logits alone"
             raise InputError(f"{self.name} returned {returned} for images {shape}: {remedy}")
         self._require_no_probabilities(logits)
         return logits
@@ -229,6 +231,10 @@ class Classifier(nn.Module):
         images = as_images("images", images)
         if images.shape[1:] != (3, size, size):
             remedy = f"render at {size} pixels per side"
+            if images.shape == (3, size, size):
+                remedy = "give a batch, such as images[None]"
+            elif images.shape[1:] == (size, size, 3):
+                remedy = "put the channels first, such as images.permute(0, 3, 1, 2)"
             raise InputError(
                 f"{name} takes images (N, 3, {size}, {size}), not {tuple(images.shape)}: {remedy}"
             )

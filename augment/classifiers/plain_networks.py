@@ -22,7 +22,7 @@ from augment.classifiers.adapter import (
     as_class_names,
 )
 from augment.settings import NormalizeLight
-from renderer.errors import InputError, describe, require_file, require_range
+from renderer.errors import InputError, as_device, describe, require_file, require_range
 from renderer.settings import MAX_SIZE
 from renderer.validation import as_list, require_kind, require_whole
 
@@ -169,6 +169,11 @@ def as_classifier(
                 "classes, normalization and value_range are for a plain network: "
                 "leave them out, because a Classifier has its own"
             )
+        if size not in (None, network.size):
+            raise InputError(
+                f"size={size} does not fit classifier {network.name}, "
+                f"which takes images of {network.size} pixels per side: use this size"
+            )
         return network.normalizing_light(normalize_light)
     require_kind(
         argument, network, Callable, "a torch.nn.Module, a function to logits, or a Classifier"
@@ -179,7 +184,7 @@ def as_classifier(
         raise InputError(f"{argument} is the class {name}: give a network, such as {name}(...)")
     require_evaluation_mode(network, argument)
     size = USUAL_SIZE if size is None else size
-    device = device_of(network) if device is None else device
+    device = device_of(network) if device is None else as_device(device)
     function = _preprocessed(network, normalization, value_range).to(device)
     count = _count_outputs(function, size, device, argument)
     if names is not None and len(names) != count:

@@ -317,6 +317,8 @@ def _load_with_color(item: MeshSettings) -> Mesh:
 def _build_solid(mesh_name: str, name_and_seed: str) -> Mesh:
     """Build a solid, such as orange:3, whose seed is 0 by default."""
     name, _, seed = name_and_seed.partition(":")
+    if seed and not seed.isdecimal():
+        raise InputError(f"{mesh_name}: its seed is {seed!r}, give a whole number")
     try:
         return solid(name, int(seed or 0))
     # The name is unknown, or the seed is no number.

@@ -16,6 +16,7 @@ from augment.classifiers.plain_networks import (
 )
 from augment.settings import NormalizeLight
 from renderer.errors import InputError
+from renderer.validation import as_list
 from train.auditing.audit import run_audit
 from train.auditing.audit_report import AuditReport, read_audit
 from train.auditing.remedies import CLASSIFIER, HARDENED
@@ -128,7 +129,7 @@ def audit(
                 hard_negatives=negatives,
                 photos=None if photographs is None else str(photographs),
                 laboratory=None if laboratory is None else str(laboratory),
-                environments=[*environments],
+                environments=as_list("environments", environments, str, "a list of names"),
                 budget=budget,
                 seed=seed,
                 device=str(device),
