@@ -40,7 +40,7 @@ from train.report.summary import (
 )
 from train.settings import PHOTOGRAPHS
 
-# Largest number of classes in a table by class of a report.
+# `class_table` has no rows if there are more classes than this.
 MAX_CLASSES = 30
 # Titles of the columns of metrics.
 TITLES = [metric_title(name) for name in METRICS]
@@ -237,6 +237,7 @@ def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
     first_runs = {method: evaluations[0].run for method, evaluations in methods.items()}
     pairs = []
     for method, run in first_runs.items():
+        # A run that began with random weights has no initial network.
         if run.before is None:
             continue
         for reference, reference_run in first_runs.items():
@@ -259,6 +260,7 @@ def class_table(group: Scored) -> Table:
     methods = read_evaluations(group, by="class")
     header = ["class", "images", "network", "top-1", "top-5"]
     rows: list[list[str]] = []
+    # Number of images of each class.
     classes: dict[Part, int] = {}
     for evaluations in methods.values():
         for part, pool in evaluations[0].pools.items():
@@ -338,14 +340,19 @@ def difference(
 
 
 def _known_value(metrics: Metrics, name: str) -> float:
-    """Return the value of a metric that has replicates, so that its value is known."""
+    """Return the value of a metric that is known, because it has bootstrap replicates."""
     metric = metrics.find(name)
     assert metric is not None and metric.value is not None
     return metric.value
 
 
 def _have_equal_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
-    """Return whether both methods have the same seeds, in the same order."""
+    """Return whether the runs of two methods have the same seeds, in the same order.
+
+    Args:
+        group: Evaluations of a method, one for each seed.
+        reference: Evaluations of the other method, one for each seed.
+    """
     seeds = [evaluation.run.seed or 0 for evaluation in group]
     reference_seeds = [evaluation.run.seed or 0 for evaluation in reference]
     return seeds == reference_seeds
@@ -431,7 +438,10 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 
 
 def _format_tables(tables: Sequence[Table]) -> str:
-    """Write the known columns of tables as Markdown. Tables without rows are left out."""
+    """Write tables as Markdown, with an empty line between them.
+
+    Tables without rows and columns without known values are left out.
+    """
     return "\n\n".join(str(table.known) for table in tables if table.rows)
 
 
@@ -522,12 +532,20 @@ def format_short_comparison(
 
 
 def _title_of_all(exclude: Sequence[str]) -> str:
-    """Name the images of all sources that are not excluded."""
+    """Return the title of all images: "all", or "all but A, B" if sources are excluded."""
     return f"all but {', '.join(exclude)}" if exclude else "all"
 
 
 def _mean_score(scored: Sequence[ScoredRun], name: str) -> Estimate | None:
-    """Average a metric over runs, of which only scores are known."""
+    """Average a metric over the scores of runs, for runs without predictions.csv.
+
+    Args:
+        scored: Runs of one method with their scores on the same images.
+        name: Name in `METRICS`.
+
+    Returns:
+        Mean without an interval. None if no run knows the metric.
+    """
     values = []
     for item in scored:
         metric = item.scores.metrics[name]
@@ -537,12 +555,21 @@ def _mean_score(scored: Sequence[ScoredRun], name: str) -> Estimate | None:
 
 
 def _format_value(metric: Estimate | None) -> str:
-    """Write a metric without its interval."""
+    """Write the value of a metric without its interval, or "-" if it is unknown."""
     return format_interval(None if metric is None else Estimate(metric.value))
 
 
 def _format_gain(methods: Evaluations, method: str) -> str:
-    """Write the difference of the AUC between a method and the first one."""
+    """Write the AUC of a method minus the AUC of the first method.
+
+    Args:
+        methods: Evaluations of each method.
+        method: Name of the method.
+
+    Returns:
+        The difference with its 95% interval. "-" for the first method itself,
+        and for a method without predictions.
+    """
     first = next(iter(methods), method)
     if method == first or method not in methods:
         return "-"
@@ -551,7 +578,20 @@ def _format_gain(methods: Evaluations, method: str) -> str:
 
 
 def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
-    """Find the runs that were scored on the photographs of a sub-folder. None if there are none."""
+    """Find the runs that were scored on the photographs of a given name.
+
+    Args:
+        groups: Groups of scored runs. All runs of a group were scored on the
+            same images.
+        photographs: Name of the sub-folder of each run with the scores.
+
+    Returns:
+        The group. None if no run has scores of the usual name `PHOTOGRAPHS`.
+
+    Raises:
+        InputError: If several groups have this name, or if no run has scores
+            of another name than the usual one.
+    """
     found = [group for group in groups if _is_scored_on(group, photographs)]
     if len(found) > 1:
         first, second = (next(iter(group.values()))[0].folder for group in found[:2])
@@ -566,8 +606,9 @@ def _find_group(groups: Sequence[Scored], photographs: str) -> Scored | None:
 def _is_scored_on(group: Scored, photographs: str) -> bool:
     """Return whether a group of scored networks belongs to photographs of a given name.
 
-    Networks that are not runs, such as files of weights, have no seed. They
-    belong to photographs of every name.
+    The scores of a run lie in a sub-folder that has the name of the
+    photographs. A network that is not a run, such as a published network, has
+    no seed and no such sub-folder. It belongs to photographs of every name.
 
     Args:
         group: Scored networks by method.

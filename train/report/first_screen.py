@@ -18,7 +18,7 @@ from train.report.plots import Picture
 
 # False-positive rate at which the recall of both networks is compared.
 EQUAL_RATE = "recall_at/0.10"
-# Both networks in sentences.
+# Words for the network before and after hardening, in the middle of a sentence.
 NETWORKS = ("the original network", "the hardened network")
 # Number of pictures in a row.
 PICTURES = 6
@@ -45,7 +45,7 @@ class Number:
     is_percentage: bool = True
 
     def text(self, value: float) -> str:
-        """Write a value in percent, or with two decimals."""
+        """Write a value of the metric in percent, or with two decimals."""
         return f"{value:.0%}" if self.is_percentage else f"{value:.2f}"
 
     def cells(self) -> list[str]:
@@ -66,8 +66,11 @@ class Answer(NamedTuple):
 
     Attributes:
         text: Class and probability.
-        verdict: "right", "wrong", or "" for another object that the network
-            takes for neither itself nor the class under study.
+        verdict: "right" if the class is that of the image. "wrong" if the image
+            shows the class under study and the network misses it, or if the
+            network takes another object for the class under study. Otherwise
+            empty: an image of another object, with a wrong class that is not
+            under study.
     """
 
     text: str
@@ -92,12 +95,13 @@ class Contrast(NamedTuple):
 
 @dataclass(frozen=True)
 class FirstScreen:
-    """What the first screen of a page shows.
+    """Content of the first screen of a page: an answer, metrics and pictures.
 
     Attributes:
-        answer: Answer in a few words.
+        answer: Whether hardening helped, or whether the network is safe, in a
+            few words.
         sentences: Reasons of the answer.
-        numbers: Three metrics.
+        numbers: Metrics of the networks.
         rows: Pictures by the title of their row.
         names: Names of both networks, or of the only one.
         images: How many images were scored, of how many objects.
@@ -149,7 +153,16 @@ class Compared(NamedTuple):
         return len({prediction.label for prediction in pool.positives}) > 1
 
     def number(self, title: str, note: str, name: str) -> Number | None:
-        """Return a metric of both networks. None if it is unknown."""
+        """Return a metric of both networks, averaged over their seeds.
+
+        Args:
+            title: Metric in words.
+            note: Which values are good, in words.
+            name: Name of the metric in `METRICS`.
+
+        Returns:
+            The metric. None if it is unknown for a network.
+        """
         before = compare.mean_metric(self.before, compare.ALL, name)
         after = compare.mean_metric(self.after, compare.ALL, name)
         if before is None or after is None:
@@ -228,7 +241,10 @@ def describe_images(label: str, auc: AreaUnderCurve) -> str:
 
 
 def _direction(change: compare.Difference) -> int:
-    """Return 1 for a proven increase, -1 for a proven decrease, and otherwise 0."""
+    """Return 1 for a proven increase, -1 for a proven decrease, and otherwise 0.
+
+    A change is proven if its 95% interval does not contain 0.
+    """
     assert change.low is not None and change.high is not None
     return int(change.low > 0) - int(change.high < 0)
 
@@ -239,7 +255,19 @@ def _answer(
     false_positives: compare.Difference,
     auc: compare.Difference,
 ) -> str:
-    """Say in a few words whether a change helped."""
+    """Say in a few words whether a change helped.
+
+    Args:
+        change: Difference between the two networks in words, such as
+            "hardening".
+        recall: Difference of the recall.
+        false_positives: Difference of the false-positive rate. An increase is
+            bad.
+        auc: Difference of the area under the ROC curve, which decides.
+
+    Returns:
+        A sentence such as "Hardening helped."
+    """
     subject = change[0].upper() + change[1:]
     match _direction(auc):
         case 1 if _direction(false_positives) > 0:
@@ -258,7 +286,19 @@ def _sentences(
     recall: compare.Difference,
     false_positives: compare.Difference,
 ) -> list[str]:
-    """Say what changed: recall, the rate of false positives, and recall at an equal rate."""
+    """Say in sentences how recall and false positives changed.
+
+    Args:
+        compared: Evaluations of both networks.
+        recall: Difference of the recall, with the recall of both networks.
+        false_positives: Difference of the false-positive rate, with the rate of
+            both networks.
+
+    Returns:
+        A sentence about the recall, and one about the false-positive rate. If
+        they are known, a sentence about the recall at 10% false positives, and
+        one about top-1, follow.
+    """
     label = compared.label
     original, hardened = compared.subjects
     sentences = [
@@ -306,8 +346,9 @@ def gain_sentence(subject: str, change: compare.Difference) -> str:
 
 
 def _points(value: float) -> str:
-    """Write a difference of fractions in percentage points, with its sign."""
+    """Write a difference of fractions in percentage points, such as "+3", "−2" or "0"."""
     points = round(100 * value)
+    # A minus sign replaces the hyphen.
     return f"{points:+d}".replace("-", "−") if points else "0"
 
 
@@ -355,7 +396,19 @@ Pair = tuple[Prediction, Prediction]
 
 
 def _read_one_each(folder: Path, labels: Sequence[str]) -> list[Prediction]:
-    """Read one prediction of each image: for its own class, or for the first one."""
+    """Read one prediction of each image.
+
+    With several classes under study, predictions.csv has one line for an image
+    and each of these classes.
+
+    Args:
+        folder: Folder of the scores of a network.
+        labels: Classes under study.
+
+    Returns:
+        For an image of a class under study, the prediction about this class.
+        For any other image, the prediction about the first of `labels`.
+    """
     predictions = []
     for prediction in read_predictions(folder / PREDICTIONS, labels):
         shown = prediction.photograph.label
@@ -365,7 +418,15 @@ def _read_one_each(folder: Path, labels: Sequence[str]) -> list[Prediction]:
 
 
 def _is_right(prediction: Prediction, labels: Sequence[str]) -> bool:
-    """Return whether a network predicts the class under study that an image shows, if any."""
+    """Return whether a prediction is right about the classes under study.
+
+    An image of a class under study must be predicted as this class. Any other
+    image must be predicted as none of these classes.
+
+    Args:
+        prediction: Prediction of a network for an image.
+        labels: Classes under study.
+    """
     shown = prediction.photograph.label
     if shown in labels:
         return prediction.predicted == shown
@@ -373,7 +434,15 @@ def _is_right(prediction: Prediction, labels: Sequence[str]) -> bool:
 
 
 def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:
-    """Draw the images whose scores differ most, of different labels and sources if possible."""
+    """Choose at most PICTURES images, and draw them with the answers of both networks.
+
+    Images whose log-odds differ most between the two networks come first. Each
+    class and source of images has one image before any of them has a second.
+
+    Args:
+        pairs: Predictions of both networks for each image.
+        images: Folder of the images.
+    """
     ordered = sorted(pairs, key=lambda pair: -abs(pair[1].log_odds - pair[0].log_odds))
     first_of_group: dict[tuple[str, str | None], Pair] = {}
     for pair in ordered:
@@ -385,7 +454,13 @@ def _draw(pairs: Iterable[Pair], images: Path) -> list[Contrast]:
 
 
 def _contrast(pair: Pair, images: Path) -> Contrast:
-    """Draw an image with the answers of both networks."""
+    """Draw an image with the answers of both networks.
+
+    Args:
+        pair: Predictions of the original and of the hardened network for the
+            image.
+        images: Folder that the path of the image is relative to.
+    """
     photograph = pair[0].photograph
     subject = in_words(photograph.label)
     if photograph.source:

@@ -26,14 +26,18 @@ MARKERS = "osD^vP"
 # The size of a plot in inches, and its width on the page in CSS pixels.
 SIZE = (4.4, 3.3)
 WIDTH = 440
-# Images of at most this many pixels per side stay PNG.
+# `encoded` writes images of at most this many pixels per side as PNG, and larger
+# ones as JPEG.
 SMALL = 192
-# Lines with fewer points than this have markers.
+# `_draw_curves` marks the points of lines that have fewer points than this.
 MARKED = 30
 # Color of text and axes in the file of matplotlib. `_plot` replaces it by the text
 # color of the page, which is light or dark.
 INK = "#123456"
+# Style sheet that `_plot` inserts into each SVG. It sets the text color for light
+# and for dark pages.
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
+# Settings of matplotlib with which `_plot` draws.
 PLOT = {
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -126,7 +130,14 @@ def _draw_curves(
     lines_of_method: Mapping[str, list[list[tuple[float, float]]]],
     x_title: str,
 ) -> None:
-    """Draw the lines of each method in its color. The legend names the first line of a method."""
+    """Draw the lines of each method in the color of the method.
+
+    Args:
+        axes: Axes to draw on.
+        lines_of_method: For each method, a line for each seed. A line is a list
+            of pairs of x and y.
+        x_title: Title of the x axis.
+    """
     for index, (method, lines) in enumerate(lines_of_method.items()):
         name: str | None = method
         for line in lines:
@@ -135,6 +146,7 @@ def _draw_curves(
             marker = MARKERS[index % len(MARKERS)] if len(line) < MARKED else None
             x, y = zip(*line, strict=True)
             axes.plot(x, y, marker=marker, ms=4, label=name, **style(index))
+            # Only the first line of a method has an entry in the legend.
             name = None
     axes.set(xlabel=x_title)
     axes.locator_params(axis="x", integer=True, min_n_ticks=1)
@@ -151,6 +163,7 @@ def roc(methods: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     Returns:
         The plot. None if no seed has both positives and negatives.
     """
+    # The pairs of each method that have both positives and negatives.
     known = {}
     for method, pairs in methods.items():
         known[method] = [
@@ -207,7 +220,7 @@ def by_radius(
 
 
 def _percent(estimate: Estimate) -> str:
-    """Write a fraction in percent."""
+    """Write a fraction in percent, such as "81%", or "-" if it is unknown."""
     return "-" if estimate.value is None else f"{estimate.value:.0%}"
 
 
@@ -219,20 +232,41 @@ def _draw_fractions(
     color: str,
     is_random: bool,
 ) -> None:
-    """Draw a line of fractions; attacks have error bars, and random draws are dotted."""
+    """Draw the line of the fractions of views that stay recognized.
+
+    Args:
+        axes: Axes to draw on.
+        positions: Position of each radius on the x axis, shape (radii,).
+        values: Fraction at each radius, with its 95% interval.
+        name: Name of the line in the legend.
+        color: Color of the line.
+        is_random: Whether the line is of random draws. It is then dotted.
+            Otherwise it is of attacks, and has error bars.
+    """
     heights = np.array([estimate.value for estimate in values], float)
     if is_random:
         axes.plot(positions, heights, color=color, linestyle=":", label=name)
         return
     lows = np.array([estimate.low for estimate in values], float)
     highs = np.array([estimate.high for estimate in values], float)
-    # Rounding can put the end of an interval inside of it.
+    # Rounding can put the lower end just above the fraction, or the upper end
+    # just below it. Error bars must not be negative.
     errors = np.stack([heights - lows, highs - heights]).clip(min=0)
     axes.errorbar(positions, heights, errors, color=color, marker="o", ms=4, capsize=3, label=name)
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
-    """Draw a transparent SVG whose text and axes have the color of the reader's scheme."""
+    """Draw a transparent SVG for light and dark pages.
+
+    Args:
+        draw: Function that draws on the axes.
+        title: Caption of the plot.
+        alt: Description for readers who do not see the plot.
+
+    Returns:
+        The plot. A browser shows its text and axes in dark color on light
+        pages, and in light color on dark pages.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -247,6 +281,7 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
             columns = 1 if len(max(labels, key=len)) > 16 else 3
             figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=columns)
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
+    # The style sheet is inserted before the first definition of the SVG.
     start, tag, rest = file.getvalue().partition("<defs>")
     page = start + STYLE + tag + rest.replace(INK, "currentColor")
     return Picture(page.encode(), "svg+xml", alt, WIDTH, title)

@@ -109,7 +109,16 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
 
 def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
-    """Say what the page shows, in which folders it lies, and when the newest file was written."""
+    """Write the line below the title of the page.
+
+    Args:
+        found: Runs and attacks on the page.
+        folders: Folders that the user named.
+
+    Returns:
+        Text with the numbers of networks, unfinished runs and attacks, with the
+        folders, and with the time at which the newest file was written.
+    """
     counts = []
     if found.runs:
         plural = "s" if len(found.runs) != 1 else ""
@@ -131,7 +140,17 @@ def _about(found: summary.Findings, folders: Sequence[Path]) -> str:
 
 
 def _title(found: summary.Findings, methods: Methods) -> str:
-    """Name the positive classes and the methods. Without runs, name what else the page shows."""
+    """Write the title of the page.
+
+    Args:
+        found: Runs and attacks on the page.
+        methods: Runs of each method. Initial networks count as methods.
+
+    Returns:
+        Text with the positive classes. If no method is an initial network, the
+        methods follow. Without any method, the title is "Attacks" or
+        "Unfinished runs".
+    """
     if not methods:
         return "Attacks" if found.attacks else "Unfinished runs"
     labels: set[str] = set()
@@ -145,12 +164,23 @@ def _title(found: summary.Findings, methods: Methods) -> str:
     return f"{subject}, trained with renders: {', '.join(trained)}"
 
 
-# Metrics of each epoch of each run, by method. An epoch is a line of metrics.jsonl.
+# For each method, a list of its runs. A run is a list of its epochs, and an epoch
+# is a mapping of metrics by name, from one line of metrics.jsonl.
 Epochs = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
 def _drawn_epochs(drawn: Methods, unfinished: Sequence[summary.Unfinished]) -> Epochs:
-    """Return the epochs of the runs in plots, with those of the first unfinished runs."""
+    """Collect the epochs that the plots of metrics show.
+
+    Args:
+        drawn: Finished runs of each method in plots.
+        unfinished: Runs that are not finished.
+
+    Returns:
+        Epochs of the runs of each method. Each of the first MAX_UNFINISHED
+        unfinished runs with epochs is a method of its own, such as
+        "unfinished: FOLDER".
+    """
     epochs = {method: [run.epochs for run in runs] for method, runs in drawn.items()}
     started = [run for run in unfinished if run.epochs]
     for run in started[:MAX_UNFINISHED]:
@@ -228,7 +258,15 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
 
 
 def _command(config: Mapping[str, Any]) -> str:
-    """Return the command of a run or an attack, after a cd to the folder where it was started."""
+    """Return the command line that started a run or an attack.
+
+    Args:
+        config: Configuration in config.yaml of the run or the attack.
+
+    Returns:
+        Lines for a shell: `cd` to the folder in which the command was started,
+        and the command. Empty if the configuration records no command.
+    """
     folder = config.get("working_folder")
     # Earlier versions did not record the command.
     command = config.get("command") or ""
@@ -238,7 +276,14 @@ def _command(config: Mapping[str, Any]) -> str:
 
 
 def _curves(methods: Epochs) -> list[Picture]:
-    """Plot the metrics in `CURVES` by epoch, and the success of attacks by round of renders."""
+    """Plot the metrics in `CURVES` by epoch, and the success of attacks by round of renders.
+
+    Args:
+        methods: Epochs of the runs of each method.
+
+    Returns:
+        The plots. A plot in which no value changes is left out.
+    """
     pictures = []
     for name, title in CURVES.items():
         lines = {}
@@ -256,12 +301,22 @@ def _curves(methods: Epochs) -> list[Picture]:
 def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
     """List the success of attacks in each round of renders of a run.
 
-    The names of metrics begin with the number of their round, as in
-    "round_3/attack_success". An epoch without such names has a single round.
+    If an epoch has several rounds, the names of its metrics begin with the
+    number of the round, as in "round_3/attack_success". If it has one round,
+    they begin with "augment/".
+
+    Args:
+        epochs: Metrics of each epoch by name.
+
+    Returns:
+        For each round of all epochs in turn, the fraction of renders that the
+        attack makes misclassified, among those that were classified correctly
+        before. None if no render was.
     """
     rates = []
     for epoch in epochs:
         rounds = {name.partition("/")[0] for name in epoch if name.startswith("round_")}
+        # By number, "round_10" follows "round_9".
         ordered = sorted(rounds, key=lambda name: int(name.removeprefix("round_")))
         for prefix in ordered or ["augment"]:
             rates.append(attack_success(epoch, f"{prefix}/"))
@@ -269,7 +324,17 @@ def _attack_success_by_round(epochs: Sequence[Mapping[str, float]]) -> list[floa
 
 
 def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
-    """Read renders/KIND_EPOCH.png of the first, the middle and the last epoch with this file."""
+    """Read the images of renders of the first, the middle and the last epoch of a run.
+
+    Args:
+        run: Finished run.
+        kind: Start of the names of the files, which are renders/KIND_EPOCH.png
+            in the folder of the run.
+        title: What the images show, for readers who do not see them.
+
+    Returns:
+        An image for each of at most SHOWN_EPOCHS epochs that have this file.
+    """
     path_of_epoch = {}
     for path in (run.folder / RENDERS).glob(f"{kind}_*.png"):
         number = path.stem.removeprefix(f"{kind}_")
@@ -283,7 +348,16 @@ def _pictures(run: RunSummary, kind: str, title: str) -> list[Picture]:
 
 
 def _accuracy_sentences(methods: Methods) -> list[str]:
-    """Compare each method with the network that it began with on the test images, in sentences."""
+    """Compare each method with its initial network on the test images, in sentences.
+
+    Args:
+        methods: Runs of each method.
+
+    Returns:
+        For each method, a sentence with the agreement of both networks if it
+        was measured. Otherwise a sentence with both accuracies. A method that
+        began with random weights has no sentence.
+    """
     sentences = []
     for method, runs in methods.items():
         agreements = [run.scores.get("test/agreement") for run in runs]
@@ -308,7 +382,15 @@ def _accuracy_sentences(methods: Methods) -> list[str]:
 
 
 def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
-    """Compare the last method with its reference, on the first images with both networks."""
+    """Compare two networks on the first images on which both were scored.
+
+    Args:
+        groups: Scored runs of each method, by a title of the images.
+
+    Returns:
+        The first screen. None if no images were scored by two networks that can
+        be compared.
+    """
     screens = []
     for group in groups.values():
         with suppress(InputError):
@@ -318,11 +400,21 @@ def _first_screen(groups: Mapping[str, Scored]) -> FirstScreen | None:
 
 
 def _compare_on(group: Scored) -> FirstScreen | None:
-    """Compare the last method that began with another network on its images. None without one."""
+    """Compare a method with its reference on the images that both were scored on.
+
+    Args:
+        group: Scored runs of each method on the same images.
+
+    Returns:
+        The first screen. It compares the last method that has an initial
+        network with this network. If no method has one, it compares the last
+        method with the first. None with a single method.
+    """
     evaluations = compare.read_evaluations(group)
     pairs = compare.choose_pairs(evaluations)
     if not pairs:
         return None
+    # Pairs whose reference is an initial network.
     initial = [pair for pair in pairs if group[pair[1]][0].run.method == summary.INITIAL]
     method, base = (initial or pairs)[-1]
     scored = group[method][0]
@@ -415,7 +507,15 @@ def scores_section(title: str, group: Scored) -> dict[str, Any]:
 
 
 def _rocs(methods: compare.Evaluations) -> list[Picture | None]:
-    """Plot the ROC curves of all images and, with several labels, of each label."""
+    """Plot the ROC curves of all images and, with several labels, of each label.
+
+    Args:
+        methods: Evaluations of each method on the same images.
+
+    Returns:
+        A plot with the curves of all methods for all images and for each label.
+        None in place of a plot without positives or without negatives.
+    """
     first_evaluation = next(iter(methods.values()))[0]
     pictures = []
     for part, pool in first_evaluation.pools.items():
@@ -429,7 +529,12 @@ def _rocs(methods: compare.Evaluations) -> list[Picture | None]:
 
 
 def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
-    """Make the table of differences and, if the images have parts, a table of their metrics."""
+    """Make the table of differences and, if there are parts of the images, the table of parts.
+
+    Args:
+        methods: Evaluations of each method. Each has a pool of all images, and
+            a pool for each label and source, if the images have any.
+    """
     tables = [compare.overall_differences(methods)]
     first_evaluation = next(iter(methods.values()))[0]
     if len(first_evaluation.pools) > 1:
@@ -438,7 +543,20 @@ def _evaluation_tables(methods: compare.Evaluations) -> list[Table]:
 
 
 def _attack(attack: summary.AttackSummary) -> dict[str, Any]:
-    """Collect the examples, images, checks and configuration of an attack for the template."""
+    """Collect what runs.html.jinja shows of an attack.
+
+    Args:
+        attack: Attack with a row for each example.
+
+    Returns:
+        Mapping with these keys:
+
+        - "folder": folder of the attack;
+        - "rows": rows of all examples;
+        - "checks": pairs of the name of a check and its result;
+        - "images": pictures of some examples, by their title;
+        - "config": configuration of the attack. Empty if there is no file.
+    """
     images = {}
     for row in evenly_spaced(attack.rows, ATTACK_EXAMPLES):
         title = f"Example {row.number}, {row.label}: {row.outcome}"

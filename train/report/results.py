@@ -19,8 +19,8 @@ from train.runs.run_config import CONFIG, read_config
 from train.runs.run_log import METRICS
 from train.runs.saved_networks import PUBLISHED, WEIGHTS
 
-# Files that the commands write to a folder, as patterns of `Path.glob`. An error
-# message names the first file that is found.
+# Files that each command writes to a folder, as patterns of `Path.glob`.
+# `require_replaceable` looks for all of them, and names the first that it finds.
 OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 OF_RUN = (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS, WEIGHTS)
 OF_ATTACK = (RELIT, f"*/{LINES}", LINES, adversary.DESCRIPTION, "sweep.csv", "sweep.png")
@@ -48,8 +48,8 @@ def require_replaceable(path: Path, key: str, overwrite: bool, own: Collection[s
         path: File or folder that the command will write. It may be missing.
         key: Setting that names it, for the error message.
         overwrite: Whether the user allows the command to replace results.
-        own: Patterns in RESULTS to ignore, because the command continues with
-            these files.
+        own: Patterns in RESULTS that the check ignores, because the command
+            continues with the files of these patterns.
 
     Raises:
         InputError: If `overwrite` is false, and the file exists or the folder
@@ -87,6 +87,7 @@ def require_new_run(folder: Path, key: str, overwrite: bool, resume: bool) -> No
     """
     if checkpoint.exists(folder):
         return
+    # Files of a run that ended before its first checkpoint.
     own: tuple[str, ...] = ()
     if _is_of_training(folder) and not is_finished(folder):
         own = (CONFIG, METRICS)

@@ -49,10 +49,13 @@ class PhotographScores:
         images: Hash of the photographs. It is equal where two networks were
             scored on the same ones.
         labels: Classes under study.
-        metrics: Each metric in `METRICS` by name. None if it is not there.
-        by_label: Such metrics of each label. Empty with a single label.
-        thresholds: Operating point of each label. Empty without one.
-        operating_point: How these were chosen, in words. Empty without one.
+        metrics: Each metric in `METRICS` by name. None if the scores lack it.
+        by_label: The metrics of each label, by label and by name of the
+            metric. Empty with a single label.
+        thresholds: Threshold of the log-odds by label. Empty without an
+            operating point.
+        operating_point: How the thresholds were chosen, in words. Empty without
+            an operating point.
     """
 
     images: str
@@ -64,13 +67,14 @@ class PhotographScores:
 
     @classmethod
     def read(cls, summary: Mapping[str, Any]) -> "PhotographScores":
-        """Read scores, of which files of older versions have a part.
+        """Read scores from the entries of a file. Files of older versions lack some entries.
 
         Args:
-            summary: Contents of summary.json, or what `to_published` returned.
+            summary: Contents of summary.json, or the entries that
+                `to_published` returned.
 
         Returns:
-            Scores that tables show.
+            Scores of one folder of photographs.
 
         Raises:
             Exception: Of any kind, if an entry is missing or damaged.
@@ -109,12 +113,27 @@ class PhotographScores:
 
 
 def _read_metrics(summary: Mapping[str, Any]) -> dict[str, Estimate | None]:
-    """Read each metric in `METRICS` from an entry of summary.json."""
+    """Read the metrics of summary.json, or of one label in it.
+
+    Args:
+        summary: Contents of summary.json, or an entry below "by_label".
+
+    Returns:
+        Each metric in `METRICS` by name. None if the entry lacks it.
+    """
     return {name: read_metric(summary, name) for name in METRICS}
 
 
 def _published(metrics: Mapping[str, Estimate | None]) -> dict[str, dict[str, Any]]:
-    """Convert metrics to entries that a published network carries."""
+    """Convert metrics to plain values for the file of a published network.
+
+    Args:
+        metrics: Metrics by name. None if a metric is unknown.
+
+    Returns:
+        The fields of each metric, such as "value", "low" and "high", by the
+        name of the metric. An unknown metric has no fields.
+    """
     published = {}
     for name, estimate in metrics.items():
         published[name] = {} if estimate is None else asdict(estimate)
@@ -225,8 +244,17 @@ def summarize(folder: Path) -> RunSummary:
 
 
 def _read(folder: Path) -> RunSummary | None:
-    """Read what a folder holds; None if it is neither run, evaluation nor network."""
+    """Read a finished run, an evaluation or a published network.
+
+    Args:
+        folder: Folder that may hold one of the three.
+
+    Returns:
+        The settings and scores. None if the folder holds none of the three.
+    """
     whole = folder.absolute()
+    # An evaluation and a published network have no settings of a training.
+    # The last two parts of the path are the name of the method.
     name = str(Path(*whole.parts[-2:]))
     settings = {"network": str(whole)}
     if is_finished(folder):
@@ -236,6 +264,7 @@ def _read(folder: Path) -> RunSummary | None:
         return RunSummary(whole.parent, name, settings, scores, accuracy=None)
     if (folder / PUBLISHED).is_file():
         values = load_selected(folder)[1].get("scores", {})
+        # The other values are single numbers, such as "test/accuracy".
         entries = {key: value for key, value in values.items() if isinstance(value, dict)}
         scores = {key: PhotographScores.read(entry) for key, entry in entries.items()}
         return RunSummary(folder, name, settings, scores, values.get("test/accuracy"))
@@ -243,7 +272,15 @@ def _read(folder: Path) -> RunSummary | None:
 
 
 def _read_run(folder: Path) -> RunSummary:
-    """Read a finished run."""
+    """Read a finished run and, if there is one, the network that it began with.
+
+    Args:
+        folder: Folder of the run, with config.yaml and metrics.jsonl.
+
+    Returns:
+        The run. Its field `before` has the scores of the initial network.
+    """
+    # Each line of metrics.jsonl is an epoch. The last line has the final scores.
     *epochs, scores = read_metrics(folder)
     config = read_config(folder / CONFIG)
     before = None
@@ -315,6 +352,7 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
         first, once. A name has the method and the settings in which its groups
         differ, or a number and the method if those are many or long.
     """
+    # The key of a group is the text of the settings without the seed.
     groups: dict[str, list[RunSummary]] = {}
     for run in (*_initial_networks(runs), *runs):
         groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
@@ -337,7 +375,16 @@ def group_by_method(runs: Sequence[RunSummary]) -> Methods:
 
 
 def _initial_networks(runs: Sequence[RunSummary]) -> list[RunSummary]:
-    """Return the networks that runs began with, each once."""
+    """List the networks that runs began with.
+
+    Args:
+        runs: Runs, several of which may have begun with the same network.
+
+    Returns:
+        The initial networks in the order of the runs. Two initial networks are
+        the same if their settings and the images that they were scored on are
+        equal. Runs that began with random weights have none.
+    """
     networks = {}
     for run in runs:
         if run.before:
@@ -371,9 +418,18 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
 
 
 def _title_of(group: Scored) -> str:
-    """Name the images of a group, with their numbers if the scores have them."""
+    """Name the images that a group of networks was scored on.
+
+    Args:
+        group: Scored runs of each method, all on the same images.
+
+    Returns:
+        Name of the sub-folder of the scores. The numbers of positive and
+        negative images follow if the AUC of the first run records the numbers.
+    """
     members = [scored for scored_runs in group.values() for scored in scored_runs]
-    # A run with epochs names the folder as its settings do.
+    # A trained run is preferred, because its settings name the sub-folder.
+    # Only a trained run has epochs.
     first = next((scored for scored in members if scored.run.epochs), members[0])
     auc = first.scores.metrics["auc"]
     if not isinstance(auc, AreaUnderCurve):
@@ -415,7 +471,15 @@ def run_tables(methods: Methods, groups: Mapping[str, Scored]) -> list[Table]:
 
 
 def _accuracy_table(methods: Methods) -> Table:
-    """Make the table of the accuracy on the test images."""
+    """Make the table of the accuracy on the test images.
+
+    Args:
+        methods: Runs of each method.
+
+    Returns:
+        Table with two columns: the accuracy of the selected epoch, and the
+        accuracy of the last epoch. Methods without an accuracy have no row.
+    """
     lines: dict[str, list[Line]] = {}
     test_images = []
     for method, runs in methods.items():
@@ -476,9 +540,10 @@ def seconds_table(methods: Methods) -> Table:
         methods: Runs of each method.
 
     Returns:
-        Means over the epochs of the first run of each method: of all phases, of
-        each, of the classifier's part of the attack, and of the operators,
-        which are computed once.
+        Table with a row for the first run of each method. A cell is a mean over
+        the epochs of this run. The columns are all phases together, each phase,
+        the time of the classifier within the attack, and the operators, which
+        are computed once in a run.
     """
     titles = {phase: phase.replace("_", " and ") for phase in PHASES}
     titles["attack_classifier"] = "attack: in the classifier"
@@ -494,31 +559,59 @@ def seconds_table(methods: Methods) -> Table:
 
 
 def _mean_seconds(run: RunSummary, phase: str) -> float | None:
-    """Average the seconds of a phase over the epochs that have it; None if none has."""
+    """Average the seconds of a phase over the epochs of a run.
+
+    Args:
+        run: Run with a mapping of metrics for each epoch.
+        phase: Name of the phase. The metric "seconds/PHASE" holds its seconds.
+
+    Returns:
+        Mean over the epochs that record this phase. None if no epoch does.
+    """
     name = f"seconds/{phase}"
     seconds = [line[name] for line in run.epochs if name in line]
     return fmean(seconds) if seconds else None
 
 
-# The seed of a run, and its metrics, one per column.
+# A row of a table: the seed of a run, and the metric of each column.
 Line = tuple[int | None, Sequence[Estimate | None]]
 
 
 def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[Line]]) -> Table:
-    """Make a table with a row per run, and one with the mean of several seeds of a method."""
+    """Make a table with a row for each run.
+
+    Args:
+        title: Title of the table.
+        header: Titles of the columns of metrics.
+        lines: For each method, the seed and the metrics of each of its runs.
+            The metrics have the order of `header`.
+
+    Returns:
+        Table with the columns "network", "seed" and those of `header`. Below
+        several seeds of a method, one more row has the mean ± standard
+        deviation of each metric.
+    """
     rows = []
     for method, runs in lines.items():
         for seed, metrics in runs:
             cells = map(format_interval, metrics)
             rows.append([method, "" if seed is None else str(seed), *cells])
         if len({seed for seed, _ in runs}) > 1:
+            # Each entry of `columns` has one metric of all runs.
             columns = zip(*(metrics for _, metrics in runs), strict=True)
             rows.append([method, f"{len(runs)} seeds", *map(_spread, columns)])
     return Table(title, ["network", "seed", *header], rows)
 
 
 def _spread(metrics: Sequence[Estimate | None]) -> str:
-    """Return the mean ± standard deviation of a metric, or "-" if a run lacks it."""
+    """Write the mean and the standard deviation of a metric over runs.
+
+    Args:
+        metrics: The same metric of each run. None if a run lacks it.
+
+    Returns:
+        Text such as "0.912 ± 0.004", or "-" if a run lacks the metric.
+    """
     values = [metric.value for metric in metrics if metric is not None and metric.value is not None]
     if len(values) < len(metrics):
         return "-"
@@ -550,12 +643,13 @@ class AttackSummary:
 
     Attributes:
         folder: Folder of the attack.
-        rows: Its examples.
-        successes: Number of successes with a sensor's noise. Attacks of earlier
-            versions counted without noise.
-        without_noise: Number of successes without noise.
-        correct: Number of examples that were correct before the attack, of
-            which successes are counted.
+        rows: A row for each attacked example.
+        successes: Number of examples that are misclassified after the attack,
+            also with a sensor's noise. Attacks of earlier versions counted
+            without noise.
+        without_noise: The same number for images without noise.
+        correct: Number of examples that were classified correctly before the
+            attack. Only these examples can be successes.
         checks: Results of `nb.check` by name.
     """
 
@@ -582,6 +676,7 @@ def read_attack(folder: Path) -> AttackSummary:
     path = folder / LINES
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        # A line describes an example or, with the key "checks", the whole attack.
         examples = [line for line in lines if "example" in line]
         correct = [line for line in examples if not line["success_before"]]
         return AttackSummary(
@@ -599,14 +694,25 @@ def read_attack(folder: Path) -> AttackSummary:
 
 
 def _is_success_without_noise(line: Mapping[str, Any]) -> bool:
-    """Return whether an example is a success without noise, as all are in earlier versions."""
+    """Return whether the attack on an example succeeds in images without noise.
+
+    Args:
+        line: Line of attack.jsonl. Earlier versions have only the key
+            "success", which was measured without noise.
+    """
     return bool(line.get("success_without_noise", line["success"]))
 
 
 def _example_row(line: Mapping[str, Any]) -> ExampleRow:
-    """Make a row of a line of attack.jsonl."""
+    """Make the table row of an example from its line in attack.jsonl.
+
+    Args:
+        line: Line of the example. "label", "predicted" and "confidence" hold
+            a list with one entry for each view.
+    """
     return ExampleRow(
         number=int(line["example"]),
+        # A class that several views share is named once.
         label=", ".join(dict.fromkeys(map(str, line["label"]))),
         before=_predicted(line["predicted_before"], line["confidence_before"]),
         after=_predicted(line["predicted"], line["confidence"]),
@@ -615,13 +721,28 @@ def _example_row(line: Mapping[str, Any]) -> ExampleRow:
 
 
 def _predicted(names: Sequence[str], probabilities: Sequence[float]) -> str:
-    """Write the prediction for each view."""
+    """Write the predicted class of each view with its probability.
+
+    Args:
+        names: Predicted class of each view.
+        probabilities: Probability of this class for each view, in [0, 1].
+
+    Returns:
+        Text such as "81.0% orange, 55.3% lemon".
+    """
     pairs = zip(names, probabilities, strict=True)
     return ", ".join(f"{probability:.1%} {name}" for name, probability in pairs)
 
 
 def _outcome(line: Mapping[str, Any]) -> str:
-    """Say what came of the attack on an example."""
+    """Say whether the attack on an example succeeded, and in how many steps.
+
+    Args:
+        line: Line of the example in attack.jsonl.
+
+    Returns:
+        Text such as "success in 12 steps".
+    """
     if line["success_before"]:
         return "wrong before any step"
     success = "no success"
@@ -696,7 +817,13 @@ def find(folders: Sequence[Path]) -> Findings:
 
 
 def _add(found: Findings, path: Path) -> None:
-    """Read a folder and add it to what was found."""
+    """Read a folder, and append its content to a list of the findings.
+
+    Args:
+        found: Findings, which are changed.
+        path: Folder of an attack, a scored network, or a run. A run that is not
+            finished goes to `found.unfinished`.
+    """
     if (path / LINES).is_file():
         found.attacks.append(read_attack(path))
     elif (path / SUMMARY).is_file() or (path / PUBLISHED).is_file() or is_finished(path):
@@ -707,7 +834,11 @@ def _add(found: Findings, path: Path) -> None:
 
 
 def _walk(folder: Path) -> Iterator[Path]:
-    """Yield the folders of runs and attacks. A run's own evaluations are shown with it."""
+    """Yield the folders of runs, attacks and evaluations in a folder and below it.
+
+    The sub-folders of a run that hold its own scores are left out, because the
+    run is shown with these scores.
+    """
     of_run = {run_log.METRICS, run_lock.FAILURE, checkpoint.LAST, checkpoint.BEST}
     of_others = {LINES, SUMMARY, PUBLISHED}
     for root, below, files in os.walk(folder):

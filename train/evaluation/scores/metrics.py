@@ -265,7 +265,11 @@ class Pool:
         return list(by_path.values())
 
     def _top_estimates(self) -> dict[str, Estimate]:
-        """Compute the metrics in `TOP_RANKS` with their bootstrap intervals."""
+        """Compute the metrics in `TOP_RANKS` with their bootstrap intervals.
+
+        Returns:
+            Each metric by name. Empty if no image has a class of the network.
+        """
         if not self.classified:
             return {}
         values = self._top_statistic(np.ones(len(self.classified)))
@@ -277,9 +281,15 @@ class Pool:
 
     @property
     def _top_statistic(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Function that computes the metrics in `TOP_RANKS` of drawn images."""
+        """Function that computes the metrics in `TOP_RANKS` of drawn images.
+
+        Its argument says how often each of the n images in `classified` is
+        drawn, shape (..., n). It returns both metrics, shape (2, ...).
+        """
         names = [prediction.photograph.label for prediction in self.classified]
         ranks = np.array([prediction.true_rank for prediction in self.classified])
+        # Whether the true class is among the 1 or the 5 most probable classes,
+        # shape (2, n).
         hits = np.stack([ranks <= rank for rank in TOP_RANKS.values()])
         return partial(class_means, hits, names)
 
@@ -289,7 +299,12 @@ class Pool:
         return bootstrap(self._top_statistic, _object_indices(self.classified))
 
     def _ranked_estimates(self) -> list[Estimate]:
-        """Compute the metrics in `RANKED` with their bootstrap intervals."""
+        """Compute the metrics in `RANKED` with their bootstrap intervals.
+
+        Returns:
+            The AUC, and the recall at each rate in `RATES`, in this order. All
+            are unknown without positives or without negatives.
+        """
         if not self._can_rank:
             return [Estimate() for _ in RANKED]
         estimates = []
@@ -329,10 +344,19 @@ class Pool:
 
 
 def _estimate_or_wilson(value: float, replicates: np.ndarray, object_count: int) -> Estimate:
-    """Add the percentile interval to the value of a metric.
+    """Add a 95% interval to the value of a metric.
 
-    If it has zero width, Wilson's interval replaces it, as if each object had
-    one image.
+    The interval is the percentile interval of the bootstrap. If all replicates
+    are equal, the percentile interval has no width. Wilson's interval for a
+    fraction of the objects then replaces it, as if each object had one image.
+
+    Args:
+        value: Value of the metric, in [0, 1].
+        replicates: Bootstrap replicates of the metric, shape (REPLICATES,).
+        object_count: Number of different objects in the images.
+
+    Returns:
+        The value with its interval.
     """
     metric = estimate(value, replicates)
     if metric.low != metric.high:
@@ -459,19 +483,27 @@ class Pooled:
         return self._by_content(lambda prediction: prediction.photograph.label)
 
     def _by_content(self, name_of: Callable[[Prediction], str | None]) -> dict[str, Pool]:
-        """Pool the images by what they show: a mesh or a class.
+        """Make a pool of the images of each mesh, or of each class.
 
-        The images of a positive class are ranked against the negatives of all
-        images. Other images are ranked against the positives of all images.
+        For the ROC curve, the images of a positive class are ranked against the
+        negatives of all meshes and classes. Images of other things are ranked
+        against the positives of all meshes and classes.
+
+        Args:
+            name_of: Function that returns the name of the mesh or class that
+                the image of a prediction shows. None if it is unknown.
+
+        Returns:
+            Pools by the name of the mesh or class.
         """
         labels = {prediction.label for prediction in self.predictions}
         pools = {}
         for name, group in _group(self._included, name_of).items():
             own_pool = pool(group, self.thresholds)
-            # Example with the labels orange and lemon: an image of an orange is a
-            # positive for the label orange and a negative for the label lemon.
-            # Such negatives are left out here, because all negatives of this
-            # mesh or class would be images of the mesh or class itself.
+            # With the labels orange and lemon, an image of an orange has two
+            # predictions: a positive about orange, and a negative about lemon.
+            # The negative about lemon is left out here. Otherwise the oranges
+            # would be ranked only against predictions for the same oranges.
             negatives = []
             for prediction in own_pool.negatives:
                 if prediction.photograph.label not in labels:
@@ -734,8 +766,9 @@ def thresholds(
 ) -> list[np.ndarray]:
     """Find the score threshold for each false-positive rate.
 
-    It is the lowest score of a negative that at most this fraction of the
-    negatives exceed.
+    The threshold is the lowest of the scores of the negatives that is high
+    enough: at most the given fraction of the negatives score above it. With the
+    rate 0.10 and 20 negatives, at most 2 score above the threshold.
 
     Args:
         negatives: Scores of the negatives, shape (m,).
@@ -805,6 +838,7 @@ def _find_entry(summary: Mapping[str, Any], name: str) -> dict[str, Any]:
     """
     entry: Any = summary
     for key in name.split("/"):
+        # An entry that is missing is empty, and so are all entries below it.
         entry = entry.get(key, {})
     return entry or summary.get(name, {})
 
