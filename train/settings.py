@@ -350,7 +350,10 @@ class TrainSettings(Settings):
 
 @dataclass
 class EvaluationSettings(Settings):
-    """Photographs on which the trained network is scored, besides the test set."""
+    """Settings of the photographs on which the trained network is scored.
+
+    Its scores on the test set are computed in any case.
+    """
 
     # OmegaConf has no type for str | dict[str, str] | None.
     photos: Any = setting(
@@ -432,13 +435,25 @@ class NetworkSettings(Settings):
 
 
 def normalized_light_values(value: Any) -> dict[str, float] | None:
-    """Return all fields of a value of `normalize_light` by name, as files record them."""
+    """Read a value of the setting `normalize_light`.
+
+    Args:
+        value: True, a mapping of some fields of normalized light, or None.
+
+    Returns:
+        All fields by name, as files record them. None without normalized light.
+    """
     light = read_normalized_light(value)
     return None if light is None else asdict(light)
 
 
 def class_texts(classes: Any) -> Any:
-    """Return class names as texts, since YAML reads digits as numbers."""
+    """Convert class names that YAML has read as numbers, such as 0, to texts.
+
+    Args:
+        classes: A list of names and whole numbers. Other values are returned
+            unchanged.
+    """
     if not isinstance(classes, list):
         return classes
     return [str(name) if is_whole(name) else name for name in classes]
@@ -499,7 +514,11 @@ class ExperimentSettings(NetworkSettings):
             require_range(product, self.augment.examples, 1, MAX_EXAMPLES)
 
     def _remove_generated_positives(self) -> None:
-        """Remove the hard negatives that are solids of a positive class and name no class."""
+        """Remove hard negatives that show a positive class.
+
+        For the label orange, "solid:orange" is removed. A hard negative in the
+        form of a mapping names its own class, and is kept.
+        """
         names = {simplified(name) for name in label_names(self.label)}
         self.scene.hard_negatives = [
             item
@@ -520,12 +539,19 @@ class ExperimentSettings(NetworkSettings):
 
     @property
     def hard_negatives(self) -> dict[str, ObjectSettings]:
-        """Return the hard negatives of the scene by their keys. Without a class, it is OTHER."""
+        """Return the settings of each hard negative of the scene by its key.
+
+        A hard negative that names no class gets the class OTHER.
+        """
         return read_objects(self.scene.hard_negatives, OTHER, "scene.hard_negatives")
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """Return the meshes and the hard negatives of the scene by their keys."""
+        """Return the settings of each mesh and each hard negative of the scene by its key.
+
+        A mesh that names no class gets the label of the run if the run has one
+        label. Otherwise it gets the name of its solid.
+        """
         labels = label_names(self.label)
         label = labels[0] if len(labels) == 1 else ""
         meshes = read_objects(self.scene.meshes, label, "scene.meshes")
@@ -544,11 +570,12 @@ class ExperimentSettings(NetworkSettings):
 
 
 def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:
-    """Read a list of objects.
+    """Read a list of objects in the settings of a scene.
 
     Args:
-        items: Files, solids or mappings.
-        label: Class of the objects that have no label of their own.
+        items: Each is a file, a solid, or a mapping with fields of
+            `ObjectSettings`.
+        label: Default class, for the objects that name no class.
         key: Key of the list in the settings, such as "scene.meshes".
 
     Returns:
@@ -567,7 +594,7 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
     Args:
         item: A file, a solid, or a mapping with fields of `ObjectSettings`.
-        label: Class of an object that has no label of its own.
+        label: Default class, which is used if the object names no class.
         key: Key of the object, for errors.
 
     Returns:
@@ -585,6 +612,7 @@ def read_object(item: Any, label: str, key: str) -> ObjectSettings:
 
 def solid_name(mesh: str) -> str:
     """Return the NAME of solid:NAME or solid:NAME:SEED, and "" for a file."""
+    # The empty text is the name if `mesh` has no colon.
     kind, name, *_ = [*mesh.split(":"), ""]
     return name if kind == "solid" else ""
 
@@ -637,11 +665,12 @@ def published(run: Path) -> Path:
     """Find a network or a folder of the installation.
 
     Args:
-        run: A path. If there is none and it begins with pretrained/, the file or folder of that
-            name in the installation or the clone stands for it.
+        run: A path. If it does not exist and begins with pretrained/, the file
+            or folder of this name in the installation, or in the clone of the
+            repository, is used.
 
     Returns:
-        The path that exists, otherwise `run`.
+        The path that exists. `run` itself if none exists.
     """
     candidates = [run]
     if run.parts[:1] == ("pretrained",):
@@ -667,11 +696,12 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
-    """Return nested settings with each text changed.
+    """Return a copy of nested settings in which each text is changed.
 
     Args:
-        value: A text, or nested mappings and lists.
-        change: Function of each text.
+        value: A text, or nested mappings and lists of texts and other values.
+        change: Function that returns the new text for a text. Keys of mappings
+            and values that are no text stay the same.
     """
     if isinstance(value, dict):
         return {key: mapped(item, change) for key, item in value.items()}

@@ -7,7 +7,8 @@ from tqdm import tqdm
 
 from train.runs.run_log import PHASES
 
-# Diagnostics of the attack that metrics.jsonl has for each round.
+# Diagnostics of the attack that `epoch_metrics` records for each round, if an epoch
+# has several rounds.
 SHOWN = ("attack_success_before", "attack_success", "steps")
 
 
@@ -87,11 +88,15 @@ def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float 
     """Compute how often an attack succeeds on examples that are correct before it.
 
     Args:
-        diagnostics: The diagnostics of the attack.
-        prefix: What the names of the diagnostics begin with.
+        diagnostics: Values by name. "attack_success_before" and
+            "attack_success" are the fractions of all examples that are
+            misclassified before and after the attack.
+        prefix: Text before the names of the diagnostics, such as "augment/".
 
     Returns:
-        The fraction of these examples, or None if there are none.
+        Among the examples that are classified correctly before the attack, the
+        fraction that is misclassified after it. None if no example is correct
+        before, or if there was no attack.
     """
     before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
     if before == 1:

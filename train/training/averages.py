@@ -34,7 +34,7 @@ class MovingAverage(AveragedModel):
             return super().update_parameters(model)
         averages = [*self.module.parameters(), *self.module.buffers()]
         latest = [*model.parameters(), *model.buffers()]
-        # `_average` takes tensors of one type at a time.
+        # `_average` takes either floating-point tensors or integer tensors.
         for is_floating in (True, False):
             old = []
             new = []
@@ -112,10 +112,12 @@ class Averages:
         """Return whether the selected network replaces the one that was kept before.
 
         Args:
-            accuracy: Its accuracy on the validation images, between 0 and 1.
+            accuracy: Accuracy of the selected network on the validation images,
+                in [0, 1].
 
         Returns:
-            Whether it validates better than all before, or the latest network is kept anyway.
+            True if the accuracy is higher than in all epochs before, or if the
+            latest network is always kept.
         """
         is_best = accuracy > self._best_accuracy
         self._best_accuracy = max(accuracy, self._best_accuracy)
@@ -127,7 +129,12 @@ class Averages:
         return {name: value.to("cpu", copy=True) for name, value in state.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint needs of the averages."""
+        """Return the states of the moving average and of the soup for a checkpoint.
+
+        Returns:
+            States under the keys "ema" and "soup". None in place of an average
+            that the training does not have.
+        """
         return {
             "ema": self._ema.state_dict() if self._ema else None,
             "soup": self._soup.state_dict() if self._soup else None,
@@ -137,8 +144,9 @@ class Averages:
         """Restore the averages.
 
         Args:
-            state: What `state_dict` returned.
-            accuracies: The validation accuracies of the epochs before.
+            state: Mapping with the entries that `state_dict` returned.
+            accuracies: Validation accuracies of the finished epochs. The
+                highest one is the accuracy to exceed.
         """
         if self._ema:
             self._ema.load_state_dict(state["ema"])

@@ -44,7 +44,14 @@ def load_data(settings: ExperimentSettings, initial: Initial | None = None) -> D
 
 
 def _load(name: str, settings: ExperimentSettings, initial: Initial | None) -> DataSet:
-    """Load the data set of a name in `SOURCES`."""
+    """Load the data set that `name` stands for.
+
+    Args:
+        name: A name in `SOURCES`.
+        settings: Settings of the run, with the path and the size of the data.
+        initial: Network that the run begins with. If the settings give no size,
+            the images get the size of its images. None for random weights.
+    """
     data = settings.data
     if name == "cifar100":
         return load_cifar100(data.path)

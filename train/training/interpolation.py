@@ -39,9 +39,10 @@ def interpolate(
 ) -> tuple[dict[str, Tensor], float]:
     """Interpolate by the factor with the lowest loss on validation images.
 
-    The loss is that of the training: the divergence from the predictions of
-    the initial network for the unchanged images, of the predictions for
-    unchanged images and of those for images in the light of a projector.
+    The loss is the weighted sum of two divergences. The first compares the
+    predictions for unchanged images, and the second the predictions for images
+    in the light of a projector. Both are divergences from the predictions of
+    the initial network for the unchanged images, as in the training.
 
     Args:
         initial: Network before the training.
@@ -57,6 +58,7 @@ def interpolate(
     """
     begin = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     wanted = predict(initial, validation)
+    # Key of the random stream of the light, which is the same for all factors.
     key = (seed, "validation")
     lowest = float("inf")
     best_factor = FACTORS[0]

@@ -59,10 +59,10 @@ class EpochState:
 
     Attributes:
         renders: The renders of the current round.
-        sums: Loss and correct predictions, summed over the images that this process has trained
-            on, shape (2,).
-        diagnostics: The diagnostics of the renders of each round so far.
-        step: The steps taken, in all rounds.
+        sums: Two sums over the images that this process has trained on in this
+            epoch, shape (2,): of the loss, and of the correct predictions.
+        diagnostics: For each round so far, values of the attack by name.
+        step: Number of steps that were taken in this epoch.
     """
 
     renders: Renders
@@ -90,7 +90,8 @@ class EpochPlan:
 
     Attributes:
         split: The images.
-        rows: The rows of the split to learn from, of which the rounds draw some.
+        rows: Indices of the images in the split that the network learns from,
+            shape (N,). The rounds draw some of them.
         rounds: The rounds.
         steps: The number of steps of each round.
     """
@@ -164,7 +165,7 @@ class Trainer:
         self._best: dict[str, Any] | None = None
         # Time of the last checkpoint or, before the first one, of the start.
         self._saved_at = time.perf_counter()
-        # Seconds that it took to write the last checkpoint.
+        # Seconds that writing the last checkpoint took.
         self._saving_took = 0.0
 
         self.model = model
@@ -183,10 +184,15 @@ class Trainer:
         self._build_step(labeled)
 
     def _build_step(self, labeled: bool) -> None:
-        """Build what a step needs: the optimizer, the loss and the augmentation."""
+        """Build the optimizer, the gradient scaler, the loss and the augmentation.
+
+        Args:
+            labeled: Whether the labels of the data are known.
+        """
         settings = self.settings
         positive_classes = self.service.positive_classes
-        # This may replace layers, so the optimizer comes after it.
+        # `wrap_ddp` may replace layers of the network. The optimizer is built
+        # afterwards, so that it has the parameters of the new layers.
         replica = wrap_ddp(self.model)
         with progress_message("loading the optimizer"):  # torch imports its compiler here: seconds.
             self.optimizer = build_optimizer(self.model, settings)
@@ -196,6 +202,8 @@ class Trainer:
         teacher = self.initial if has_teacher else None
         with keyed(choice="compile"):
             is_compiled = compiles(settings.compile, self.device)
+        # The module that computes the logits of the teacher. It may reuse frozen
+        # layers of the network in training.
         answering: nn.Module | None = teacher
         if teacher is not None and not is_compiled:
             answering = share_layers(settings, self.model, teacher, self.architecture["size"])
@@ -260,7 +268,18 @@ class Trainer:
         signals: SignalHandler,
         log: RunLog | None,
     ) -> bool:
-        """Take the remaining steps of an epoch. Return False if a signal came before the last."""
+        """Take the remaining steps of an epoch.
+
+        Args:
+            split: Images and labels.
+            rows: Indices of the images to learn from, shape (N,).
+            signals: Signals that ask the run to stop.
+            log: Log of the run. None in all processes but the first one.
+
+        Returns:
+            Whether all steps were taken. False if a signal came before the last
+            step.
+        """
         plan = self._plan(split, rows)
         if self._under_way is None:
             self._under_way = self._begin_epoch(plan, log)
@@ -269,6 +288,7 @@ class Trainer:
         state = self._under_way
         with closing(self._remaining_batches(plan, state, log)) as batches:
             for batch in batches:
+                # The number of the step in the whole run.
                 number = self.epoch * plan.total + state.step
                 state.sums += self._step(*batch, state.step / plan.total, number)
                 state.step += 1
@@ -279,7 +299,12 @@ class Trainer:
         return True
 
     def _plan(self, split: Split, rows: Tensor) -> EpochPlan:
-        """Divide the epoch into rounds and steps."""
+        """Divide the current epoch into rounds, and count the steps of each.
+
+        Args:
+            split: Images and labels.
+            rows: Indices of the images to learn from, shape (N,).
+        """
         settings = self.settings
         rounds = rounds_of_epoch(
             len(rows),
@@ -293,7 +318,7 @@ class Trainer:
         return EpochPlan(split, rows, rounds, steps)
 
     def _begin_epoch(self, plan: EpochPlan, log: RunLog | None) -> EpochState:
-        """Render for the first round of an epoch."""
+        """Render the images of the first round of an epoch, and return the new state."""
         self.averages.begin_epoch(self.initial, self.optimizer)
         renders = self._regenerate(plan.rounds[0], log)
         return EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
@@ -301,7 +326,17 @@ class Trainer:
     def _remaining_batches(
         self, plan: EpochPlan, state: EpochState, log: RunLog | None
     ) -> Generator[Batch, None, None]:
-        """Yield the remaining batches of an epoch, and render before each of its other rounds."""
+        """Yield the remaining batches of an epoch.
+
+        Before each round but the first one of the epoch, new images are rendered.
+
+        Args:
+            plan: Images and rounds of the epoch.
+            state: State of the epoch. The renders and diagnostics of each new
+                round are stored in it.
+            log: Log of the run. None in all processes but the first one.
+        """
+        # Each round that has begun has diagnostics.
         current = len(state.diagnostics) - 1
         for index in range(current, len(plan.rounds)):
             if index == len(state.diagnostics):
@@ -325,7 +360,7 @@ class Trainer:
                 yield from progress(batches, title, plan.steps[index], first)
 
     def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
-        """Render for a round, and log a few of its attacks."""
+        """Render the images of a round, and log a few of the attacked ones."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
@@ -345,7 +380,7 @@ class Trainer:
         progress: float,
         number: int,
     ) -> Tensor:
-        """Learn from a batch.
+        """Change the weights by the gradient of the loss of a batch.
 
         Args:
             images: The images, uint8, shape (B, 3, H, W).
@@ -369,6 +404,8 @@ class Trainer:
             tensors = [images, labels, rendered, augmented]
         self.optimizer.zero_grad(set_to_none=True)
         sums = torch.zeros(2, device=self.device)
+        # Each tensor is divided along the batch. A part has one chunk of each tensor.
+        # The gradients of all parts are added.
         chunks = [tensor.chunk(settings.accumulation_steps) for tensor in tensors]
         parts = zip(*chunks, strict=True)
         for part in parts:
@@ -385,7 +422,13 @@ class Trainer:
         return sums
 
     def _end_epoch(self, split: Split, rows: Tensor, log: RunLog | None) -> None:
-        """Validate on some rows of a split, remember the best network, and log the metrics."""
+        """Validate the network, remember it if it is the best, and log the metrics.
+
+        Args:
+            split: Images and labels.
+            rows: Indices of the images that validate, shape (N,).
+            log: Log of the run. None in all processes but the first one.
+        """
         state = cast(EpochState, self._under_way)
         self._under_way = None
         loss_sum, hits = all_reduce_sum(state.sums).tolist()
@@ -410,7 +453,8 @@ class Trainer:
             "accuracy": hits / images,
             "learning_rate": self.optimizer.param_groups[0]["lr"],
         }
-        # A run that is resumed after its last attack of the epoch has no more of that phase.
+        # If a run was resumed after the last attack of the epoch, no time of the phase
+        # "attack" was measured. It then counts as 0 seconds.
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()
         metrics = epoch_metrics(trained, validated, state.diagnostics, seconds)
         self.history.append({"epoch": self.epoch, **metrics})
@@ -419,7 +463,12 @@ class Trainer:
         console.debug("%s", format_epoch(self.epoch, self.settings.epochs, metrics))
 
     def _require_finite(self, loss: float, epoch: int) -> None:
-        """Raise InputError if the loss or a weight is NaN or infinite."""
+        """Raise InputError if the loss or a weight is NaN or infinite.
+
+        Args:
+            loss: Sum of losses.
+            epoch: Number of the epoch, from 1, for the error.
+        """
         weights = self.model.network.state_dict().values()
         is_finite = torch.stack([value.isfinite().all() for value in weights]).all()
         if not (math.isfinite(loss) and is_finite):
@@ -430,7 +479,10 @@ class Trainer:
             raise InputError(f"{rate} with {decay} {effect}: set lower values", "learning_rate")
 
     def _save(self) -> None:
-        """Write last.pt, keep its predecessor, and write best.pt if there is a better network."""
+        """Write the checkpoint last.pt, and best.pt if a network was selected since the last time.
+
+        The former last.pt is kept as previous.pt. Only the first process writes.
+        """
         if self._under_way:
             self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
         # The line of the epoch in metrics.jsonl is written before the checkpoint, so
@@ -508,11 +560,16 @@ class Trainer:
             self._under_way = self._restored_epoch(state["under_way"])
 
     def _restored_epoch(self, state: Mapping[str, Any]) -> EpochState:
-        """Restore the state within an epoch."""
+        """Restore the state within an epoch from a checkpoint.
+
+        Args:
+            state: Values that `EpochState.state_dict` returned.
+        """
         images = to_unit(state["images"]).to(self.device)
         labels = state["labels"].to(self.device)
         renders = Renders(images, labels, state["diagnostics"][-1])
-        # The sums are over all processes. Only one process may add them.
+        # The stored sums are over all processes. The first process takes them, and
+        # the others begin at 0, so that a later sum over processes counts them once.
         sums = state["sums"].to(self.device) * (distributed.rank() == 0)
         return EpochState(renders, sums, state["diagnostics"], state["step"])
 
@@ -590,14 +647,15 @@ def evaluate(model: nn.Module, split: Split, rows: Tensor | None = None) -> dict
         rows: The rows of the split to score, shape (N,). None for all.
 
     Returns:
-        loss: The mean cross entropy.
-        accuracy: The fraction of images whose class is right.
+        Mapping with two keys: "loss", the mean cross entropy, and "accuracy",
+        the fraction of images whose class is right.
     """
     device = split.labels.device
     if rows is None:
         rows = torch.arange(len(split))
     rows = rows.to(device)
     totals = torch.zeros(2, device=device)
+    # Both are views of `totals`, so adding to them changes `totals`.
     loss_sum, hits = totals
     batches = rows[distributed.rank() :: distributed.world_size()].split(EVALUATION_BATCH)
     shown = progress(batches, f"{len(rows)} images")

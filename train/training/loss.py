@@ -13,10 +13,13 @@ from train.settings import TrainSettings
 class TrainingLoss:
     """The loss of a batch of images, some of which are renders.
 
-    It is the mean of the label loss. With their weights in the settings, three terms are added:
-    the ranking loss of the positive classes, the divergence from a teacher's predictions, and the
-    divergence of the predictions for augmented images from the teacher's predictions for the same
-    images without augmentation.
+    The loss is the mean of the label loss plus three terms, each with a weight
+    in the settings:
+
+    - the ranking loss of the positive classes;
+    - distillation: the divergence of the predictions from those of a teacher;
+    - consistency: the divergence of the predictions for augmented images from
+      the predictions of the teacher for the same images without augmentation.
 
     Args:
         model: The network, from images in [0, 1] to logits.
@@ -90,10 +93,19 @@ class TrainingLoss:
         return loss, hits
 
     def _changes(self, logits: Tensor, targets: Tensor, rendered: Tensor) -> Tensor:
-        """Return the divergence of each image's prediction from the teacher's, shape (B,).
+        """Compute how far the predictions are from those of the teacher.
 
-        On renders, the predictions of the positive classes may change, and only the other classes
-        are compared. Without positive classes, renders have no divergence.
+        The predictions for renders may change in the positive classes, so only
+        the other classes of renders are compared. Without positive classes,
+        renders have the divergence 0.
+
+        Args:
+            logits: Logits of the network, shape (B, classes).
+            targets: Logits of the teacher, shape (B, classes).
+            rendered: Which of the images are renders, bool, shape (B,).
+
+        Returns:
+            Kullback-Leibler divergence of each image, shape (B,).
         """
         changes = kl_divergence(logits, targets) * ~rendered
         if self._positive_classes:

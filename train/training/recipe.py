@@ -22,17 +22,34 @@ WARMUP = 0.2
 
 
 def _step(done: float) -> float:
-    """Return the factor of the learning rate of "step" after a fraction of the training."""
+    """Return the factor of the learning rate in the schedule "step".
+
+    Args:
+        done: Fraction of the training that is done, in [0, 1].
+    """
     return STEP_FACTOR ** sum(done >= milestone for milestone in MILESTONES)
 
 
 def _cosine(done: float) -> float:
-    """Return the factor of "cosine", half a period of a cosine from 1 to 0."""
+    """Return the factor of the learning rate in the schedule "cosine".
+
+    The factor falls from 1 to 0 along half a period of a cosine.
+
+    Args:
+        done: Fraction of the training that is done, in [0, 1].
+    """
     return (1 + math.cos(math.pi * done)) / 2
 
 
 def _one_cycle(done: float) -> float:
-    """Return the factor of "one_cycle", which rises and falls linearly. It suits few epochs."""
+    """Return the factor of the learning rate in the schedule "one_cycle".
+
+    The factor rises linearly to 1, and then falls linearly to 0. The schedule
+    suits trainings of few epochs.
+
+    Args:
+        done: Fraction of the training that is done, in [0, 1].
+    """
     if done < WARMUP:
         return START_FACTOR + (1 - START_FACTOR) * done / WARMUP
     return (1 - done) / (1 - WARMUP)
@@ -102,6 +119,7 @@ def last_layer(network: nn.Module) -> str:
         Name, such as "head.fc". Empty for the network itself.
     """
     *_, (name, _) = network.named_parameters()
+    # The name of a parameter is that of its module, followed by ".weight" or such.
     return name.rpartition(".")[0]
 
 
@@ -119,7 +137,10 @@ def freeze(network: nn.Module, stage: str) -> None:
             parameters.
     """
     names = [name for name, _ in network.named_parameters()]
+    # The module that has each parameter.
     modules = [name.rpartition(".")[0] for name in names]
+    # `frozen` holds the indices of parameters of the frozen modules. The last of
+    # these indices is where freezing ends.
     if stage == ALL_BUT_LAST:
         last = last_layer(network)
         frozen = [index for index, module in enumerate(modules) if module != last]

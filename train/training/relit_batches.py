@@ -14,7 +14,7 @@ from augment.random_streams import generator
 from renderer.image import decode, to_bytes, to_unit
 from train.settings import TrainSettings
 
-# Cells per side with a factor of their own, as in the attack.
+# Cells per side of the grid of factors of a slide, as in the attack on photographs.
 CELLS = RelightingSettings().cells
 
 
@@ -56,6 +56,7 @@ class RelitBatches:
         Returns:
             The relit images, uint8, shape (B, 3, size, size).
         """
+        # Each step and each process has random draws of its own.
         draws = generator(self._seed, step, "relight", distributed.rank())
         count, _, size, _ = images.shape
         light = draw_projected_light(count, size, draws, images).to(images.device)

@@ -67,7 +67,8 @@ from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, learning_rate
 from train.training.renders import build_service
 
-# Number of images whose channels are measured if the images are on disk.
+# If the images are on disk, `build_trainer` measures the mean and the standard
+# deviation of the channels on this many images.
 SAMPLED = 1000
 
 
@@ -120,12 +121,14 @@ class Run:
                 are wrong.
         """
         settings = self.settings
+        # The labels of the data become indices into the classes of the network.
         self.data = _data_for(settings, self.data, self.initial)
         for name, photographs in settings.evaluate.folders.items():
             require_outside(self.folder / name, photographs)
             _require_names(settings, self.data)
             find_photographs(photographs, self.data.classes, settings.label)
         set_deterministic(settings.train.deterministic)
+        # The settings of the run that is resumed. None for a new run.
         before = self._require_folder()
         part = choose_validation(settings, self.data, self.initial)
         with keyed(fraction="data.validation"):
@@ -207,7 +210,16 @@ class Run:
                 console.info("it needs normalized light before it: normalize_light=%s", given)
 
     def _require_folder(self) -> DictConfig | None:
-        """Return the settings of the run that is resumed in the folder. None for a new run."""
+        """Check that the run may write to its folder.
+
+        Returns:
+            Settings of the run in the folder that is resumed. None for a new
+            run.
+
+        Raises:
+            InputError: If the folder holds a run, and the settings neither
+                resume it nor allow to overwrite it.
+        """
         resumes = self.settings.train.resume
         begins_anew = self.settings.overwrite and not resumes
         if begins_anew or not checkpoint.exists(self.folder):
@@ -219,7 +231,17 @@ class Run:
         return require_same_run(self.folder, self.settings)
 
     def _asked_threads(self, before: DictConfig | None) -> int | None:
-        """Return the number of threads in the settings, or of the run that is resumed."""
+        """Return the number of threads that the run should train with.
+
+        A resumed run keeps its number of threads unless the settings give one,
+        because the number changes the last bits of sums.
+
+        Args:
+            before: Settings of the run that is resumed. None for a new run.
+
+        Returns:
+            The number. None if it is still to be chosen.
+        """
         asked = self.settings.train.threads
         if asked or before is None:
             return asked
@@ -227,7 +249,11 @@ class Run:
         return recorded if isinstance(recorded, int) and recorded > 0 else None
 
     def _warn_of_stretched_schedule(self, planned: int) -> None:
-        """Warn if a new number of epochs changes the learning rate of a resumed run."""
+        """Warn if a new number of epochs changes the learning rate of a resumed run.
+
+        Args:
+            planned: Number of epochs that the run had before it was stopped.
+        """
         recipe = self.settings.train
         # Each epoch of a soup runs through the whole schedule, so that the number of
         # epochs does not change it.
@@ -262,7 +288,14 @@ class Run:
         )
 
     def _score_initial(self, model: MixedPrecision) -> None:
-        """Score the initial network, and label unlabeled data by its predictions."""
+        """Score the initial network on the test images and the photographs.
+
+        If the data have no labels, the predictions of the initial network become
+        the labels of the test images and of the images that validate.
+
+        Args:
+            model: The initial network.
+        """
         settings = self.settings
         # The code of a foreign function may change unseen, so its logits are not stored.
         is_foreign = settings.model.name.startswith(PYTHON)
@@ -271,7 +304,8 @@ class Run:
         test = self.data.test
         self._initial_predictions = self._predicted_classes(predict, test)
         if not self.data.labeled:
-            # The loss asks the teacher about the images that the network learns from.
+            # The images that the network learns from need no labels here. The
+            # loss computes the predictions of the initial network for them.
             labels = self.data.train.labels.clone()
             held_out = self.data.train[self.held_out]
             labels[self.held_out] = self._predicted_classes(predict, held_out)
@@ -290,7 +324,11 @@ class Run:
         self._scores["test/accuracy_before"] = accuracy
 
     def _render_kept_aside(self) -> None:
-        """Render the images that are kept aside, unless there are photographs or the renders."""
+        """Render test images of other instances and patterns than those of the training.
+
+        Nothing is rendered if the settings name photographs, if they ask for no
+        renders, or if a resumed run has rendered them already.
+        """
         if self.scored_folders or not self.settings.evaluate.laboratory_setups:
             return
         folder = self.folder / KEPT_ASIDE
@@ -306,7 +344,15 @@ class Run:
         self.scored_folders = {LABORATORY: folder}
 
     def _predicted_classes(self, model: Model, split: Split) -> Tensor:
-        """Return the classes that a model gives the images of a split, shape (N,)."""
+        """Predict the class of each image of a split.
+
+        Args:
+            model: Network, from images in [0, 1] to logits.
+            split: N images.
+
+        Returns:
+            Index of the class with the largest logit, int64, shape (N,).
+        """
         batches = torch.arange(len(split)).split(BATCH)
         count = len(self.trainer.architecture["classes"])
         classes = [
@@ -316,9 +362,15 @@ class Run:
         return torch.cat(classes)
 
     def _test_scores(self) -> dict[str, float]:
-        """Look at the test images once: with the last network and, if it is another, the best.
+        """Compute the test accuracy of the last network and of the selected network.
 
-        The best network stays loaded.
+        The selected network is the one in best.pt. Afterwards,
+        `self.trainer.selected` has its weights.
+
+        Returns:
+            "test/accuracy" of the selected network, "test/accuracy_last" of the
+            last network, "test/epoch" with the epoch of the selected network
+            and, if it was interpolated, "test/interpolation" with the factor.
         """
         trainer = self.trainer
         test = self.data.test.to(trainer.device)
@@ -347,9 +399,17 @@ class Run:
         return scores
 
     def _interpolated(self, best: dict[str, Any]) -> dict[str, Any]:
-        """Return the checkpoint of the interpolated network, and write it as best.pt.
+        """Interpolate between the initial and the trained weights, and write best.pt.
 
-        The run may have written it before it was stopped.
+        Nothing changes if best.pt holds interpolated weights already, because
+        the run was stopped after this step.
+
+        Args:
+            best: Checkpoint in best.pt.
+
+        Returns:
+            Copy of the checkpoint with the interpolated weights and their
+            factor.
         """
         trainer = self.trainer
         if INTERPOLATION in best or trainer.initial is None:
@@ -370,7 +430,17 @@ class Run:
         return interpolated
 
     def _agreement(self, initial_predictions: Tensor) -> float:
-        """Return the fraction of test images that both networks predict as the same class."""
+        """Compute how often the selected network predicts the class of the initial network.
+
+        Args:
+            initial_predictions: Class that the initial network predicts for each
+                test image, shape (N,).
+
+        Returns:
+            Fraction of the test images, in [0, 1].
+        """
+        # The labels of unlabeled data are the predictions of the initial network,
+        # so the accuracy is the agreement.
         agreement = self._scores["test/accuracy"]
         if self.data.labeled:
             answered = Split(self.data.test.images, initial_predictions).to(self.trainer.device)
@@ -384,7 +454,22 @@ class Run:
         return agreement
 
     def _relit_scores(self, initial: MixedPrecision) -> dict[str, float]:
-        """Return how often both networks predict relit test images as the initial one unchanged."""
+        """Compare predictions for relit test images with those for unchanged images.
+
+        The reference is always the class that the initial network predicts for
+        the unchanged image.
+
+        Args:
+            initial: Network before the training.
+
+        Returns:
+            Three fractions of the test images whose predicted class is that of
+            the reference:
+
+            - "test/agreement": selected network, unchanged images;
+            - "test/relit_agreement_before": initial network, relit images;
+            - "test/relit_agreement_after": selected network, relit images.
+        """
         test = self.data.test
         wanted = predict(initial, test)
         scores = {"test/agreement": agreement(predict(self.trainer.selected, test), wanted)}
@@ -403,9 +488,13 @@ class Run:
         """Score a model on one of the folders of photographs of this run.
 
         Args:
-            model: The model.
-            name: Key of the photographs in `scored_folders`.
-            folder: Folder of the run. The scores are written to its sub-folder `name`.
+            model: Network, from images in [0, 1] to logits.
+            name: Key of the folder of photographs in `self.scored_folders`.
+            folder: The scores are written to the sub-folder `name` of this
+                folder.
+
+        Returns:
+            The scores, as they are written.
         """
         asked = self.settings.evaluate
         return evaluate_photographs(
@@ -445,7 +534,10 @@ def load_runs(methods: Mapping[Path, ExperimentSettings], command: str) -> list[
 
 
 def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
-    """Raise InputError if the label is an index, which scores on photographs do not know."""
+    """Raise InputError if the label is the index of a class instead of its name.
+
+    Scores on photographs know classes only by name.
+    """
     for name in label_names(settings.label):
         known = class_name(data.classes, name, "label")
         if known != name:
@@ -453,7 +545,21 @@ def _require_names(settings: ExperimentSettings, data: DataSet) -> None:
 
 
 def _data_for(settings: ExperimentSettings, data: DataSet, initial: Initial | None) -> DataSet:
-    """Return the data in the classes that the run's network has."""
+    """Return a copy of the data whose labels are indices into the classes of the network.
+
+    Args:
+        settings: Settings of the run.
+        data: Data set as it was loaded.
+        initial: Network that the run begins with. None for random weights.
+
+    Returns:
+        The data set. If the data have no labels, only its classes change. With
+        random weights, the data set stays the same.
+
+    Raises:
+        InputError: If the data have no labels and the run has no network to
+            imitate, or if the network lacks a class of the data.
+    """
     if not data.labeled:
         if not (initial and settings.train.distillation_weight):
             missing = "set train.init_from and train.distillation_weight"
@@ -534,7 +640,17 @@ def build_trainer(
 
 
 def _network_shape(settings: ExperimentSettings, initial: Initial | None) -> dict[str, Any]:
-    """Return the arguments that build the network: the settings, or the initial classifier."""
+    """Return the arguments of `build_network` by name.
+
+    Args:
+        settings: Settings of the run. Without an initial classifier, they
+            decide.
+        initial: Network that the run begins with. None for random weights.
+
+    Raises:
+        InputError: If the settings name another network than the initial
+            classifier.
+    """
     shape = settings.model.shape
     if initial is None or not initial.is_classifier:
         return shape
@@ -564,7 +680,16 @@ def describe_test_images(settings: ExperimentSettings, data: DataSet) -> str:
 
 
 def _photograph_scores(name: str, scores: Scores) -> dict[str, float]:
-    """Return the known metrics of photographs and of each label, by name."""
+    """Name the metrics of a folder of photographs as metrics.jsonl has them.
+
+    Args:
+        name: Name of the folder of photographs, such as "photographs".
+        scores: Scores on these photographs.
+
+    Returns:
+        Values of the known metrics by names such as "photographs/auc" and, with
+        several labels, "photographs/orange/auc".
+    """
     parts = {name: scores.overall}
     for label, metrics in scores.by_label.items():
         parts[f"{name}/{label}"] = metrics
