@@ -44,6 +44,7 @@ default_role = "py:obj"
 html_theme = "furo"
 html_title = f"{project} {version}"
 html_show_sourcelink = False
+html_favicon = "static/icon.svg"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
