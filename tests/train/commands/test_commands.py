@@ -238,7 +238,7 @@ def photographed_cup(here) -> Path:
     ("arguments", "message"),
     [
         (["mask=small.png"], "mask=small.png has 9 × 9 pixels"),
-        (["mask=black.png"], "no object is found"),
+        (["mask=black.png"], "no white pixels"),
         (["mask=none.png"], "none.png cannot be read"),
         ([], "mask=FILE or box="),
     ],
