@@ -146,5 +146,5 @@ def test_photographs_of_another_size_are_an_error(photographs):
     from augment.classifiers.plain_networks import as_classifier
 
     classifier = as_classifier(HueNetwork().eval(), SIZE, None)
-    with pytest.raises(InputError, match="8 pixels"):
+    with pytest.raises(InputError, match="16 pixels"):
         attack_photographs(classifier, photographs[:, :, :8, :8])
