@@ -53,7 +53,15 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
 
 
 def class_of_name(name: str, classes: Sequence[str]) -> str | None:
-    """Return the class whose name differs only in case, "_", "-" and spaces. None if not unique."""
+    """Find the class of a name. Case, "_", "-" and spaces make no difference.
+
+    Args:
+        name: Name of a class as a user writes it.
+        classes: Names of all classes of a network.
+
+    Returns:
+        Name of the class. None if no class or several classes match.
+    """
     same = [known for known in classes if simplified(known) == simplified(name)]
     if name in same:
         return name
@@ -108,7 +116,12 @@ def classes_of_meshes(items: Sequence[Any], classes: Sequence[str], key: str) ->
 
 
 def _unnamed(mesh: str, classes: Sequence[str]) -> InputError:
-    """Return the error for a mesh whose name is not the name of a class."""
+    """Create the error for a mesh whose class is unknown.
+
+    Args:
+        mesh: File, or solid:NAME. Its name is not the name of a class.
+        classes: Names of all classes of the network.
+    """
     solid = solid_name(mesh)
     if not solid and not Path(mesh).exists():
         return InputError(f"{mesh} does not exist: give the path of a mesh, or solid:NAME")

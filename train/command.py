@@ -57,8 +57,9 @@ INTERRUPTED = "ended by SIGINT"
 PREFIX = "pnb-"
 SWEEP_FLAGS = {"--multirun", "-m"}
 HELP_FLAGS = {"--help", "-h"}
-# Seconds of importing after which a line reports it.
+# If an import takes more seconds than this, `import_function` prints a line about it.
 IMPORT_DELAY = 5.0
+# Words for the types of settings in error messages.
 NOUNS = {
     int: "a whole number",
     float: "a number",
@@ -66,9 +67,10 @@ NOUNS = {
     str: "text",
     list: "a list, such as [a,b]",
 }
-# Hydra and OmegaConf let these pass for some mistakes, without saying where.
+# For some mistakes of the user, Hydra and OmegaConf raise these errors, which do not
+# name the setting.
 INTERNAL_ERRORS = (AssertionError, AttributeError, OverflowError)
-# Digits of a whole number that a float can hold.
+# A float cannot hold whole numbers of more digits than this.
 MAX_DIGITS = 300
 # Hydra reads text between these as it is.
 QUOTES = "'\""
@@ -321,7 +323,18 @@ def read_settings(kind: type[Kind], config: DictConfig) -> Kind:
 
 
 def _read_node(node: DictConfig, key: str) -> Any:
-    """Make the settings of a node that stands at a key."""
+    """Convert a node of a configuration to settings.
+
+    Args:
+        node: Node with the type of a settings class.
+        key: Dotted key of the node. Empty for the whole configuration.
+
+    Returns:
+        Settings of this class. Groups inside of it are converted, too.
+
+    Raises:
+        InputError: If a value is missing or wrong.
+    """
     kind = cast(type, OmegaConf.get_type(node))
     values: dict[str, Any] = {}
     for item in fields(cast(Any, kind)):
@@ -384,7 +397,17 @@ def as_override(argument: str, keys: Mapping[str, Any]) -> str:
 
 
 def _as_list(key: str, value: str, is_text: bool) -> str:
-    """Write the override of a list, whose one member is the value unless this is a list."""
+    """Write the override of a setting that is a list.
+
+    Args:
+        key: Key of the setting.
+        value: Value in the words of the user. A list, null and a sweep stay the
+            same. Any other value becomes a list of one member.
+        is_text: Whether the members of the list are texts.
+
+    Returns:
+        Override such as "label=['orange']".
+    """
     if not value or value.startswith("["):
         return f"{key}={value}"
     try:
@@ -457,7 +480,11 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
 
 
 def _file_of(error: BaseException) -> str:
-    """Name the file of conf/ that Hydra's error is about, if any."""
+    """Name the file of conf/ that an error of Hydra is about.
+
+    Returns:
+        Text such as " (In 'attack')". Empty if the error names no file.
+    """
     first = _first_line(error).partition(":")[0]
     return f" ({first})" if first.startswith("In ") else ""
 
@@ -478,7 +505,14 @@ def _explain_value(
     keys: Mapping[str, Any],
     place: str,
 ) -> str:
-    """Explain a value that does not fit the annotation of its key."""
+    """Explain a value that does not have the type of its setting.
+
+    Args:
+        error: Error of OmegaConf.
+        key: Key of the setting.
+        keys: Annotation of each key.
+        place: Text with the file of conf/ that has the value, or an empty text.
+    """
     hint = without_none(keys.get(key))
     value = getattr(error, "value", None)
     noun = NOUNS.get(get_origin(hint) or hint)
@@ -499,7 +533,14 @@ def _explain_choice(file: str) -> str:
 
 
 def _explain_overflow(words: Sequence[str]) -> str | None:
-    """Return an error message if a word is a whole number that is too large for a float."""
+    """Explain the error of a whole number that is too large for a float.
+
+    Args:
+        words: Words of the command line.
+
+    Returns:
+        Sentence about the first such number. None if no word has one.
+    """
     for word in words:
         key, _, value = word.partition("=")
         if value.lstrip("-").isdigit() and len(value) > MAX_DIGITS:
@@ -508,7 +549,18 @@ def _explain_overflow(words: Sequence[str]) -> str | None:
 
 
 def _explain_null_group(keys: Mapping[str, Any], words: Sequence[str]) -> str | None:
-    """Explain a setting of a group that nobody chose, such as attack.geometry.radius."""
+    """Explain the error of a setting inside a group that is null.
+
+    For example, attack.geometry.radius cannot be set while attack.geometry is
+    null.
+
+    Args:
+        keys: Annotation of each key.
+        words: Words of the command line.
+
+    Returns:
+        Sentence about the first such setting. None if no word has one.
+    """
     for word in words:
         key = word.partition("=")[0]
         group = key.rpartition(".")[0]

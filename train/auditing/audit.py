@@ -61,7 +61,8 @@ VIEWS = 24
 LIGHTS = 8
 # Views that are attacked with each kind of lighting.
 ATTACKED = 12
-# Setups of the laboratory for each pattern and each environment.
+# Number of draws of light, camera and pose in the laboratory, for each projected
+# pattern and each environment.
 SETUPS = 6
 # Projected patterns that no training of this project uses.
 PATTERNS = ("gradient", "rings", "window", "leaves", "text", "colors")
@@ -109,13 +110,16 @@ def run_audit(
         networks = load_networks(settings)
     if not settings.meshes:
         return _audit_photographs(settings, networks, is_named)
+    # Sentences that the report shows at its beginning.
     caveats = _compare_sizes(networks.values())
     if not (settings.hard_negatives or settings.laboratory):
         caveats.append(NO_HARD_NEGATIVES)
     settings = complete(settings, networks[CLASSIFIER])
     plan = _Plan(settings, networks)
     out = writable_folder(settings.out, "out")
-    # An audit of networks that have no names does not continue.
+    # Networks that the caller passes have no names in config.yaml. It is unknown
+    # whether the results in the folder are of the same networks, so an audit of
+    # such networks does not continue.
     own = _own_results(out) if is_named else ()
     require_replaceable(out, "out", settings.overwrite, own=own)
     renders = out / "renders"
@@ -153,7 +157,14 @@ def run_audit(
 def _audit_photographs(
     settings: AuditSettings, networks: Mapping[str, Classifier], is_named: bool
 ) -> page.Audited:
-    """Audit networks on relit photographs alone, and write the report."""
+    """Audit networks on relit photographs alone, and write the report.
+
+    Args:
+        settings: Settings of an audit without meshes.
+        networks: Networks by the name of the folder of their parts.
+        is_named: Whether the settings name the networks. Only then may an audit
+            that was stopped continue.
+    """
     device = choose_device(settings.device)
     find_unlabeled(published(Path(str(settings.photographs))))
     out = writable_folder(settings.out, "out")
@@ -183,7 +194,10 @@ def _measure_photographs(network: Classifier, settings: AuditSettings, own: Path
 
 
 def _names(networks: Mapping[str, Classifier]) -> dict[str, str]:
-    """Return the names of networks, which differ."""
+    """Return a name of each network, by the key of the network.
+
+    If both networks have the same name, " (hardened)" follows the second one.
+    """
     names = {key: network.name for key, network in networks.items()}
     if len(set(names.values())) < len(names):
         names[HARDENED] += " (hardened)"
@@ -229,7 +243,7 @@ class _Plan:
         """Search views that the audited classifier recognizes in plain light, for all networks.
 
         Args:
-            own: Folder of the parts of the audited classifier.
+            own: Folder that the result for the audited classifier is written to.
         """
         own.mkdir(exist_ok=True)
         path = own / page.PLAIN
@@ -268,7 +282,13 @@ class _Plan:
             self._score(network, out / key)
 
     def _score(self, network: Classifier, own: Path) -> None:
-        """Score a network on each folder of images, in the folder `own`."""
+        """Score a network on each folder of images.
+
+        Args:
+            network: Network with or without normalized light.
+            own: Folder of the parts of this network. The scores on each folder
+                of images go to a sub-folder.
+        """
         for name, folder in self.folders.items():
             own.mkdir(exist_ok=True)
             predictor = Predictor(network, network.classes, network.size, self.device)
@@ -276,7 +296,7 @@ class _Plan:
 
 
 def complete(settings: AuditSettings, classifier: Classifier) -> AuditSettings:
-    """Fill in what an audit derives from its classifier.
+    """Fill in the class and the hard negatives that the settings leave out.
 
     Args:
         settings: Settings of the audit.
@@ -336,7 +356,15 @@ def _require_classes(
     folders: Mapping[str, Path],
     label: str,
 ) -> None:
-    """Raise InputError if a network lacks the class of a mesh or of a photograph."""
+    """Raise InputError if a network lacks the class of a mesh or of a photograph.
+
+    Args:
+        networks: Networks of the audit.
+        items: Meshes and hard negatives. Classes that start with OTHER_PREFIX
+            need not be classes of a network.
+        folders: Folder of labeled images by part.
+        label: Class whose objects are tested.
+    """
     labels = {item.label for item in items if not item.label.startswith(OTHER_PREFIX)}
     for network in networks:
         for name in labels:
@@ -347,7 +375,7 @@ def _require_classes(
 
 
 def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
-    """Write a caveat if the networks take images of several sizes."""
+    """Return a caveat if the networks take images of different sizes, and otherwise nothing."""
     sizes = [str(network.size) for network in networks]
     if len(set(sizes)) == 1:
         return []
@@ -356,7 +384,7 @@ def _compare_sizes(networks: Collection[Classifier]) -> list[str]:
 
 
 def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
-    """Write a caveat for each network that has no gradients."""
+    """Return a caveat for each network that has no gradients."""
     return [
         f"{network.name} has no gradients: random search attacks each view with {QUERIES} queries "
         "for each radius."
@@ -366,7 +394,19 @@ def _missing_gradients(networks: Collection[Classifier]) -> list[str]:
 
 
 def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
-    """Remove earlier results or check that they have the same settings, and write the settings."""
+    """Prepare the folder of an audit, and write config.yaml.
+
+    With `overwrite`, the parts of an earlier audit are removed. Otherwise the
+    folder must have the same settings as this audit.
+
+    Args:
+        settings: Settings of the audit.
+        out: Folder of the audit.
+        renders: Folder of the renders of the laboratory in `out`.
+
+    Raises:
+        InputError: If the folder has other settings.
+    """
     if settings.overwrite:
         networks = (CLASSIFIER, HARDENED, CLASSIFIER + NORMALIZED, HARDENED + NORMALIZED)
         for name in (*networks, renders.name):
@@ -377,7 +417,13 @@ def _begin(settings: AuditSettings, out: Path, renders: Path) -> None:
 
 
 def _may_be_added(key: str, old: Any, new: Any) -> bool:
-    """Return whether a setting without a value may be set when an audit continues."""
+    """Return whether a setting may change when an audit continues.
+
+    Args:
+        key: Key of the setting.
+        old: Value in config.yaml. Only None may change.
+        new: Value of this command.
+    """
     return old is None and key in ADDED
 
 
@@ -436,7 +482,11 @@ def read_meshes(settings: AuditSettings) -> tuple[list[ObjectSettings], list[Obj
 
 
 def _own_results(out: Path) -> Collection[str]:
-    """Return RESULTS if the folder is the folder of an audit, which may continue, else nothing."""
+    """Return the patterns of the results with which an audit in a folder continues.
+
+    Returns:
+        RESULTS if the folder is the folder of an audit. Otherwise nothing.
+    """
     with suppress(InputError):
         if "hard_negatives" in read_config(out / CONFIG):
             return RESULTS
@@ -444,26 +494,39 @@ def _own_results(out: Path) -> Collection[str]:
 
 
 def _write_part(path: Path, measure: Callable[..., Mapping[str, Any]], *arguments: Any) -> None:
-    """Call a function and write its result as JSON, unless the file exists."""
+    """Measure a part of an audit, and write it as JSON, unless its file exists.
+
+    Args:
+        path: File of the part.
+        measure: Function that returns the content of the file.
+        *arguments: Arguments of this function.
+    """
     if not path.exists():
         atomic_write(path, json.dumps(measure(*arguments)) + "\n", durable=True)
 
 
 def _search(classifier: Classifier, views: Views) -> dict[str, Any]:
-    """Search views in plain light, and return the result for JSON."""
+    """Search views in plain light, and return the fields of `PlainViews` by name."""
     return asdict(find_plain_views(classifier, views))
 
 
 def _evaluate(predictor: Predictor, folder: Path, label: str, out: Path) -> None:
-    """Score a network on all photographs that can be read."""
+    """Score a network on the photographs of `folder`, and write the scores to `out`.
+
+    Photographs that cannot be read are left out.
+    """
     evaluate_photographs(predictor, folder, label, out, skip_unreadable=True)
 
 
 def _write_folder(folder: Path, write: Callable[[Path], object]) -> None:
-    """Write a folder, unless it exists.
+    """Write a part of an audit that is a folder, unless the folder exists.
 
     The folder gets its name when it is complete. Until then, ".part" follows
     the name.
+
+    Args:
+        folder: Folder of the part.
+        write: Function that writes the part to the folder that it is given.
     """
     if not folder.exists():
         unfinished = folder.with_name(f"{folder.name}.part")

@@ -40,7 +40,7 @@ from train.report.plots import Picture
 from train.report.report_page import scores_section, write_page
 from train.runs.run_config import CONFIG, read_config, read_json
 
-# Answers of `write_answer` as the first words of a page.
+# First words of a page, by the answer that `write_answer` gives.
 VERDICTS = {
     "No": "It is not safe under unusual lighting.",
     "Unknown": "It is unknown whether it is safe.",
@@ -160,7 +160,17 @@ def write_audit_page(
 def _recommendation(
     remedies: Mapping[str, str], folders: Mapping[str, Path], out: Path
 ) -> Recommendation | None:
-    """Recommend a remedy by the first folder of images. None without one."""
+    """Recommend a remedy by the scores on the first folder of images.
+
+    Args:
+        remedies: Folder of the parts of each remedy in `out`, by name. The
+            original network comes first.
+        folders: Folder of images by the name of the part with its scores.
+        out: Folder of the audit.
+
+    Returns:
+        The recommendation. None without images, or without a remedy.
+    """
     part = next(iter(folders), None)
     if part is None or len(remedies) == 1:
         return None
@@ -170,7 +180,17 @@ def _recommendation(
 def _with_remedies(
     paths: Mapping[str, Path], remedies: Mapping[str, str], out: Path
 ) -> dict[str, Path]:
-    """Add the networks with normalized light to the folders of the networks by name."""
+    """Add the networks with normalized light to the networks of an audit.
+
+    Args:
+        paths: Folder of the parts of each network, by the name of the network.
+        remedies: Names of the folders of the remedies in `out`, by remedy.
+        out: Folder of the audit.
+
+    Returns:
+        `paths`, and the folders of the networks with normalized light under
+        names such as "resnet50, normalized light".
+    """
     names = {path.name: name for name, path in paths.items()}
     added = {}
     for key in remedies.values():
@@ -181,7 +201,17 @@ def _with_remedies(
 
 
 def _slider(counts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return the lights of one attack on the first network with a success. None without one."""
+    """Find an attack whose lights the slider of the page shows.
+
+    Args:
+        counts: For each network and each kind of lighting, the content of the
+            file of `success_by_light`. It has the key "slider" if the attack
+            has a success.
+
+    Returns:
+        The frames that `frames_of` returned, with the keys "network" and
+        "light" in addition. None if no attack has a success.
+    """
     for name, by_kind in counts.items():
         for kind, part in by_kind.items():
             if "slider" in part:
@@ -196,7 +226,18 @@ def _first_screen(
     counts: Mapping[str, Mapping[str, Any]],
     plain: PlainViews,
 ) -> FirstScreen:
-    """Compare both networks on the first folder of images, or describe the only network."""
+    """Make the first screen of the page.
+
+    With two networks and a folder of images, it compares the networks on the
+    images. Otherwise it describes the first network.
+
+    Args:
+        label: Class whose objects were tested.
+        paths: Folder of the parts of each network, by the name of the network.
+        folders: Folder of images by the name of the part with its scores.
+        counts: Content of the files of attacks, by network and kind of lighting.
+        plain: Views that the first network recognizes in plain light.
+    """
     (name, path), *others = paths.items()
     part = next(iter(folders), None)
     if others and part is not None:
@@ -205,6 +246,7 @@ def _first_screen(
         if screen is not None:
             return screen
     scores = read_json(path / part / SUMMARY) if part is not None else None
+    # The answer follows the question mark, and ends at a colon if reasons follow.
     answer = write_answer(label, name, path, folders).partition("? ")[2].partition(":")[0]
     verdict = VERDICTS.get(answer, answer)
     return screen_of_one(label, name, verdict, plain, counts[name], scores)
@@ -216,7 +258,17 @@ def _compare(
     hardened: tuple[str, Path],
     images: Path,
 ) -> FirstScreen | None:
-    """Compare the scores of two networks, each a name and a folder, on the same images."""
+    """Compare the scores of two networks on the same images.
+
+    Args:
+        label: Class under study.
+        original: Name of the original network, and folder of its scores.
+        hardened: Name of the hardened network, and folder of its scores.
+        images: Folder of the images.
+
+    Returns:
+        The first screen. None if a metric of it is unknown.
+    """
     evaluations = _evaluations(dict([original, hardened]))
     compared = Compared(
         label=in_words(label),
@@ -230,17 +282,32 @@ def _compare(
 
 
 def _evaluations(paths: Mapping[str, Path]) -> compare.Evaluations:
-    """Read the scores of networks on the same images, by name, from the folders of the scores."""
+    """Read the predictions of networks for the same images.
+
+    Args:
+        paths: Folder of the scores of each network, by the name of the network.
+
+    Returns:
+        One evaluation of each network, by name.
+    """
     runs = {}
     for name, path in paths.items():
         scores = {path.name: summary.PhotographScores.read(read_json(path / SUMMARY))}
         runs[name] = [summary.RunSummary(path.parent, name, {"network": name}, scores, None)]
+    # All networks were scored on the same images, so there is one group.
     (group,) = summary.group_by_images(runs).values()
     return compare.read_evaluations(group)
 
 
 def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
-    """Collect the scores of all networks, by folder of images."""
+    """Collect the plots, tables and images of each folder of images.
+
+    Args:
+        paths: Folder of the parts of each network, by the name of the network.
+
+    Returns:
+        For each folder of images, the values that `scores_section` returns.
+    """
     runs = {}
     for name, path in paths.items():
         scores = summary.read_summaries(path)
@@ -249,7 +316,13 @@ def _score_sections(paths: Mapping[str, Path]) -> list[dict[str, Any]]:
 
 
 def _unreadable_caveats(parts: Collection[str], path: Path) -> Iterator[str]:
-    """Say which images cannot be read, by the scores of one network in `path`."""
+    """Yield a sentence for each part in which images cannot be read.
+
+    Args:
+        parts: Names of the parts with scores on images.
+        path: Folder of the parts of a network. All networks read the same
+            images.
+    """
     for part in parts:
         files = read_json(path / part / SUMMARY)["unreadable"]
         if files:
@@ -307,7 +380,17 @@ def write_answer(label: str, name: str, folder: Path, parts: Collection[str]) ->
 
 
 def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Finding]:
-    """Find how often a network is right on renders and on the images of each part."""
+    """Find how often a network is right on renders and on the images of each part.
+
+    Args:
+        label: Class whose objects were tested.
+        folder: Folder of the parts of the network.
+        parts: Names of the parts that are scored on images.
+
+    Returns:
+        Findings about renders in environments, renders in random light, and,
+        for each part, recall and false positives. Unknown rates are left out.
+    """
     rates = _rates(read_json(folder / RECOGNIZED))
     findings = [_recognized(subject, rate) for subject, rate in rates.items()]
     for part in parts:
@@ -321,7 +404,15 @@ def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Findin
 
 
 def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
-    """Say how many images of a subject a network recognizes. None if the recall is unknown."""
+    """Say what fraction of the images of a subject a network recognizes.
+
+    Args:
+        subject: What the images show, in words.
+        recall: Fraction of recognized images with its interval.
+
+    Returns:
+        The finding. None if the recall is unknown.
+    """
     if recall is None or recall.value is None or recall.low is None:
         return None
     text = f"it recognizes {recall.value:.0%} of {subject}"
@@ -329,7 +420,16 @@ def _recognized(subject: str, recall: Estimate | None) -> Finding | None:
 
 
 def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
-    """Say how many images of a subject a network mistakes. None if the error rate is unknown."""
+    """Say what fraction of the images of a subject a network mistakes.
+
+    Args:
+        subject: What the images show and what they are mistaken for, such as
+            "other things for orange".
+        error_rate: Fraction of mistaken images with its interval.
+
+    Returns:
+        The finding. None if the error rate is unknown.
+    """
     if error_rate is None or error_rate.value is None or error_rate.high is None:
         return None
     text = f"it takes {error_rate.value:.0%} of {subject}"
@@ -337,7 +437,15 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
 
 def _attack_faults(folder: Path) -> list[str]:
-    """Name the smallest radius at which attacks on each kind of lighting fool half of the views."""
+    """Name the kinds of lighting whose attacks fool half of the views.
+
+    Args:
+        folder: Folder of the parts of a network.
+
+    Returns:
+        For each such kind, a clause with the smallest radius at which an attack
+        makes at least half of the correct views misclassified.
+    """
     faults = []
     for kind, light in KINDS.items():
         counts = read_json(folder / f"{kind}.json")
@@ -353,6 +461,14 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     """Compute the fraction of recognized renders in environments and in random lights.
 
     The bootstrap of the interval draws views, and then lights of each view.
+
+    Args:
+        correct: Whether each view is recognized, by the name of the lighting.
+            Names of random lights start with RANDOM.
+
+    Returns:
+        Fraction with its 95% interval, by "renders in environments" and
+        "renders in random light".
     """
     random = {name for name in correct if name.startswith(RANDOM)}
     lights = {
@@ -363,6 +479,7 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
     for title, names in lights.items():
         # The array has a row for each view and a column for each light.
         hits = np.array([correct[name] for name in sorted(names)], float).T
+        # The view of each render, in the order of `hits.ravel()`.
         views = np.arange(len(hits)).repeat(hits.shape[1])
         if hits.min() == hits.max():
             # All replicates are equal. The interval counts each view once.
@@ -374,7 +491,13 @@ def _rates(correct: Mapping[str, Sequence[bool]]) -> dict[str, Estimate]:
 
 
 class _ScoredImage(NamedTuple):
-    """Prediction of one network, with the part and the index of the image."""
+    """Prediction of one network for an image.
+
+    Attributes:
+        part: Part whose folder has the image.
+        image_index: Index of the image among the predictions of the part.
+        prediction: Prediction of the network.
+    """
 
     part: str
     image_index: int
@@ -386,10 +509,18 @@ def _worst(
     folders: Mapping[str, Path],
     scored: Predictions,
 ) -> dict[str, list[Picture]]:
-    """Make two galleries for each network, by title.
+    """Make two galleries of images for each network.
 
-    The first one has the images of the label with the lowest log-odds. The
-    second one has the images of other things with the highest log-odds.
+    The first gallery has the images of the label with the lowest log-odds. The
+    second gallery has the images of other things with the highest log-odds.
+
+    Args:
+        label: Class whose objects were tested.
+        folders: Folder of images by part.
+        scored: Predictions by network and by part.
+
+    Returns:
+        At most WORST images by the title of the gallery.
     """
     galleries: dict[str, list[Picture]] = {}
     for name, by_part in scored.items():
@@ -408,7 +539,13 @@ def _worst(
 
 
 def _draw_image(folders: Mapping[str, Path], scored: Predictions, row: _ScoredImage) -> Picture:
-    """Draw an image with the predictions of all networks as its caption."""
+    """Draw an image with the predictions of all networks as its caption.
+
+    Args:
+        folders: Folder of images by part.
+        scored: Predictions by network and by part.
+        row: Prediction of one network for the image, with its part and index.
+    """
     photograph = row.prediction.photograph
     texts = []
     for network, by_part in scored.items():

@@ -139,8 +139,12 @@ def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
         label: Class whose objects were tested.
         name: Name of the network.
         folder: Folder of the measurements of this network.
+
+    Returns:
+        The numbers, with the fraction of recognized views by lighting.
     """
     summaries = {path.parent.name: read_json(path) for path in folder.glob(f"*/{SUMMARY}")}
+    # Whether each view is recognized, by the name of the lighting.
     recognized_views = read_json(folder / RECOGNIZED)
     recognized_fraction = {}
     for light, is_recognized in recognized_views.items():
@@ -156,7 +160,12 @@ def _read_network(label: str, name: str, folder: Path) -> NetworkReport:
 
 
 def _read_attack(kind: str, path: Path) -> AttackCounts:
-    """Read the counts of one kind of lighting."""
+    """Read the counts of the attack on one kind of lighting.
+
+    Args:
+        kind: Key of KINDS.
+        path: File that `success_by_light` returned the content of.
+    """
     counts = read_json(path)
     return AttackCounts(
         unit=KINDS[kind].unit,
@@ -169,6 +178,6 @@ def _read_attack(kind: str, path: Path) -> AttackCounts:
 
 
 def _read_scores(summary: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the known metrics of a summary."""
+    """Read the metrics in `METRICS` that a summary.json has, by name."""
     found = {name: read_metric(summary, name) for name in METRICS}
     return {name: estimate for name, estimate in found.items() if estimate is not None}

@@ -60,7 +60,12 @@ def strongest_kind(counts: Counts) -> str | None:
 
 
 def _fooled(part: Mapping[str, Any]) -> float:
-    """Return the fraction of the correct views that an attack at the largest radius fools."""
+    """Return the fraction of the correct views that an attack at the largest radius fools.
+
+    Args:
+        part: Content of the file of an attack, see `success_by_light`. Its
+            lists have an entry for each radius, in ascending order.
+    """
     return part["adversarial"][-1] / part["correct"]
 
 
@@ -114,7 +119,15 @@ def screen_of_one(
 
 
 def _score_sentence(label: str, scores: Mapping[str, Any]) -> list[str]:
-    """Say what a network recognizes and mistakes in a folder of images, if both are known."""
+    """Write a sentence on recall and false positives in a folder of images.
+
+    Args:
+        label: Class of the objects.
+        scores: Content of summary.json.
+
+    Returns:
+        One sentence, or nothing if one of the two metrics is unknown.
+    """
     recall = read_metric(scores, "recall")
     mistaken = read_metric(scores, "false_positive_rate")
     if recall is None or mistaken is None or recall.value is None or mistaken.value is None:
@@ -150,7 +163,16 @@ def attack_pictures(folder: Path, counts: Counts) -> list[Contrast]:
 
 
 def _answers(part: Mapping[str, Any]) -> list[Answer]:
-    """Return the answers before and after an attack. Empty if the attack has no success."""
+    """Describe the predictions for one view before and after an attack.
+
+    Args:
+        part: Content of the file of an attack. "predicted" holds two classes if
+            the attack has a success, and "confidence" their probabilities.
+
+    Returns:
+        The answer before the attack and the answer after it. Empty if the
+        attack has no success.
+    """
     texts = [in_words(name) for name in part.get("predicted", ())]
     # Earlier versions did not record the probabilities.
     for index, probability in enumerate(part.get("confidence", ())):
@@ -181,11 +203,25 @@ def charts(counts_by_network: Mapping[str, Counts]) -> list[plots.Picture]:
 
 
 def _remaining(part: Mapping[str, Any], method: str) -> list[Estimate]:
-    """Return the fraction of the correct views that stay recognized, at radius 0 and others."""
+    """Compute the fraction of the correct views that stay recognized at each radius.
+
+    Args:
+        part: Content of the file of an attack, see `success_by_light`.
+        method: "adversarial", or "random" for random draws alone.
+
+    Returns:
+        Fractions at the radius 0, where no view is fooled, and at each radius
+        of the attack.
+    """
     correct = part["correct"]
     return [fraction(correct - fooled, correct) for fooled in (0, *part[method])]
 
 
 def _chart(light: LightKind, lines: Mapping[str, Sequence[Estimate]]) -> plots.Picture:
-    """Plot the fractions of one kind of lighting."""
+    """Plot the fractions that `_remaining` returns, for one kind of lighting.
+
+    Args:
+        light: Kind of lighting, with its radii.
+        lines: Fractions at each radius, by the name of the line.
+    """
     return plots.by_radius(lines, (0, *light.radii), light.title, f"radius, {light.unit}")

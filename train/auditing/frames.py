@@ -54,6 +54,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     probabilities = logits.softmax(1).cpu()
     label = int(result.criterion.source[example, 0])
     ranked = probabilities.amax(0).argsort(descending=True).tolist()
+    # The right class, and then the other classes by falling probability.
     shown = [label, *(index for index in ranked if index != label)][:CLASSES]
     frames = []
     for index in range(FRAMES):

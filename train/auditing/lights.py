@@ -59,13 +59,14 @@ CAMERA_ANGLES = (60, 45, 40)
 CAMERA = orbit_cameras(1, CAMERA_DISTANCE, *CAMERA_ANGLES)
 # Range of the random cameras, poses and sizes, around CAMERA and the objects.
 VARIATION = VariationSettings(azimuth=25, rotation=60, scale=[0.85, 1.15])
-# Steps of the attack at each radius, and random draws at each radius.
+# Number of steps of the attack at each radius, and of random draws at each radius.
 STEPS = 10
-# Forward passes of each search without gradients, and random draws beside it.
+# Number of forward passes of a search without gradients at each radius, and of
+# random draws beside it.
 QUERIES = 100
-# Steps of an attack that continues after its success.
+# Number of steps of an attack that continues after its success.
 ADDITIONAL_STEPS = 20
-# Steps of an attack that are as long together as the radius.
+# A step of an attack has the length radius / STEPS_PER_RADIUS.
 STEPS_PER_RADIUS = 4
 # Gray value of the background, in sRGB.
 BACKGROUND = 0.5
@@ -87,6 +88,7 @@ class LightKind(NamedTuple):
     local: tuple[ProjectorSettings | LampsSettings, ...] = ()
 
 
+# Kinds of lighting that an audit attacks, by the name of their files.
 KINDS = {
     "lighting": LightKind(
         title="light from all around",
@@ -242,6 +244,7 @@ def adversaries(
     radius = KINDS[kind].radii[-1]
     settings_class = SkylightSettings if kind == "skylight" else StepSettings
     step_size = radius / STEPS_PER_RADIUS
+    # Arguments of `AttackSettings`. A field with the name of the kind has the ball.
     limits: dict[str, Any] = {kind: settings_class("linf", radius, "sign", step_size)}
     if additional:
         limits |= {"max_steps": ADDITIONAL_STEPS, "margin": MAX_SCALE}
@@ -296,6 +299,7 @@ def success_by_light(
     clean = result.clean_correct
     by_radius = success_by_radius(result, [radius / radii[-1] for radius in radii])
     counts: dict[str, Any] = {"n": views.count, "correct": int(clean.sum())}
+    # The counts are made twice: with noise of a sensor, and without.
     for end, success in (
         ("", result.success),
         ("_without_noise", result.success_without_noise),
@@ -321,7 +325,16 @@ def success_by_light(
 
 
 def _draw_pair(result: AttackResult, example: int) -> Image.Image:
-    """Draw the first view of an example before and after the attack, side by side."""
+    """Draw the first view of an example before and after the attack, side by side.
+
+    Args:
+        result: Result of the attack.
+        example: Index of the example.
+
+    Returns:
+        Image of 2 · SIDE by SIDE pixels. Renders that are smaller are enlarged
+        without smoothing, so that single pixels are visible.
+    """
     before = result.images_before[example]
     after = result.images[example]
     pair = to_bytes(torch.cat([before, after], dim=2).cpu()).permute(1, 2, 0)
@@ -368,7 +381,14 @@ def transfer_success(
 
 
 class _TransferTest:
-    """Test of adversaries of one attack on another classifier."""
+    """Test whether the adversaries of one attack fool another classifier.
+
+    Args:
+        result: Result of the attack on the first classifier.
+        other: Classifier to test.
+        problem: The attacked parameters, with a scene at the size of the other
+            classifier.
+    """
 
     def __init__(self, result: AttackResult, other: Classifier, problem: AttackProblem):
         label = other.label(problem.scene.labels[0])
@@ -379,14 +399,19 @@ class _TransferTest:
         self.model = preprocessed_model(result.settings, other)
 
     def count(self, is_wrong: Tensor, values: Tensor) -> list[int]:
-        """Count fooled and all adversaries whose view was correct before, and those without noise.
+        """Count the adversaries that fool the other classifier, too.
+
+        Only adversaries count whose view the other classifier recognizes before
+        the attack.
 
         Args:
             is_wrong: Whether each example fools the attacked classifier, shape (E,).
             values: Attacked values of all examples, shape (E, D).
 
         Returns:
-            The three counts of `transfers`.
+            Three counts: adversaries that fool the other classifier also with
+            noise of a sensor, all counted adversaries, and adversaries that
+            fool it in images without noise.
         """
         is_tested = is_wrong.to(self.is_correct) & self.is_correct
         images = self.problem.images(values.to(self.problem.start))

@@ -79,7 +79,7 @@ def find_plain_views(classifier: Classifier, views: Views) -> PlainViews:
 
 
 def _candidates(views: Views) -> Iterator[Views]:
-    """Yield views in each plain light, at each size and each exposure."""
+    """Yield copies of views in each plain light, at each exposure and each size of objects."""
     for size in SIZES:
         for exposure in EXPOSURES:
             for light in PLAIN_LIGHTS:
@@ -87,7 +87,7 @@ def _candidates(views: Views) -> Iterator[Views]:
 
 
 def _count_recognized(classifier: Classifier, views: Views) -> int:
-    """Count the views that a classifier recognizes."""
+    """Render views in their light, and count those that a classifier recognizes."""
     scene = views.scene(classifier.size)
     light = load_light(views.light).to(scene.lights) * views.exposure
     examples = torch.arange(views.count, device=views.device)

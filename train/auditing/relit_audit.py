@@ -30,13 +30,14 @@ from train.settings import published
 
 # Part of a network with the scores on relit photographs.
 RELIT_PART = "relit"
-# Photographs of an audit with a budget of 1.
+# Number of photographs that an audit with a budget of 1 attacks.
 PHOTOGRAPHS = 100
-# Passes of each search.
+# Number of passes through the network in each search.
 PASSES = 11
 # Width of a picture in pixels.
 WIDEST = 900
-# Fraction of photographs that keep their class under a slide of a network that is called safe.
+# `_answer` says that predictions depend on the light if fewer photographs than this
+# fraction keep their class under random slides.
 PASS_THRESHOLD = 0.9
 # Titles of the numbers on the first screen.
 NUMBERS = {
@@ -157,7 +158,11 @@ def write_photographs_page(
 
 
 def _answer(scores: RelitScores) -> str:
-    """Say whether the predictions of a network depend on the light of a projector."""
+    """Say whether the predictions of a network depend on the light of a projector.
+
+    The fraction of photographs that keep their class under random slides
+    decides.
+    """
     kept = scores.kept(SLIDE)
     if kept.value is not None and kept.value < PASS_THRESHOLD:
         return "Its predictions depend on the light."
@@ -165,19 +170,29 @@ def _answer(scores: RelitScores) -> str:
 
 
 def _sentence(name: str, scores: RelitScores) -> str:
-    """Say how many photographs keep their class in each light."""
+    """Say how many photographs keep their class in each light.
+
+    Args:
+        name: Name of the network.
+        scores: Predictions of the network for the photographs.
+    """
     counts = [f"{scores.kept(light).hits} {IN_LIGHT[light]}" for light in scores.lights]
     return f"Of {len(scores.photographs)} photographs, {name} keeps the class of {_join(counts)}."
 
 
 def _join(items: Sequence[str]) -> str:
-    """Join items to a list in words."""
+    """Join items to a list in words, such as "a, b and c"."""
     *others, last = items
     return f"{', '.join(others)} and {last}" if others else last
 
 
 def _section(name: str, folder: Path) -> RelitSection:
-    """Read the scores and the pictures of a network."""
+    """Read the tables, the pictures and the sentences of a network.
+
+    Args:
+        name: Name of the network.
+        folder: Folder that `attack_folder` wrote.
+    """
     scores = read_relit(folder)
     sentences = [
         _sentence(name, scores),

@@ -105,6 +105,8 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     }
     if any(gain is None for gain in gains.values()):
         return None
+    # A remedy must gain over the original network and over the cheaper remedy that
+    # was chosen so far.
     chosen = original
     for name in remedies:
         if _is_gain(evaluations, name, original, metric) and _is_gain(
@@ -127,12 +129,28 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
 
 
 def _metric_for(group: Sequence[Evaluation]) -> str:
-    """Return the metric by which remedies are compared."""
+    """Return the metric by which remedies are compared.
+
+    Args:
+        group: Evaluations of the original network.
+
+    Returns:
+        TOP1 with several classes under study. Otherwise EQUAL_RATE.
+    """
     labels = {prediction.label for prediction in group[0].pools[ALL].positives}
     return TOP1 if len(labels) > 1 else EQUAL_RATE
 
 
 def _is_gain(evaluations: Evaluations, name: str, reference: str, metric: str) -> bool:
-    """Return whether the interval of the gain of a remedy over another network is above 0."""
+    """Return whether a remedy is proven to be better than another network.
+
+    It is proven if the 95% interval of its gain is above 0.
+
+    Args:
+        evaluations: Evaluations by the name of the network.
+        name: Name of the remedy.
+        reference: Name of the other network.
+        metric: Name of the metric.
+    """
     gain = difference(evaluations[name], evaluations[reference], ALL, metric)
     return gain is not None and gain.low is not None and gain.low > 0

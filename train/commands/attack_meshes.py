@@ -78,7 +78,7 @@ class MeshAttack(NamedTuple):
 
 @dataclass
 class Outcome:
-    """What is printed about the attack on one mesh.
+    """Lines and numbers that are printed about the attack on one mesh.
 
     Attributes:
         name: Name of the mesh.
@@ -211,9 +211,18 @@ def _write_attack(
     settings: AttackExperimentSettings,
     targets: TransferTargets,
 ) -> Outcome:
-    """Check the attack on one mesh, write its files into a folder, and return its outcome.
+    """Check the attack on one mesh, and write its files into a folder.
 
-    With --verbose, the details have what the checks found, too.
+    Args:
+        mesh_attack: The attack.
+        folder: Folder of the files.
+        settings: Settings of pnb-attack.
+        targets: Classifiers, views and objects to which the adversaries are
+            transferred.
+
+    Returns:
+        The lines to print and the numbers of successes. With --verbose, the
+        lines have the results of the checks, too.
     """
     name = mesh_attack.name
     result = mesh_attack.result
@@ -276,7 +285,10 @@ def format_outcomes(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def _remove_adversaries(out: Path) -> None:
-    """Remove the adversaries of an earlier call, which a report would show among the new ones."""
+    """Remove the files of an earlier attack from a folder.
+
+    Otherwise a report would show its adversaries among the new ones.
+    """
     for lines in out.glob(f"*/{LINES}"):
         for example in lines.parent.glob("example_*"):
             if example.is_dir():
@@ -333,7 +345,12 @@ def _attack_adversary(
     device: torch.device,
     adversary: Adversary,
 ) -> MeshAttack:
-    """Attack the scene of a saved adversary."""
+    """Attack the scene of a saved adversary.
+
+    Raises:
+        InputError: If the adversary consists of changed pixels, which have no
+            scene.
+    """
     if adversary.pixels is not None:
         fault = "an attack cannot continue from changed pixels"
         raise InputError(f"reload={settings.reload}: {fault}: leave attack= out")
@@ -355,7 +372,11 @@ def _attack_mesh(
     device: torch.device,
     mesh: ObjectSettings,
 ) -> MeshAttack:
-    """Attack one mesh in the given scene, or in a scene that a search finds."""
+    """Attack one mesh in the given scene, or in a scene that a search finds.
+
+    The search looks for a scene in which the classifier recognizes the mesh. It
+    is left out if `attack.force` attacks a misclassified mesh, too.
+    """
     build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
     scene_settings = settings.scene
     if scene_settings.search and not settings.attack.force:

@@ -62,6 +62,10 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
 
     All processes write to the folder of rank 0, since the default name of the
     folder has the time at which a process started.
+
+    Args:
+        config: Configuration of the command. Its `run` becomes an absolute path.
+        overrides: Overrides of the command.
     """
     run = broadcast(str(config.run))
     is_first = distributed.rank() == 0
@@ -90,7 +94,17 @@ def _train(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _list_methods(settings: ExperimentSettings, folder: Path) -> dict[Path, ExperimentSettings]:
-    """Return the settings of the baselines and, at the end, of the main run, by folder."""
+    """List the settings of all runs of a command.
+
+    Args:
+        settings: Settings of the main run. `compare` names the kinds of renders
+            of the baselines.
+        folder: Folder of the main run.
+
+    Returns:
+        Settings by folder. Each baseline has a sub-folder with the name of its
+        kind of renders. The main run is the last.
+    """
     methods = {}
     for method in settings.compare:
         with keyed("compare"):

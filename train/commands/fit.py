@@ -79,7 +79,18 @@ def fit(settings: FitSettings) -> None:
 
 
 def _compare(attacked: AttackExperimentSettings, out: Path, encoding: str) -> float:
-    """Write comparison.png, and return the relative error of the pixels that the object covers."""
+    """Compare the photograph with a render of the fitted scene.
+
+    The function writes both images to comparison.png, side by side.
+
+    Args:
+        attacked: Settings of pnb-attack for the fitted scene.
+        out: Folder of the fit, with mask.png.
+        encoding: Encoding of both images.
+
+    Returns:
+        Relative error of the pixels that the object covers.
+    """
     photograph, rendered = render_attacked(attacked)
     write_values(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The written mask is gray, so its channels are equal.

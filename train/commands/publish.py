@@ -53,7 +53,15 @@ def publish_network(settings: PublishSettings) -> None:
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
-    """Collect the settings, versions and scores of a run, which its network carries."""
+    """Collect the facts about a run that are stored in the file of its published network.
+
+    Args:
+        folder: Folder of the run.
+
+    Returns:
+        "settings" by dotted key, "versions" of the packages by name, and
+        "scores" by name: metrics, and the scores of each folder of photographs.
+    """
     run = summarize(folder)
     photographs = {name: scores.to_published() for name, scores in run.photographs.items()}
     return {

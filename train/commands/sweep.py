@@ -36,8 +36,9 @@ from train.system.user_errors import user_message, writable_folder
 from train.system.verbosity import is_verbose, shortened
 from train.training.run import load_runs
 
-# Lines of the table and of the list of unfinished runs without --verbose.
+# Largest number of lines of the table that `format_sweep` prints without --verbose.
 MAX_TABLE_LINES = 10
+# Largest number of lines of the list of unfinished runs without --verbose.
 MAX_UNFINISHED = 3
 
 
@@ -79,13 +80,27 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
 
 
 def _shared_keys(runs: Sequence[Sequence[str]]) -> list[str]:
-    """List the keys of the overrides that all runs of a sweep have."""
+    """List the keys of the overrides that have the same value in all runs of a sweep.
+
+    Args:
+        runs: Overrides of each run, such as "train.epochs=3".
+    """
     shared = set.intersection(*map(set, runs))
     return [override.partition("=")[0] for override in shared]
 
 
 def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bool) -> None:
-    """Check that the folder of a run is empty, or holds the same run."""
+    """Check that a run of a sweep may write to its folder.
+
+    Args:
+        folder: Folder of the run.
+        overrides: Overrides of the run.
+        overwrite: Whether the run may replace results of other commands.
+
+    Raises:
+        InputError: If the folder holds a run with other settings, or results of
+            another command.
+    """
     if is_finished(folder) or checkpoint.exists(folder):
         settings = read_settings(ExperimentSettings, compose("train", overrides))
         require_same_run(folder, settings, finished=True)
@@ -94,7 +109,16 @@ def _require_usable_folder(folder: Path, overrides: Sequence[str], overwrite: bo
 
 
 def _expand(overrides: Sequence[str]) -> list[tuple[str, ...]]:
-    """List the overrides of every run, as Hydra's basic sweeper makes them."""
+    """List the overrides of every run of a sweep, as Hydra's basic sweeper makes them.
+
+    Args:
+        overrides: Overrides of the command, such as "seed=0,1" and
+            "train.epochs=3".
+
+    Returns:
+        For each combination of values, overrides such as
+        ("seed=0", "train.epochs=3").
+    """
     choices_of_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()

@@ -63,14 +63,15 @@ class Round(NamedTuple):
 class Draws:
     """Random draws for the images of a round. They are the same on every device.
 
-    The last dimensions are (batches, images of a batch), or (images of all
-    batches,).
+    A round has N batches of B images.
 
     Attributes:
-        order: The number of each image.
-        shifts: The rows and columns by which it is shifted; the first dimension has both.
-        flips: Whether it is flipped.
-        seeds: The seed of its random crop, if the images are read from files.
+        order: Number of each image in `TrainingImages`, shape (N, B).
+        shifts: Pixels by which each image is shifted, shape (2, N, B). The first
+            dimension has rows and columns.
+        flips: Whether each image is flipped, bool, shape (N, B).
+        seeds: Seed of the random crop of each image, shape (N, B). None if the
+            images are in memory.
     """
 
     order: Tensor
@@ -165,10 +166,22 @@ def training_batches(
 
 
 def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips: str) -> Draws:
-    """Draw the order, shifts, flips and crops of the images of a round."""
+    """Draw the order, the shifts, the flips and the crops of the images of a round.
+
+    Args:
+        images: Data and renders.
+        batch_size: Number of images of a batch, in all processes.
+        seed: Seed of the run.
+        now: The round.
+        flips: "random" or "alternating", see `training_batches`.
+
+    Returns:
+        Draws for all batches of the round.
+    """
     shown = len(now.rows)
     batches = math.ceil(shown / batch_size)
     shuffled = now.rows[torch.randperm(shown, generator=generator(seed, now.number, "batches"))]
+    # The last batch is filled up with the first images of the round.
     filled_up = torch.arange(batches * batch_size) % shown
     order = shuffled[filled_up].view(-1, batch_size)
 
@@ -181,6 +194,8 @@ def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips:
     else:
         count = len(images.rows) + len(images.renders)
         draws = generator(seed, "flips")
+        # Whether each image is flipped in even epochs. In odd epochs, the other
+        # images are flipped.
         by_image = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
         is_flipped = by_image[order] ^ bool(now.epoch % 2)
     seeds = None
@@ -190,10 +205,21 @@ def _draw(images: TrainingImages, batch_size: int, seed: int, now: Round, flips:
 
 
 def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of images in memory. Several batches are computed at a time."""
+    """Yield the batches of a round whose images are in memory.
+
+    Args:
+        images: Data and renders.
+        share: Number of images of a batch in this process, B.
+        draws: Draws for the images of this process.
+
+    Yields:
+        Images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
+    """
     split, rows, renders = images
     pixels = cast(Tensor, split.images)
     device = pixels.device
+    # Number of images that are shifted and flipped in one call. It is a multiple
+    # of `share`, so that the images make whole batches.
     at_once = share * max(1, CHUNK_BYTES // (share * pixels[0].numel()))
 
     # The draws of all batches are copied to the device together, so that no batch
@@ -202,6 +228,7 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
     is_render_on_cpu = order >= len(rows)
     parts = [slice(begin, begin + at_once) for begin in range(0, len(order), at_once)]
     places_of_renders = [is_render_on_cpu[part].nonzero().squeeze(1).to(device) for part in parts]
+    # The rows of renders are wrong here. Renders replace these images below.
     row_of_image = rows[order.clamp(max=len(rows) - 1)].to(device)
     render_of_image = (order - len(rows)).to(device)
     shifts = draws.shifts.flatten(1).to(device)
@@ -228,9 +255,18 @@ def _batches_in_memory(images: TrainingImages, share: int, draws: Draws) -> Iter
 
 
 def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws) -> Iterator[Batch]:
-    """Yield the batches of images that are read from files, in random crops.
+    """Yield the batches of a round whose images are read from files.
 
-    The crops are flipped at random when they are read. Renders are shifted and flipped here.
+    The images are shown in random crops, which are flipped at random when they
+    are read. Renders are shifted and flipped in this function.
+
+    Args:
+        images: Data and renders.
+        files: Files of the data.
+        draws: Draws for the images of this process, in batches of B images.
+
+    Yields:
+        Images (B, 3, H, W) uint8, labels (B,), and which are renders (B,).
     """
     split, rows, renders = images
     device = split.labels.device
@@ -263,19 +299,23 @@ def _batches_from_files(images: TrainingImages, files: ImageFiles, draws: Draws)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
-    """Shift some images, mirrored at the border, and flip some of these.
+    """Take some images, flip some of them left to right, and shift each.
+
+    Pixels from outside an image are mirrored at its border.
 
     Args:
-        images: The images, shape (N, 3, H, W).
-        chosen: The rows of the images to take, shape (B,).
-        shifts: The pixels by which each is shifted, rows and columns, shape (2, B).
-        flips: Whether each is flipped left to right, bool, shape (B,).
+        images: Images, shape (N, 3, H, W).
+        chosen: Indices of the images to take, shape (B,).
+        shifts: Rows and columns by which each image is shifted, shape (2, B).
+        flips: Whether each image is flipped left to right, bool, shape (B,).
 
     Returns:
         The images, shape (B, 3, H, W).
     """
     height, width = images.shape[2:]
     device = images.device
+    # For each image, the rows (B, H) and the columns (B, W) that its pixels are
+    # taken from.
     rows = _reflect(torch.arange(height, device=device) + shifts[0, :, None], height)
     columns = torch.arange(width, device=device).expand(len(chosen), -1)
     columns = torch.where(flips[:, None], columns.flip(1), columns)
@@ -290,5 +330,9 @@ def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor)
 
 
 def _reflect(index: Tensor, size: int) -> Tensor:
-    """Mirror indices outside 0 to size - 1 at the border pixel, as torch's "reflect" does."""
+    """Mirror indices below 0 or above size - 1 at the border pixel.
+
+    The index -1 becomes 1, and `size` becomes size - 2, as in the mode
+    "reflect" of torch.
+    """
     return (size - 1) - ((size - 1) - index.abs()).abs()

@@ -22,7 +22,8 @@ MINIMUM_AREA = 0.35
 # A large JPEG is decoded to at least this many times the final size.
 DECODED = 2
 
-# The row of an image, and the seed of its random crop. None asks for the central square.
+# Index of an image in `ImageFiles.paths`, and seed of its random crop. Without a
+# seed, the central square is read.
 Key = tuple[int, int | None]
 # The reason why a file cannot be read, by path.
 Faults = dict[PurePosixPath, str]
@@ -95,7 +96,17 @@ class ImageFiles:
         )
 
     def _read(self, batches: Iterable[list[Key]]) -> Iterator[Tensor]:
-        """Yield the images of batches of keys. Raise InputError if an image cannot be read."""
+        """Yield the images of batches.
+
+        Args:
+            batches: Keys of the images of each batch.
+
+        Yields:
+            Images of each batch, uint8, shape (B, 3, size, size).
+
+        Raises:
+            InputError: If an image cannot be read, unless `self.skip` is set.
+        """
         broken: Faults = {}
         loader: DataLoader = DataLoader(
             _Reader(self),
@@ -134,7 +145,16 @@ class _Reader(Dataset[tuple[Tensor, Faults]]):
         self._crop = v2.Compose([crop, v2.RandomHorizontalFlip()])
 
     def __getitem__(self, key: Key) -> tuple[Tensor, Faults]:
-        """Return an image, uint8, shape (3, size, size), and the files that could not be read."""
+        """Read an image.
+
+        Args:
+            key: Index of the image, and seed of its random crop or None.
+
+        Returns:
+            The image, uint8, shape (3, size, size), and the reason by path for
+            each file that could not be read. If no file could be read, the
+            image is black.
+        """
         row, seed = key
         broken: Faults = {}
         for path in self._candidates(row):
@@ -151,7 +171,11 @@ class _Reader(Dataset[tuple[Tensor, Faults]]):
         return torch.zeros(3, size, size, dtype=torch.uint8), broken
 
     def _candidates(self, row: int) -> Iterator[PurePosixPath]:
-        """Give the image of a row, and then the others of its folder."""
+        """Yield the path of an image, and then the other paths of the same folder.
+
+        Args:
+            row: Index of the image.
+        """
         paths = self._files.paths
         for ahead in range(len(paths)):
             path = paths[(row + ahead) % len(paths)]

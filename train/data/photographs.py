@@ -158,7 +158,17 @@ def _require_files_of_rows(
     files: Sequence[PurePosixPath],
     example: PurePosixPath,
 ) -> None:
-    """Warn of rows whose file does not exist. Raise InputError if no file of any row exists."""
+    """Warn of rows of photos.csv whose file does not exist.
+
+    Args:
+        table: Path of photos.csv.
+        rows: Rows of the table by the path of the image.
+        files: Paths of all files in the folder.
+        example: Path of an image, for the error.
+
+    Raises:
+        InputError: If no row has a file that exists.
+    """
     unknown = sorted(rows.keys() - set(files))
     if not unknown:
         return
@@ -210,7 +220,15 @@ def find_unlabeled(folder: Path) -> list[Photograph]:
 
 
 def _image_files(folder: Path) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
-    """Return the images of a folder, sorted, and all of its files."""
+    """List the files of a folder and its sub-folders.
+
+    Returns:
+        Sorted paths of the images, and paths of all files, relative to the
+        folder.
+
+    Raises:
+        InputError: If the folder does not exist or holds no image.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: name a folder of photographs")
     files = list(_files(folder))
@@ -284,12 +302,21 @@ def _has_class_folders(
 ) -> bool:
     """Return whether the images lie in class folders, and check the names of the folders.
 
-    Raise InputError if no folder is named after a class, if the name of another
-    folder resembles a label, or if images lie beside the folders.
+    Args:
+        folder: Folder of photographs.
+        paths: Paths of its images, relative to the folder.
+        classes: Names of the classes of the network.
+        labels: Positive classes.
+
+    Raises:
+        InputError: If no folder is named after a class, if the name of a folder
+            that is no class resembles a label, or if images lie beside the
+            folders.
     """
     names = folder_names(folder)
     others = [name for name in names if name not in classes and not name.startswith(OTHER_PREFIX)]
     for name in others:
+        # If `others` has all names, no folder is named after a class.
         if others == names or any(_is_like(name, label) for label in labels):
             suggestions = nearest(name, classes)
             problem = f"is not named after a class of the model (such as {suggestions})"
@@ -309,12 +336,22 @@ def _has_class_folders(
 
 
 def _is_like(name: str, label: str) -> bool:
-    """Return whether the name of a folder resembles a label."""
+    """Return whether the name of a folder contains a label, or is almost the same."""
     return label in name.lower() or bool(get_close_matches(name.lower(), [label]))
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, _Row]:
-    """Read the rows of photos.csv by path. Return no rows if there is no such file."""
+    """Read photos.csv.
+
+    Args:
+        table: Path of the file, which may be missing.
+
+    Returns:
+        Rows by the path of the image. Empty without a file.
+
+    Raises:
+        InputError: If the file is damaged or contradicts itself.
+    """
     rows: dict[PurePosixPath, _Row] = {}
     if not os.path.lexists(table):
         return rows
@@ -405,7 +442,16 @@ def _read_into(
     folder: Path,
     photographs: Sequence[Photograph],
 ) -> list[Exception | None]:
-    """Read photographs into the rows of a tensor, and return the error of each row or None."""
+    """Read photographs into the rows of a tensor.
+
+    Args:
+        images: Tensor that is filled, uint8, shape (N, 3, size, size).
+        folder: Folder of the photographs.
+        photographs: The N photographs.
+
+    Returns:
+        For each photograph, the error that reading it raised, or None.
+    """
     paths = [folder / photograph.path for photograph in photographs]
     # Pillow releases Python's lock while it decodes and resizes, so threads help.
     pool = ThreadPoolExecutor()
@@ -418,7 +464,15 @@ def _read_into(
 
 
 def _read_image(image: Tensor, path: Path) -> Exception | None:
-    """Read a photograph into a tensor (3, size, size), and return the error if it is broken."""
+    """Read the central square of a photograph into a tensor.
+
+    Args:
+        image: Tensor that is filled, uint8, shape (3, size, size).
+        path: File of the photograph.
+
+    Returns:
+        The error that reading the file raised. None without an error.
+    """
     try:
         # The memory of Pillow is read-only, and np.array copies it.
         pixels = np.array(read_square(path, image.shape[-1]))

@@ -36,7 +36,8 @@ SETTINGS = ImageSettings(samples=4)
 # its own.
 VIEWS = 5
 BACKGROUNDS = 4
-# A hash of the code that renders, since other code may render other images.
+# Hash of the code that renders. It is part of the key of the cache, since other
+# code may render other images.
 _MODULES = (renderer.__file__, augment.__file__, __file__)
 CODE = source_key(*(Path(module).parent for module in _MODULES))
 
@@ -92,7 +93,18 @@ def soft_front_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
-    """Render the images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
+    """Render the images of every class.
+
+    Args:
+        part: "train" or "test", which decides the random draws.
+        per_class: Number of images of each class.
+        seed: Seed of shapes, views and lights.
+        settings: Settings of the images, with their size.
+
+    Returns:
+        Images in the order of the classes, uint8, shape
+        (classes · per_class, 3, size, size).
+    """
     instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     draws = generator(seed, part)
     images = []

@@ -68,7 +68,7 @@ class Split:
         return (images[batch] for batch in rows)
 
     def sample(self, count: int) -> Tensor:
-        """Return at most `count` images from all over the split, shape (count, 3, H, W)."""
+        """Return at most `count` evenly spaced images of the split, shape (count, 3, H, W)."""
         rows = torch.linspace(0, len(self) - 1, min(count, len(self))).long()
         return next(iter(self.squares([rows])))
 
@@ -235,7 +235,14 @@ def load_npz(path: str) -> DataSet:
 
 
 def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
-    """Read the arrays of a data set; raise ValueError for arrays of another kind."""
+    """Read a data set from the arrays of an .npz file.
+
+    Args:
+        archive: File with the arrays that `load_npz` describes.
+
+    Raises:
+        ValueError: If an array has another type or shape.
+    """
     classes = archive["classes"]
     splits = []
     for part in progress(("train", "test"), "reading the data"):
@@ -251,7 +258,16 @@ def _read_npz(archive: np.lib.npyio.NpzFile) -> DataSet:
 
 
 def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
-    """Make a split of arrays. Raise ValueError if a shape, a type or a label is wrong."""
+    """Convert the arrays of images and labels to a split.
+
+    Args:
+        images: Images, which must be uint8 of shape (N, 3, S, S).
+        labels: Labels, which must be whole numbers of shape (N,).
+        classes: Number of classes.
+
+    Raises:
+        ValueError: If a shape, a type or a label is wrong.
+    """
     is_square = images.ndim == 4 and images.shape[1] == 3 and images.shape[2] == images.shape[3]
     if not is_square or images.dtype != np.uint8:
         given = f"images are {images.dtype} of shape {images.shape}"
@@ -357,7 +373,15 @@ def _folder_split(
     skip_unreadable: bool,
     workers: int,
 ) -> Split:
-    """Read the images of class folders, with their labels."""
+    """Read the images of class folders.
+
+    Args:
+        root: Folder with a sub-folder for each class.
+        classes: Names of the classes. A label is an index into them.
+        size: Pixels per side of the images.
+        skip_unreadable: Whether broken images are skipped.
+        workers: Number of processes that read images from disk.
+    """
     found = find_photographs(root, classes, classes[0])
     found, images = _read(root, found, size, skip_unreadable, workers)
     labels = [class_index(classes, item.label, str(root)) for item in found]
@@ -367,7 +391,21 @@ def _folder_split(
 def _read(
     root: Path, found: list[Photograph], size: int, skip_unreadable: bool, workers: int
 ) -> tuple[list[Photograph], Tensor | ImageFiles]:
-    """Return the photographs that can be read, and their images, in memory or on disk."""
+    """Read photographs, or prepare to read them later if they are large.
+
+    Args:
+        root: Folder of the photographs.
+        found: Photographs in the folder.
+        size: Pixels per side of the images.
+        skip_unreadable: Whether broken images are skipped.
+        workers: Number of processes that read images from disk.
+
+    Returns:
+        Photographs and their images. Images of more than RESIDENT pixels per
+        side stay on disk, and whether they can be read is not known yet. Other
+        images are uint8 of shape (N, 3, size, size), and photographs that
+        cannot be read are left out.
+    """
     if size > RESIDENT:
         paths = tuple(item.path for item in found)
         return found, ImageFiles(root, paths, size, workers, skip_unreadable)

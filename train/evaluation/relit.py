@@ -33,7 +33,7 @@ from train.runs.run_config import read_json
 
 # File with the predictions for all photographs.
 RELIT = "relit.json"
-# Number of photographs of which a folder holds pictures.
+# Number of photographs of which `attack_folder` writes pictures.
 PICTURED = 8
 # Lights by the titles of their columns.
 TITLES = {
@@ -41,6 +41,7 @@ TITLES = {
     RANDOM: "random search",
     ADVERSARIAL: "gradient",
 }
+# Sentence of reports on the limits of the model.
 MODELED = (
     "This models a flat print of each photograph in the light of a projector, with the shading of "
     "a random smooth surface. There are no cast shadows, highlights or changes of the shape."
@@ -54,7 +55,8 @@ class RelitPhotograph:
     Attributes:
         path: Path in its folder.
         predicted: Predicted class of the unchanged photograph.
-        kept: Number of slides under which it keeps this class, by light.
+        kept: Number of slides under which the photograph keeps this class, by
+            light.
         becomes: Predicted classes under the slides, by light.
     """
 
@@ -132,7 +134,15 @@ class RelitScores:
 
 
 def _kept_fraction(row: Sequence[Any]) -> float:
-    """Return the fraction of the photographs of a row that keep their class in all lights."""
+    """Sum the fraction of the photographs that keep their class over all lights.
+
+    Args:
+        row: Row of `RelitScores.class_table`: the class, the number of
+            photographs, and for each light the number that keep their class.
+
+    Returns:
+        Sum of one fraction for each light.
+    """
     return sum(row[2:]) / row[1]
 
 
@@ -215,7 +225,15 @@ def read_relit(folder: Path) -> RelitScores:
 def _describe(
     result: PhotographAttackResult, photographs: Sequence[Photograph]
 ) -> list[dict[str, Any]]:
-    """Describe the predictions for each photograph by names of classes."""
+    """Describe the predictions for each photograph by names of classes.
+
+    Args:
+        result: Result of the attack on N photographs, with several slides each.
+        photographs: The N photographs.
+
+    Returns:
+        Fields of `RelitPhotograph` by name, for each photograph.
+    """
     classes = result.classifier.classes
     described = []
     for index, photograph in enumerate(photographs):
@@ -236,13 +254,24 @@ def _describe(
 
 
 def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]:
-    """Write pictures of photographs in all lights side by side, and return their file names.
+    """Write pictures of at most PICTURED photographs in all lights, side by side.
 
-    Photographs that only the gradient changes come first, and then those that
-    only the searches change.
+    Photographs whose class changes in one light come first. Usually this light
+    is the gradient attack. Photographs whose class changes in two lights follow,
+    and so on. Photographs that no light changes come last.
+
+    Args:
+        result: Result of the attack.
+        out: Folder of the pictures.
+
+    Returns:
+        File name of each picture by the index of its photograph.
     """
+    # Number of lights in which a photograph changes its class under any slide,
+    # shape (N,).
     number_of_losses = torch.stack([mask.any(1) for mask in result.changed.values()]).sum(0)
     is_lost = number_of_losses > 0
+    # Adding 100 puts the photographs without a change at the end.
     order = torch.argsort(number_of_losses + 100 * ~is_lost, stable=True)
     names = {}
     for photograph in order[:PICTURED].tolist():
@@ -258,6 +287,15 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
 
 
 def _slide_to_show(result: PhotographAttackResult, photograph: int) -> int:
-    """Return the first slide with a change in the last light, or 0."""
+    """Choose the slide under which a picture shows a photograph.
+
+    Args:
+        result: Result of the attack.
+        photograph: Index of the photograph.
+
+    Returns:
+        Index of the first slide that changes the class in the last, strongest
+        light. 0 if no slide does.
+    """
     changed = [*result.changed.values()][-1][photograph]
     return int(changed.int().argmax())

@@ -82,13 +82,22 @@ def _align(cells: Sequence[str]) -> Column:
 
 
 def _fit_terminal(columns: Sequence[Column]) -> list[list[Column]]:
-    """Divide columns into tables as wide as the terminal, each with the first column."""
+    """Divide the columns of a table into several tables that fit the terminal.
+
+    Args:
+        columns: Columns of a table. The first one has the titles of the rows.
+
+    Returns:
+        Columns of each table. Each table begins with the first column. If the
+        output is no terminal, there is one table.
+    """
     terminal_width = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     first, *others = columns
     tables = [[first]]
     for column in others:
         has_other_column = len(tables[-1]) > 1
         if has_other_column and _width([*tables[-1], column]) > terminal_width:
+            # A new table begins.
             tables.append([first])
         tables[-1].append(column)
     return tables
@@ -100,7 +109,7 @@ def _width(columns: Sequence[Column]) -> int:
 
 
 def _to_markdown(columns: Sequence[Column]) -> str:
-    """Join columns to the lines of a Markdown table."""
+    """Join columns of padded cells to the lines of a Markdown table."""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
 
 

@@ -147,7 +147,14 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
 
 
 def _working_folder(folder: Path, command: str) -> str:
-    """Return the folder in which the command was first given, if the command continues a run."""
+    """Return the folder in which a command was first given.
+
+    Args:
+        folder: Folder of the run, which may hold the config.yaml of an earlier
+            command.
+        command: Command line of this command. If it begins with the recorded
+            command, it continues the run, and the recorded folder is returned.
+    """
     with suppress(InputError):
         before = read_config(folder / CONFIG)
         if command.startswith(str(before.get("command"))):
@@ -175,7 +182,13 @@ def decisive_settings(settings: Any) -> dict[str, object]:
 
 
 def _move_paths(value: Any, folder: str, to: str) -> Any:
-    """Replace a folder at the start of all paths in nested settings."""
+    """Replace a folder at the start of all paths in nested settings.
+
+    Args:
+        value: Settings as nested mappings and lists. Any text may be a path.
+        folder: Folder to replace.
+        to: Text that takes the place of the folder.
+    """
 
     def move(text: str) -> str:
         is_inside = f"{text}/".startswith(f"{folder}/")
@@ -197,7 +210,7 @@ def given_command(overrides: Sequence[str]) -> str:
 
 
 def _recorded(overrides: Sequence[str]) -> list[str]:
-    """Remove the overrides that a recorded command lacks."""
+    """Return the overrides without run= and train.resume=, see NOT_RECORDED."""
     return [override for override in overrides if not override.startswith(NOT_RECORDED)]
 
 
@@ -328,7 +341,12 @@ def fingerprints(settings: Any) -> dict[str, str]:
 
 
 def _collect_texts(value: Any) -> set[str]:
-    """Collect the texts of a setting that may be paths, with the files of meshes and props."""
+    """Collect the texts of a setting that may be paths of input files.
+
+    Args:
+        value: A text, a mapping with the keys "mesh" and "props", or a list of
+            these. All other values have no path.
+    """
     if isinstance(value, dict):
         value = [value.get("mesh"), value.get("props")]
     if isinstance(value, list):

@@ -160,6 +160,7 @@ class RunLog:
         for index in attack_examples.labels:
             labels.append(classes[index] if index >= 0 else "negative")
         columns = {}
+        # Index 0 has the state before the attack, and index 1 the state after it.
         for index, name in enumerate(("before", "after")):
             images = attack_examples.images[index]
             captions = _captions(attack_examples.predictions[index], classes, labels)
@@ -181,7 +182,17 @@ def _captions(
     classes: Sequence[str],
     labels: Sequence[str],
 ) -> list[tuple[str, str]]:
-    """Write the most probable class, with its probability, and the label of each image."""
+    """Write the two captions of each image.
+
+    Args:
+        probabilities: Probabilities of the classes, shape (N, classes).
+        classes: Names of the classes.
+        labels: Label of each image in words.
+
+    Returns:
+        For each image, the most probable class with its probability, such as
+        "81% orange", and the label.
+    """
     highest, predicted = torch.max(probabilities, dim=1)
     captions = []
     for value, index, label in zip(highest.tolist(), predicted.tolist(), labels, strict=True):

@@ -83,7 +83,15 @@ def load_network(
 
 
 def _run_of(path: Path) -> Path | None:
-    """Return the folder of a run if a path is this folder or its file of weights, else None."""
+    """Find the run that a path belongs to.
+
+    Args:
+        path: Any path. The folder of a run has a file best.pt.
+
+    Returns:
+        Folder of the run, if the path is this folder or its file weights.pt.
+        Otherwise None.
+    """
     for folder in (path, path.parent):
         is_named = folder == path or path.name == WEIGHTS
         if is_named and (folder / BEST).is_file():
@@ -152,7 +160,12 @@ def load_run(
 
 
 def _operating_points(state: Mapping[str, Any]) -> list[OperatingPoint]:
-    """Return the operating points that are stored with a network: none, one or several."""
+    """Read the operating points that are stored with a network.
+
+    Args:
+        state: Content of the file of a network. "operating_point" holds the
+            fields of one point, or a list with the fields of several.
+    """
     stored = state.get("operating_point", [])
     if not isinstance(stored, list):
         stored = [stored]

@@ -21,8 +21,9 @@ from train.system.user_errors import keyed
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
 # The threads that torch took at the start, before any run sets its own number.
 THREADS = torch.get_num_threads()
-# Weights times pixels of a batch. Less than this takes some milliseconds of one core, and
-# `choose_threads` chooses one thread.
+# The work of a batch is the number of weights times the number of pixels of the
+# batch. `choose_threads` chooses one thread for less work than this, which takes one
+# core some milliseconds.
 SMALL_WORK = 1e10
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": torch.float32}
 # The batch sizes for which `GraphedModel` records graphs. Validation has the largest. The batches
@@ -142,7 +143,10 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
 
 
 def _has_depthwise_layer(network: nn.Module | None) -> bool:
-    """Return whether a network has a depthwise convolution, with one group per channel."""
+    """Return whether a network has a depthwise convolution.
+
+    A depthwise convolution has several input channels and a group for each.
+    """
     modules = network.modules() if network is not None else []
     convolutions = [module for module in modules if isinstance(module, nn.Conv2d)]
     return any(layer.groups == layer.in_channels > 1 for layer in convolutions)
@@ -226,6 +230,7 @@ class GraphedModel(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         if self.training or len(images) > SIZES[-1]:
             return self.model(images)
+        # The smallest recorded size that holds the batch.
         size = next(size for size in SIZES if len(images) <= size)
         padding = images.new_zeros(size - len(images), *images.shape[1:])
         logits = self._graphs(torch.cat([images, padding]))

@@ -23,7 +23,12 @@ def content_hash(state: Any) -> str:
 
 
 def _update(digest: Any, value: Any) -> None:
-    """Add a value to a hash."""
+    """Add a value to a hash.
+
+    Args:
+        digest: Hash of hashlib, which is changed.
+        value: A tensor, a mapping, a list, a tuple, or a plain value.
+    """
     match value:
         case Tensor():
             plain = value.detach().cpu().contiguous()

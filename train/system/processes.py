@@ -41,7 +41,10 @@ def process_group() -> Iterator[None]:
 
 @contextmanager
 def main_process_first() -> Iterator[None]:
-    """Let the first process run the block before the others, which then find a download done."""
+    """Let the first process run the block before the others.
+
+    The other processes then find a download or a cached file that is complete.
+    """
     if distributed.rank() > 0:
         dist.barrier()
     yield
@@ -142,8 +145,9 @@ class SignalHandler:
     def requested(self) -> bool:
         """Return whether to stop now because a process of the run got a signal.
 
-        Several processes tell each other without waiting. They hear of a signal that came before
-        they were asked the last time.
+        With several processes, a call starts a sum over the processes and
+        returns the result of the sum that the call before has started. Processes
+        therefore seldom wait for each other, and all stop after the same call.
         """
         has_signal = self._number is not None
         if distributed.world_size() == 1:

@@ -100,7 +100,10 @@ def user_message(error: BaseException) -> str | None:
 
 
 def _is_of_another_process(error: RuntimeError) -> bool:
-    """Return whether NCCL or gloo lost the connection to another process."""
+    """Return whether an error says that the connection to another process was lost.
+
+    NCCL or gloo raises such errors.
+    """
     from torch.distributed import DistError
 
     # Gloo has no error class. Its messages name its source file.

@@ -64,6 +64,7 @@ class Baseline:
         # torchvision's transforms draw once for a whole batch, and from the global generator.
         transformed = []
         with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
+            # Index of the first image of this process in the batch of all processes.
             first = distributed.rank() * len(images)
             for index, image in enumerate(images, first):
                 torch.manual_seed(stream_seed(self._seed, step, index, "distortion"))
@@ -72,7 +73,7 @@ class Baseline:
 
 
 def _transform(name: str) -> Any:
-    """Return one of torchvision's transforms."""
+    """Return the transform of torchvision that a name of `Baseline` stands for."""
     from torchvision.transforms import v2  # torchvision takes a second to import
 
     jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)

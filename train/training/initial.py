@@ -179,7 +179,18 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 
 
 def _classifier(settings: ExperimentSettings, name: str) -> Initial:
-    """Load a classifier that was trained elsewhere, for images of its own size or another one."""
+    """Load a classifier of another library or a file as the initial network.
+
+    Args:
+        settings: Settings of the run, with the weights, the classes and the
+            size of the images. Without a size, the images have the size that
+            the classifier takes.
+        name: Value of `train.init_from`.
+
+    Raises:
+        InputError: If there is no such classifier, or if it has no weights that
+            can be trained.
+    """
     size = settings.data.size
     is_file = is_network_file(name)
     with keyed(name="train.init_from", size="data.size"):
@@ -255,12 +266,14 @@ def choose_validation(
     if fraction is None:
         most = 1.0 if data.labeled else HELD_OUT / len(data.train)
         fraction = min(VALIDATION, most)
+    # The record of the part that this run leaves out.
     own = {"fraction": fraction, "seed": 0, "images": data.train.content_hash}
     if data.rendered:
         own["data"] = "shapes"
     if initial is None:
         return ValidationPart(fraction, own)
 
+    # The part that the initial network did not learn from, and its fraction.
     stored = initial.validation
     known = stored.get("fraction") if stored else None
     if data.rendered and stored and known is not None and "data" not in stored:

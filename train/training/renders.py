@@ -89,7 +89,16 @@ def _build_scene(
     device: torch.device,
     phases: Phases,
 ) -> Scene:
-    """Build the scene of a run's meshes, in the first process before the others."""
+    """Build the scene with the meshes and hard negatives of a run.
+
+    The first process builds the scene before the others.
+
+    Args:
+        settings: Settings of the run.
+        size: Pixels per side of the renders.
+        device: Device that renders.
+        phases: Clock that adds the time to the phase "operators".
+    """
     with keyed(**keys_of("renderer", settings.renderer)):
         rasterizer = choose_rasterizer(settings.renderer)
     console.debug("rasterizer: %s", rasterizer.description)
@@ -112,7 +121,15 @@ def _build_scene(
 
 
 def _class_numbers(settings: ExperimentSettings, data: DataSet) -> dict[str, int]:
-    """Return the number of each class that a mesh of the run has."""
+    """Return the index of each class that a mesh or a hard negative of the run has.
+
+    Args:
+        settings: Settings of the run, with its objects.
+        data: Data of the run. The index counts its classes.
+
+    Returns:
+        Index by the name of the class. Objects of the class OTHER are left out.
+    """
     return {
         item.label: class_index(data.classes, item.label, f"label of {key}")
         for key, item in settings.objects.items()

@@ -63,7 +63,7 @@ class Subject(NamedTuple):
     Attributes:
         label: Class of the mesh, and name of the folder of its renders.
         mesh: File of the mesh, or name of the solid.
-        parts: The mesh by texture.
+        parts: Parts of the mesh. Each part has one texture, or none.
     """
 
     label: str
@@ -150,12 +150,19 @@ def _rgb(color: np.ndarray) -> dict[str, Any]:
 
 
 def _lights(shot: Shot) -> list[dict[str, Any]]:
-    """Describe the light sources for Mitsuba."""
+    """Describe the light sources of a shot for Mitsuba.
+
+    Returns:
+        Entries of a Mitsuba scene: the environment map, if the shot has one.
+        Otherwise a projector for each pattern, and even light from all
+        around.
+    """
     if shot.environment is not None:
         return [environment({"bitmap": shot.environment})]
     lights = []
     for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
         distance = float(np.linalg.norm(position - shot.center))
+        # At the object, the light covers a square of this half-width.
         fov = 2 * float(np.degrees(np.arctan(PROJECTOR_HALF_WIDTH / distance)))
         # The irradiance of a projector falls with the square of the distance.
         power = shot.brightness * distance**2
@@ -166,14 +173,29 @@ def _lights(shot: Shot) -> list[dict[str, Any]]:
 
 
 def _plane(pose: np.ndarray, color: np.ndarray) -> dict[str, Any]:
-    """Describe a large diffuse square for Mitsuba, with its front toward its own +z axis."""
+    """Describe a large diffuse square, the table or the wall, for Mitsuba.
+
+    Args:
+        pose: Matrix from the coordinates of the square to the world, shape
+            (4, 4). The square lies in its plane z = 0, and its front faces +z.
+        color: Albedo in linear RGB, shape (3,).
+    """
     scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
     surface = {"type": "diffuse", "reflectance": _rgb(color)}
     return {"type": "rectangle", "to_world": pose @ scale, "bsdf": surface}
 
 
 def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
-    """Rotate and scale the object, set it on the table, and make a Mitsuba shape of each part."""
+    """Make a Mitsuba shape of each part of the object in the pose of a shot.
+
+    The object is scaled and rotated. Its lowest point then touches the table
+    z = 0.
+
+    Args:
+        module: The module `mitsuba`.
+        parts: Parts of the object.
+        shot: Shot with scale, rotation and roughness.
+    """
     positions_by_part = []
     for part in parts:
         positions = shot.scale * part.positions @ shot.rotation.T
@@ -185,6 +207,7 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
         if part.texture is not None:
             albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
         surface = {"type": "principled", "base_color": albedo, "roughness": shot.roughness}
+        # Each face has three vertices of its own.
         faces = np.arange(len(positions)).reshape(-1, 3)
         normals = (part.normals @ shot.rotation.T).reshape(-1, 3)
         shapes.append(
@@ -248,7 +271,20 @@ def write_laboratory(settings: LabSettings) -> int:
 
 
 def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[list[Subject]]:
-    """Group the meshes by label. Hard negatives of all labels form the last group."""
+    """Group the meshes by label.
+
+    Args:
+        subjects: Meshes with their labels.
+        labels: Positive classes.
+
+    Returns:
+        The meshes of each label. The last group has the meshes of all other
+        classes, if there are any.
+
+    Raises:
+        InputError: If a label has no mesh, or if there is a single label and no
+            mesh of another class.
+    """
     negatives = [subject for subject in subjects if subject.label not in labels]
     groups = []
     for label in labels:
@@ -282,7 +318,18 @@ def _write_render(
     shot: Shot,
     number: int,
 ) -> str:
-    """Render a mesh in a setup, write the image, and return its path relative to the folder."""
+    """Render a mesh in a shot, and write the image as sRGB of 8 bits.
+
+    Args:
+        out: Folder of the test set.
+        settings: Settings of pnb-lab.
+        subject: The mesh.
+        shot: Lighting, camera and pose.
+        number: Number of the shot, from 0.
+
+    Returns:
+        Path of the image in `out`: LABEL/NUMBER_FAMILY.png.
+    """
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
@@ -299,7 +346,18 @@ def _read_slide(path: str) -> np.ndarray:
 
 
 def _read_environment(path: Path) -> np.ndarray:
-    """Read the radiance (H, W, 3) of a map, or of a built-in light without negative radiance."""
+    """Read the radiance of an environment map, or of a built-in light.
+
+    Args:
+        path: File of the map, or name of a built-in light. Negative radiance of
+            a built-in light is removed.
+
+    Returns:
+        Linear RGB, shape (H, W, 3). The upper half is above the horizon.
+
+    Raises:
+        InputError: If no light comes from above the horizon.
+    """
     if str(path) in PROBES:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
         return to_map(light, PROBE_HEIGHT).clamp(min=0).numpy()

@@ -155,10 +155,18 @@ def _draw_shot(
     rng: np.random.Generator,
     extra_rng: np.random.Generator,
 ) -> Shot:
-    """Draw a shot under the patterns whose names are joined by + in `family`.
+    """Draw a shot under the light of projectors.
 
-    `extra_rng` draws what earlier versions of the laboratory did not have, such
-    as the wall, so that the other draws stay the same.
+    Args:
+        family: Names of the projected patterns, joined by "+". Each pattern has
+            a projector.
+        brightness: Brightness of the projected light, see `Shot`.
+        settings: Settings of pnb-lab, with the ranges of the draws.
+        slides: Pictures of the pattern "slides".
+        rng: Random number generator.
+        extra_rng: Random number generator of the things that earlier versions
+            of the laboratory did not have, such as the wall. With a generator
+            of their own, they leave all other draws as they were.
     """
     first_family, *other_families = family.split("+")
     azimuth = rng.uniform(0, 360)
@@ -179,6 +187,7 @@ def _draw_shot(
     rotation = Rotation.from_euler("ZXZ", angles, degrees=True).as_matrix()
     wall = _draw_wall(azimuth, extra_rng)
     has_wall = extra_rng.uniform() < settings.walls
+    # The wall is left out if it would stand between a projector and the object.
     is_hidden = any((position - center) @ wall >= wall @ wall for position in projectors)
     return Shot(
         family=family,

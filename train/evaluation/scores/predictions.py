@@ -256,6 +256,8 @@ def rank_classes(
     probabilities = logits.softmax(dim=1).tolist()
     # Ranks come from the logits, whose order survives if probabilities round to
     # 0. Of classes with equal logits, the first one has the lower rank.
+    # `class_at_rank` has the index of the class at each place, and `ranks` the place
+    # of each class, from 1. Both have shape (N, C).
     class_at_rank = logits.argsort(dim=1, descending=True, stable=True)
     ranks = (class_at_rank.argsort(dim=1) + 1).tolist()
     predicted = class_at_rank[:, 0].tolist()
@@ -318,7 +320,14 @@ def write_predictions(path: Path, predictions: Sequence[Prediction]) -> None:
 
 
 def _to_row(predictions: Sequence[Prediction]) -> dict[str, object]:
-    """Return the row of a photograph, given its predictions for each positive class."""
+    """Make the row of a photograph in predictions.csv.
+
+    Args:
+        predictions: Predictions for the photograph, one for each positive class.
+
+    Returns:
+        Cells by the name of the column, see `write_predictions`.
+    """
     photograph = predictions[0].photograph
     row: dict[str, object] = {
         "path": photograph.path,
@@ -363,7 +372,13 @@ def read_predictions(path: Path, label: Label) -> list[Prediction]:
 
 
 def _from_row(row: Mapping[str, str], label: str) -> Prediction:
-    """Return the prediction for a positive class that a row of predictions.csv holds."""
+    """Read the prediction for a positive class from a row of predictions.csv.
+
+    Args:
+        row: Cells of a photograph by the name of the column.
+        label: Positive class. The row has the columns LABEL_probability,
+            LABEL_rank and LABEL_log_odds.
+    """
     photograph = Photograph(
         path=PurePosixPath(row["path"]),
         label=row["label"],

@@ -166,7 +166,14 @@ class Scores:
 
 
 def _entries(metrics_by_name: Mapping[str, Metrics]) -> dict[str, dict[str, Any]]:
-    """Convert metrics by name to entries of summary.json."""
+    """Convert metrics to entries of summary.json.
+
+    Args:
+        metrics_by_name: Metrics by the name of a label, source, mesh or class.
+
+    Returns:
+        Entries by the same names.
+    """
     return {name: metrics.to_summary() for name, metrics in metrics_by_name.items()}
 
 
@@ -246,12 +253,16 @@ def score(
 
 
 def _metrics_of(pools: Mapping[str, Pool]) -> dict[str, Metrics]:
-    """Compute the metrics of each pool. Their bootstrap intervals take a while."""
+    """Compute the metrics of each pool by its name. The bootstrap intervals take a while."""
     return {name: pool.metrics for name, pool in progress(pools.items(), "intervals")}
 
 
 def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
-    """Score the photographs of each class that the folder has."""
+    """Score the photographs of each class that the folder has.
+
+    Returns:
+        Scores by the name of the class, in alphabetical order.
+    """
     by_class: dict[str, list[Prediction]] = {}
     for prediction in predicted.photographs:
         by_class.setdefault(prediction.photograph.label, []).append(prediction)
@@ -259,7 +270,12 @@ def _score_classes(predicted: FolderPredictions) -> dict[str, ClassScores]:
 
 
 def _score_class(predictions: Sequence[Prediction], labels: Sequence[str]) -> ClassScores:
-    """Score the photographs of one class."""
+    """Score the photographs of one class.
+
+    Args:
+        predictions: One prediction for each photograph of the class.
+        labels: Positive classes.
+    """
     # The rank is None if the model lacks the class.
     ranks = [item.true_rank for item in predictions if item.true_rank is not None]
     wrong = Counter(sorted(item.predicted for item in predictions if item.true_rank != 1))
@@ -421,7 +437,10 @@ def format_overall(scores: Scores) -> str:
 
 
 def _rows_of(scores: Scores) -> Iterator[tuple[str, Metrics]]:
-    """Name the metrics that tables show: of all images, each label, and each group."""
+    """Yield the title and the metrics of each row of a table.
+
+    The rows are all images, each label, and then each mesh, class or source.
+    """
     yield "all", scores.overall
     yield from scores.by_label.items()
     groups = scores.by_mesh or scores.class_metrics or scores.by_source
@@ -439,7 +458,11 @@ def _counted_table(scores: Scores) -> Table:
 
 
 def _ranked_table(scores: Scores) -> Table:
-    """Make the table of the metrics with bootstrap intervals, and say what these are over."""
+    """Make the table of the metrics with bootstrap intervals.
+
+    The title says whether the bootstrap draws images alone, or objects and
+    images.
+    """
     auc = scores.overall.auc
     resampled_metrics = (*RANKED, *TOP_RANKS)
     resampled = "images"
@@ -456,7 +479,7 @@ def _ranked_table(scores: Scores) -> Table:
 
 
 def _class_table(scores: Scores) -> Table:
-    """Make the table of the photographs of each class."""
+    """Make the table of recall, top-5 and wrong predictions, with a row for each class."""
     header = ["class", "recall", "top-5", f"predicted {scores.label}", "most common wrong classes"]
     rows = []
     for name, part in scores.by_class.items():
@@ -467,7 +490,7 @@ def _class_table(scores: Scores) -> Table:
 
 
 def _notes(scores: Scores) -> Iterator[str]:
-    """Say how thresholds were chosen, and which files were not scored."""
+    """Yield a sentence for each threshold, and for the files that were not scored."""
     for point in scores.point_entries:
         label = f" of {point['label']}" if scores.by_label else ""
         threshold = f"threshold {point['threshold']:.3f} on the log-odds{label}"

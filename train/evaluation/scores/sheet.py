@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 
 ROC_TABLE = "roc.csv"
 ROC_FIGURE = "roc.png"
-# The images that a section shows, at most, and the images in a row.
+# Largest number of images in a section of the contact sheet.
 PER_SECTION = 40
+# Number of images in a row of a section.
 COLUMNS = 10
-# Pixels: the side of an enlarged image, and the width of its frame.
+# Side of an enlarged image in pixels.
 IMAGE = 96
+# Width of the frame of an image in pixels.
 FRAME = 4
-# Characters of a caption, at most.
+# `_shortened` cuts captions of more characters than this.
 LONGEST_CAPTION = 18
 LEGEND = (
     "Under each image: the predicted class and its probability. "
@@ -39,19 +41,20 @@ RED = "#d03b3b"
 YELLOW = "#e8a317"
 
 Item = TypeVar("Item")
-# The scores of the positives and of the negatives.
+# Log-odds of the positives, shape (n,), and of the negatives, shape (m,).
 Pair = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class _Section:
-    """Images of one kind, by falling probability.
+    """A section of the contact sheet about one class.
 
     Attributes:
-        name: The kind, such as "true positives".
-        color: The color of the frames.
-        shown: The predictions and their images.
-        total: The number of images that the kind is a part of.
+        name: Title of the section, such as "true positives".
+        color: Color of the frames.
+        shown: Predictions with their images, by falling probability.
+        total: Number of all positives, for true positives and false negatives.
+            Number of all negatives, for false positives.
     """
 
     name: str
@@ -92,7 +95,15 @@ def _sections(
     predictions: Sequence[Prediction],
     images: torch.Tensor,
 ) -> list[_Section]:
-    """Divide the predictions about a class into the sections of the contact sheet."""
+    """Divide the predictions about a class into the sections of the contact sheet.
+
+    True negatives have no section.
+
+    Args:
+        label: The class.
+        predictions: Predictions about this class for all images.
+        images: The images, uint8, shape (N, 3, H, W).
+    """
     pairs = list(zip(predictions, images, strict=True))
     # The images with the most confident predictions come first.
     pairs.sort(key=lambda pair: pair[0].probability, reverse=True)
@@ -109,7 +120,7 @@ def _sections(
 
 
 def _section_grid(label: str, section: _Section) -> Image.Image:
-    """Draw a section under its heading."""
+    """Draw the heading of a section and, below it, at most PER_SECTION of its images."""
     count = len(section.shown)
     heading = f"{label}: {count} {section.name} of {section.total}"
     if count > PER_SECTION:
@@ -136,7 +147,15 @@ def evenly_spaced(ordered: Sequence[Item], count: int) -> list[Item]:
 
 
 def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
-    """Frame an image over the predicted class and, if that is wrong, the true class."""
+    """Draw an image in a frame, with captions below it.
+
+    Args:
+        prediction: Prediction for the image. The first caption has the
+            predicted class with its probability. If it is wrong, the second
+            caption has the true class.
+        image: The image, uint8, shape (3, H, W).
+        color: Color of the frame.
+    """
     pixels = Image.fromarray(image.permute(1, 2, 0).numpy())
     enlarged = pixels.resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
     lines = [f"{prediction.probability:.0%} {prediction.predicted}"]
@@ -149,7 +168,7 @@ def _tile(prediction: Prediction, image: torch.Tensor, color: str) -> Tile:
 
 
 def _shortened(caption: str) -> str:
-    """Cut a caption that is too long."""
+    """Cut a caption of more than LONGEST_CAPTION characters, and end it with "…"."""
     if len(caption) <= LONGEST_CAPTION:
         return caption
     return f"{caption[: LONGEST_CAPTION - 1]}…"
@@ -163,14 +182,16 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
     Args:
         folder: Folder that the files are written to.
         overall: Scores of the positives and of the negatives among all images.
-        by_name: Such scores of each source or each label. The table has a row
-            for each point of their curves, after those of all images, whose
-            name is empty.
+        by_name: Scores of the positives and of the negatives of each source, or
+            of each label. In the table, the points of the curve of all images
+            come first, under an empty name. The points of the curve of each
+            source or label follow.
         label: Positive classes, as axes name them.
     """
     # This import takes half a second.
     from matplotlib.figure import Figure
 
+    # A curve needs both positives and negatives.
     known = {name: pair for name, pair in by_name.items() if all(map(len, pair))}
     has_overall = all(map(len, overall))
     table = io.StringIO()
@@ -197,7 +218,15 @@ def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: s
 
 
 def _curve_rows(name: str, pair: Pair) -> list[tuple[object, ...]]:
-    """Return a row of roc.csv for each point of a curve."""
+    """Make a row of roc.csv for each point of a curve.
+
+    Args:
+        name: Name of the source or label of the curve. Empty for all images.
+        pair: Scores of the positives and of the negatives.
+
+    Returns:
+        Rows of name, false-positive rate, recall and threshold.
+    """
     points = zip(*roc_curve(*pair), strict=True)
     return [(name, *map(float, point)) for point in points]
 
