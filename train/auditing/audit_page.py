@@ -59,7 +59,7 @@ SLIDER_SCRIPT = (Path(__file__).parent / "slider.js").read_text(encoding="utf-8"
 # Number of images in a gallery of the worst images.
 WORST = 10
 # Minimum fraction of correctly classified images of a network that is called
-# safe, both of the label and of other things.
+# safe, both of the label and of other objects.
 PASS_THRESHOLD = 0.9
 # Predictions by the name of a network and by part, in the order of the images.
 Predictions = Mapping[str, Mapping[str, Sequence[Prediction]]]
@@ -398,7 +398,7 @@ def _find_rates(label: str, folder: Path, parts: Collection[str]) -> list[Findin
         recall = read_metric(scores, "recall")
         findings.append(_recognized(f"{label} in the {part}", recall))
         false_positive_rate = read_metric(scores, "false_positive_rate")
-        subject = f"other things for {label} in the {part}"
+        subject = f"other objects for {label} in the {part}"
         findings.append(_not_mistaken(subject, false_positive_rate))
     return [finding for finding in findings if finding is not None]
 
@@ -424,7 +424,7 @@ def _not_mistaken(subject: str, error_rate: Estimate | None) -> Finding | None:
 
     Args:
         subject: What the images show and what they are mistaken for, such as
-            "other things for orange".
+            "other objects for orange".
         error_rate: Fraction of mistaken images with its interval.
 
     Returns:
@@ -512,7 +512,7 @@ def _worst(
     """Make two galleries of images for each network.
 
     The first gallery has the images of the label with the lowest log-odds. The
-    second gallery has the images of other things with the highest log-odds.
+    second gallery has the images of other objects with the highest log-odds.
 
     Args:
         label: Class whose objects were tested.

@@ -236,7 +236,7 @@ def describe_images(label: str, auc: AreaUnderCurve) -> str:
     """
     return (
         f"Scored on {auc.positives:,} images of {label} ({auc.positive_objects:,} objects) and "
-        f"{auc.negatives:,} of other things ({auc.negative_objects:,} objects)."
+        f"{auc.negatives:,} of other objects ({auc.negative_objects:,} objects)."
     )
 
 
@@ -308,11 +308,11 @@ def _sentences(
     before = f"{false_positives.before:.0%}"
     after = f"{false_positives.after:.0%}"
     if _direction(false_positives) > 0:
-        price = f"The price: {hardened} calls {after} of the images of other things “{label}”"
+        price = f"The price: {hardened} calls {after} of the images of other objects “{label}”"
         sentences.append(f"{price}, instead of {before}.")
     else:
         sentences.append(
-            f"Of the images of other things, {original} calls {before} “{label}”; "
+            f"Of the images of other objects, {original} calls {before} “{label}”; "
             f"{hardened}, {after}."
         )
     equal = compared.difference(EQUAL_RATE)

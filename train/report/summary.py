@@ -435,12 +435,14 @@ def _title_of(group: Scored) -> str:
     if not isinstance(auc, AreaUnderCurve):
         return first.name
     labels = first.scores.labels
-    title = f"{first.name}, {auc.positives:,} of {' or '.join(labels)}"
-    title += f" and {auc.negatives:,} of other things"
+    title = (
+        f"{first.name}: {auc.positives:,} images of {' or '.join(labels)}, "
+        f"{auc.negatives:,} images of other objects"
+    )
     if len(labels) > 1:
         title += COUNTED_EACH
     if auc.has_repeated_objects:
-        title += "; AUC and recall at FPR over objects, too"
+        title += "; intervals of AUC are over objects and images"
     return title
 
 
