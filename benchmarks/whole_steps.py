@@ -128,10 +128,12 @@ class ByHand:
         self.background_part = (1 - operator.coverage) * background
         self.empty_image = operator.coverage.new_full((3, size**2), background)
         if operator.distinct is not None:
-            self.source = operator.distinct.source.expand(3, -1)
-            self.transfer = self.transfer.index_select(1, operator.distinct.first)
-            self.albedo = self.albedo.index_select(1, operator.distinct.first)
-            self.background_part = self.background_part.index_select(0, operator.distinct.first)
+            self.source = operator.distinct.pixel_to_group.expand(3, -1)
+            self.transfer = self.transfer.index_select(1, operator.distinct.first_pixel)
+            self.albedo = self.albedo.index_select(1, operator.distinct.first_pixel)
+            self.background_part = self.background_part.index_select(
+                0, operator.distinct.first_pixel
+            )
 
     def step(self, light: Tensor, loss: Loss) -> tuple[Tensor, Tensor]:
         """Render a light, and compute the gradient of the loss by the light.
