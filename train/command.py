@@ -494,7 +494,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _suggest(key: str, keys: Collection[str]) -> str:
-    """Suggest the nearest key."""
+    """Suggest the key that is most similar to an unknown one, or --help if none is similar."""
     close = get_close_matches(key, keys, 1, 0.5)
     return f"did you mean {close[0]}?" if close else "--help shows all settings"
 

@@ -39,11 +39,14 @@ ENVIRONMENTS = ("grace", "eucalyptus", "st_peters")
 RENDERERS = ("reload", "mitsuba")
 # Power of the default lamps if only their positions are attacked.
 LAMP_POWER = 2.0
+# Patterns of projectors that a training may use.
 TRAINED_PATTERNS = ("solid", "gradient", "stripes", "checkers", "half", "spots")
+# Patterns of projectors for images that are kept aside from training.
 OTHER_PATTERNS = ("rings", "window", "leaves", "text", "colors")
 # Name of the pattern that projects images of the user.
 SLIDES = "slides"
 PATTERNS = (*TRAINED_PATTERNS, *OTHER_PATTERNS, SLIDES)
+# Default meshes of pnb-lab.
 LAB_MESHES = [
     *(f"solid:orange:{seed}" for seed in range(101, 107)),
     *("solid:apple:101", "solid:apple:102", "solid:pear:101", "solid:sweet_pepper:101"),

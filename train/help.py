@@ -83,7 +83,7 @@ def without_none(hint: Any) -> Any:
 
 
 def _choice_lines(groups: Sequence[str]) -> Iterator[str]:
-    """Format each file of each group with the comment at its beginning."""
+    """Yield a line for each choice of each group, such as "attack=lighting" with its comment."""
     for group in groups:
         folder = CONF / group.partition("@")[0]
         for path in sorted(folder.glob("*.yaml")):
@@ -99,7 +99,15 @@ def _first_comment(path: Path) -> str:
 
 
 def _setting_lines(node: DictConfig, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the key and the line of each setting below a node."""
+    """Yield the line of --help about each setting below a node.
+
+    Args:
+        node: Settings with their values.
+        prefix: Text before each key, such as "train.".
+
+    Yields:
+        Dotted key of a setting or a group of settings, and its line.
+    """
     kind = cast(type, OmegaConf.get_type(node))
     values = cast(dict[str, Any], OmegaConf.to_container(node))
     for name in field_types(kind):

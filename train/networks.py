@@ -27,8 +27,8 @@ PYTHON = "python:"
 # Version of the description that is stored with the weights of a network.
 # Version 1 had no size, normalization and encoding.
 VERSION = 2
-# Limits of a WideResNet. A file from elsewhere can ask for any depth and width,
-# and 1e9 parameters take 4 GB.
+# Largest depth and largest number of parameters of a WideResNet. A file from
+# elsewhere can ask for any depth and width, and 1e9 parameters take 4 GB.
 MAX_DEPTH = 1000
 MAX_PARAMETER_COUNT = 1e9
 # Dropout on a CPU draws integers of 16 bits.
@@ -122,6 +122,8 @@ def _require_shape(depth: int, width: int, dropout: float) -> None:
     """Raise InputError if a WideResNet cannot have the depth, the width or the dropout."""
     given = f"depth={depth}, width={width}"
     # The weights of the 3 × 3 convolutions, which are most of the parameters.
+    # Each group has two convolutions in each of (depth - 4) / 6 blocks. The channels
+    # of the groups are 16, 32 and 64 times the width, with the squares 16² · (1, 4, 16).
     parameter_count = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
     if depth < 10 or (depth - 4) % 6 or width < 1:
         raise InputError(f"{given}: depth is 10, 16, 22, ... and width at least 1", "depth")
@@ -194,7 +196,11 @@ class Dropout(nn.Dropout):
         return x * (draws[distributed.rank()] >= self.p) / (1 - self.p)
 
     def _draw_factors(self, x: Tensor) -> Tensor:
-        """Draw 0 or 1 / (1 - p) for each value of x from 16 random bits, in the layout of x."""
+        """Draw a factor for each value of x: 0 with probability p, otherwise 1 / (1 - p).
+
+        A draw has 16 random bits. The factors have the shape and the memory
+        layout of x.
+        """
         # All processes draw for the whole batch, and each takes its own part.
         # The draws then do not depend on the number of processes.
         value_count = x.numel()
@@ -275,7 +281,18 @@ def build_network(
 
 
 def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
-    """Call the Python function of a name, and check the size and the classes that it returns."""
+    """Call the Python function that builds a network.
+
+    Args:
+        name: "python:MODULE:FUNCTION". The function returns a module, the size
+            of its images and its classes.
+        classes: Classes that the function must return.
+        size: Pixels per side that the function must return.
+
+    Raises:
+        InputError: If the function returns no module, or another size or other
+            classes.
+    """
     network, own_size, own_classes = call_python(name.removeprefix(PYTHON))
     if not isinstance(network, nn.Module):
         raise InputError(f"name={name} returns no torch.nn.Module, which training needs", "name")

@@ -43,7 +43,7 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 
 def _load_network(settings: EvaluateSettings) -> Classifier:
-    """Load the network of a run, or any other classifier."""
+    """Load the network of a run if `settings.run` is set. Otherwise load the classifier."""
     if settings.run is None:
         with keyed(name="classifier"):
             return load_chosen(settings)

@@ -115,7 +115,15 @@ def _list_methods(settings: ExperimentSettings, folder: Path) -> dict[Path, Expe
 
 
 def _advise_to_resume(methods: Mapping[Path, ExperimentSettings], folder: Path) -> str:
-    """Say how to continue a command that was interrupted."""
+    """Say how to continue a command that was interrupted.
+
+    Args:
+        methods: Settings of each run by its folder.
+        folder: Folder of the main run.
+
+    Returns:
+        The command to give. If no run has a checkpoint, advice to start again.
+    """
     if not any(map(checkpoint.exists, methods)):
         return "no checkpoint yet: start again"
     words = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
@@ -127,7 +135,13 @@ def _train_methods(
     folder: Path,
     command: str,
 ) -> None:
-    """Train all runs in their folders, and print a table. The main run lies in `folder`."""
+    """Train all runs of a command, and print a table that compares them.
+
+    Args:
+        methods: Settings of each run by its folder.
+        folder: Folder of the main run, which gets the report.
+        command: Command that was given, which each run records.
+    """
     for run in load_runs(methods, command):
         method = run.settings.augment.mode
         purpose = "" if run.folder == folder else ", for comparison"

@@ -82,7 +82,18 @@ def _calibrate(
     label: Any,
     false_positive_rate: float,
 ) -> list[dict[str, Any]]:
-    """Choose the threshold of each label on a folder of photographs, and print it."""
+    """Choose the threshold of each label on a folder of photographs, and print it.
+
+    Args:
+        network: Network to publish. Its weights are rounded to 16 bits.
+        folder: Folder of photographs.
+        label: Positive class, or several.
+        false_positive_rate: False-positive rate that the threshold must not
+            exceed, in (0, 1).
+
+    Returns:
+        Fields of the operating point of each label.
+    """
     # The thresholds are those of the published weights, which have 16 bits.
     network.half().float()
     with keyed(folder="calibrate"):

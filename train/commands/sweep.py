@@ -163,7 +163,12 @@ def _print_detail(line: str) -> None:
 
 
 def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
-    """Make a run, and write the reason to failed.txt if it fails."""
+    """Make a run of a sweep, and write the reason to failed.txt if it fails.
+
+    Args:
+        config: Configuration of the run.
+        folder: Folder of the run.
+    """
     job = HydraConfig.get()
     # The runs of joblib's launcher print at the same time.
     shares_console = "n_jobs" in job.launcher
@@ -183,7 +188,13 @@ def _run_and_record_failure(config: DictConfig, folder: Path) -> None:
 
 
 def _run(config: DictConfig, folder: Path, overrides: Sequence[str]) -> None:
-    """Make all parts of a run, or resume it from its checkpoint."""
+    """Train, score and export a run. If it has a checkpoint, it is resumed from there.
+
+    Args:
+        config: Configuration of the run.
+        folder: Folder of the run.
+        overrides: Overrides of the run, as Hydra's sweeper writes them.
+    """
     settings = read_settings(ExperimentSettings, config)
     settings.train.resume = checkpoint.exists(folder)
     command = given_command([_unescaped(override) for override in overrides])

@@ -193,7 +193,15 @@ class _Reader(Dataset[tuple[Tensor, Faults]]):
 
 
 def _collate(items: Sequence[tuple[Tensor, Faults]]) -> tuple[Tensor, Faults]:
-    """Stack the images of a batch, and join their faults."""
+    """Stack the images of a batch.
+
+    Args:
+        items: For each image, a tensor (3, size, size) and the reasons by path
+            for files that could not be read.
+
+    Returns:
+        Images of shape (B, 3, size, size), and the reasons of all images by path.
+    """
     faults: Faults = {}
     for _, broken in items:
         faults |= broken

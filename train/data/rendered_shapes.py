@@ -118,7 +118,16 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
 
 
 def _portraits(mesh: Mesh, settings: ImageSettings, draws: torch.Generator) -> Tensor:
-    """Render 20 images of one instance: uint8 (20, 3, size, size)."""
+    """Render one instance of a solid from VIEWS views before BACKGROUNDS backgrounds.
+
+    Args:
+        mesh: Mesh of the solid.
+        settings: Settings of the images.
+        draws: Random generator of cameras, backgrounds and lights.
+
+    Returns:
+        Images, uint8, shape (VIEWS · BACKGROUNDS, 3, size, size).
+    """
     polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64).tolist()
     cameras = []
     for view in range(VIEWS):

@@ -139,7 +139,18 @@ def evaluate(
 def _choose_labels(
     classifier: Classifier, folder: Path, label: str | int | Sequence[str | int] | None
 ) -> list[str]:
-    """Return the names of the positive classes."""
+    """Return the names of the positive classes.
+
+    Args:
+        classifier: Network with the names of the classes.
+        folder: Folder of photographs.
+        label: Classes by name or index. None for all classes of the network
+            that have a sub-folder.
+
+    Raises:
+        InputError: If a class is unknown, or if no sub-folder is named after a
+            class.
+    """
     if label is not None:
         return [classifier.classes[classifier.label(name)] for name in label_names(label)]
     labels = class_folders(folder, classifier.classes)
@@ -153,7 +164,15 @@ def _choose_labels(
 
 
 def _points_of(classifier: Classifier, labels: Sequence[str]) -> list[OperatingPoint]:
-    """Return the operating points that a network carries, if it has one for each label."""
+    """Return the operating points that are stored with a network.
+
+    Args:
+        classifier: The network.
+        labels: Positive classes.
+
+    Returns:
+        Operating point of each label. Empty if a label has none.
+    """
     by_label = {point.label: point for point in classifier.operating_points}
     has_all = by_label.keys() >= set(labels)
     return [by_label[name] for name in labels] if has_all else []

@@ -175,7 +175,12 @@ def harden(
 
 
 def _trainable_copy(network: nn.Module) -> nn.Module:
-    """Return a copy of a network whose weights can be trained."""
+    """Return a copy of a network whose weights can be trained.
+
+    Raises:
+        InputError: If a plain network is in training mode, or if the copy cannot
+            be trained.
+    """
     if not isinstance(network, Classifier):
         require_evaluation_mode(network, "network")
     copy = deepcopy(network)
@@ -190,7 +195,14 @@ def _trainable_copy(network: nn.Module) -> nn.Module:
 def _read_settings(
     changes: Mapping[str, Any], sections: Mapping[str, Settings | Section]
 ) -> ExperimentSettings:
-    """Read the settings of the experiment with changes, and then those of the caller."""
+    """Combine the settings of conf/experiment/classifier.yaml with those of the caller.
+
+    Args:
+        changes: Nested settings that the arguments of `harden` decide. They
+            replace those of the file.
+        sections: Settings of the caller by the name of the section, such as
+            "train". They replace both.
+    """
     composed = cast(dict[str, Any], OmegaConf.to_container(main.compose(["experiment=classifier"])))
     names = [item.name for item in fields(ExperimentSettings)]
     settings = OmegaConf.create({name: composed[name] for name in names})
@@ -202,7 +214,12 @@ def _read_settings(
 
 
 def _as_mapping(name: str, section: Settings | Section) -> Mapping[str, Any]:
-    """Return the fields of a section of the settings by name."""
+    """Return the fields of a section of the settings by name.
+
+    Args:
+        name: Name of the section, for the error.
+        section: Settings, a mapping of some fields, or None for no fields.
+    """
     if isinstance(section, Settings):
         return asdict(cast(Any, section))
     if section is None or isinstance(section, Mapping):
@@ -224,7 +241,16 @@ def _state_of_torch_kept() -> Iterator[None]:
 
 
 def _train(settings: ExperimentSettings, classifier: Classifier, has_report: bool) -> nn.Module:
-    """Train a copy of a classifier in the folder of the run, and return its network."""
+    """Train a copy of a classifier in the folder of the run.
+
+    Args:
+        settings: Settings of the run.
+        classifier: Classifier to train.
+        has_report: Whether to write a report and to print its path.
+
+    Returns:
+        The selected network of the run.
+    """
     folder = Path(settings.run)
     initial = initial_of(classifier, settings.data.size)
     with keyed(**{"data.path": "photographs"}):
@@ -240,7 +266,17 @@ def _train(settings: ExperimentSettings, classifier: Classifier, has_report: boo
 
 
 def _copy_with(network: nn.Module, classifier: Classifier, trained: nn.Module) -> nn.Module:
-    """Return a copy of a network with the weights that its classifier has learned."""
+    """Return a copy of the network of the caller with the trained weights.
+
+    Args:
+        network: Classifier or plain network that the caller gave.
+        classifier: The same network as a classifier.
+        trained: Network with the trained weights.
+
+    Returns:
+        Copy of `classifier` if the caller gave a classifier. Otherwise a copy of
+        the plain network.
+    """
     if isinstance(network, Classifier):
         copy: nn.Module = deepcopy(classifier)
         target = cast(Classifier, copy).function

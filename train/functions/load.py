@@ -72,7 +72,15 @@ def published_names() -> list[str]:
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:
-    """Read the accuracy, and the metrics on each folder of photographs, by name."""
+    """Read the results of a published network.
+
+    Args:
+        scores: Accuracy under "test/accuracy", and metrics by the name of each
+            folder of photographs.
+
+    Returns:
+        Results by name, such as "test/accuracy" and "photographs/auc".
+    """
     results = {ACCURACY: Estimate(scores[ACCURACY])}
     folders = {name: entry for name, entry in scores.items() if isinstance(entry, Mapping)}
     for folder, entry in folders.items():

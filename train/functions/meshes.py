@@ -64,7 +64,15 @@ def as_mappings(
 
 
 def _of_source(source: MeshSource, folder: Path) -> dict[str, Any]:
-    """Return the mapping of a mesh, which is written to the folder if it is in memory."""
+    """Describe a mesh by fields of `ObjectSettings`.
+
+    Args:
+        source: File, solid or mesh in memory.
+        folder: Folder to which a mesh in memory is written.
+
+    Returns:
+        Mapping with the key "mesh". A mesh in memory has "gloss" in addition.
+    """
     if not isinstance(source, Mesh):
         return {"mesh": str(source)}
     with TemporaryDirectory() as temporary:

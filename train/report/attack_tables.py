@@ -28,7 +28,7 @@ VERSIONS = {
 }
 # Titles of the methods that are compared at each radius.
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
-# End of the names of what counts without a sensor's noise.
+# End of the names of results that are measured in images without a sensor's noise.
 WITHOUT_NOISE = "_without_noise"
 
 # Result of `nb.success_by_radius`: at each radius, whether each method
@@ -42,7 +42,7 @@ def format_attack(
     checks: Mapping[str, Any] | None,
     lines: Sequence[Mapping[str, Any]] = (),
 ) -> list[str]:
-    """Write what came of the attack on one mesh.
+    """Write the success, the checks and the adversaries of the attack on one mesh.
 
     Args:
         name: Name of the mesh.
@@ -65,7 +65,16 @@ def format_attack(
 
 
 def _heading(name: str, result: AttackResult) -> str:
-    """Say what was attacked, and how often and how fast with success."""
+    """Write the first line about an attack.
+
+    Args:
+        name: Name of the mesh.
+        result: Result of the attack.
+
+    Returns:
+        The attacked parameters, the classifier, the rate of success, the median
+        number of steps of the successes, the passes and the seconds.
+    """
     parameters = "+".join(parameter.name for parameter in result.problem.parameters)
     heading = f"{name}: {parameters} against {result.classifier.name}: {_success(result)}"
     steps = result.steps[result.success & ~result.success_before].double()
@@ -82,7 +91,18 @@ def _passes(result: AttackResult) -> str:
 
 
 def _success(result: AttackResult) -> str:
-    """Count the successes on clean-correct examples and on their views."""
+    """Count the successes of an attack.
+
+    Only examples count that are classified correctly before the attack.
+
+    Args:
+        result: Result of the attack on E examples of V views.
+
+    Returns:
+        Text with the number of examples with a success. If noise, a margin or
+        several views were asked for, the numbers without noise, with the margin
+        and for single views follow.
+    """
     clean = result.clean_correct
     rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
     if rate.n == 0:
@@ -104,7 +124,18 @@ def _success(result: AttackResult) -> str:
 
 
 def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: bool) -> list[str]:
-    """Say what the checks of an attack found."""
+    """Write the results of the checks of an attack.
+
+    Args:
+        checks: Result of `nb.check`.
+        has_noise: Whether a success must remain with a sensor's noise.
+        uses_gradients: Whether the attack takes steps along a gradient.
+            Otherwise its budget counts queries.
+
+    Returns:
+        Lines about the log-probability before and after the attack, about
+        random changes and longer attacks, and about doubts.
+    """
     unit = "step" if uses_gradients else "query"
     units = "steps" if uses_gradients else "queries"
     rates_without_noise = checks[f"success_by_steps{WITHOUT_NOISE}"]
@@ -127,14 +158,27 @@ def _check_lines(checks: Mapping[str, Any], has_noise: bool, uses_gradients: boo
 
 
 def _both_rates(rate: float, without_noise: float, has_noise: bool) -> str:
-    """Write a rate of success and, if noise counts, the rate without noise."""
+    """Write a rate of success and, if noise counts, the rate without noise.
+
+    Args:
+        rate: Rate of success, in [0, 1].
+        without_noise: Rate of success in images without noise.
+        has_noise: Whether a success must remain with a sensor's noise.
+    """
     if not has_noise:
         return f"{rate:.0%}"
     return f"{rate:.0%} ({without_noise:.0%} without noise)"
 
 
 def _version_line(version: str, adversaries: Sequence[Mapping[str, Any]], has_noise: bool) -> str:
-    """Say how often adversaries still succeed in another version of their images."""
+    """Write how often adversaries still succeed in another version of their images.
+
+    Args:
+        version: Key of VERSIONS.
+        adversaries: Lines of attack.jsonl of the successful examples. "versions"
+            has the results of each version.
+        has_noise: Whether a success must remain with a sensor's noise.
+    """
     results = [line["versions"][version] for line in adversaries]
     success = sum(result["success"] for result in results)
     without_noise = ""
@@ -183,7 +227,12 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
 
 
 def _count_correct(success: Sequence[bool], clean: Sequence[bool]) -> int:
-    """Count the successes on examples that were correct before."""
+    """Count the successes on examples that were correct before the attack.
+
+    Args:
+        success: Whether the attack succeeds on each example.
+        clean: Whether each example was classified correctly before.
+    """
     return sum(hit for hit, correct in zip(success, clean, strict=True) if correct)
 
 
@@ -247,7 +296,16 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
 
 
 def _pool(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
-    """Join the examples of all meshes at each radius."""
+    """Join the examples of all meshes at each radius.
+
+    Args:
+        sweeps: Success at each radius, for each mesh. All meshes have the same
+            radii.
+        methods: Keys of the successes.
+
+    Returns:
+        Success at each radius on the examples of all meshes.
+    """
     pooled = []
     for rows in zip(*sweeps.values(), strict=True):
         success = {method: torch.cat([row[method] for row in rows]) for method in methods}
@@ -256,7 +314,14 @@ def _pool(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Sweep:
 
 
 def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
-    """Draw the rate of success of each method against the radius."""
+    """Draw the rate of success of each method against the radius.
+
+    Args:
+        records: Rows of sweep.csv of one mesh.
+        norms: Norm of the radius by attacked parameter. The axis shows the
+            radius of the first parameter.
+        path: File of the figure.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 3.8), layout="constrained")

@@ -103,7 +103,8 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         folder: The folder of the run.
 
     Returns:
-        The state, and the fault of a newer file if that is damaged.
+        The state, and the fault of last.pt if it is damaged and previous.pt was
+        read. The fault is None if last.pt was read.
 
     Raises:
         InputError: If there is no whole checkpoint.
@@ -117,7 +118,12 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the state of the CPU's random generator and of each GPU's."""
+    """Return the states of torch's random generators.
+
+    Returns:
+        State of the CPU under "cpu", and a list with the state of each GPU under
+        "cuda".
+    """
     states = cuda.get_rng_state_all() if cuda.is_available() else []
     return {"cpu": torch.get_rng_state(), "cuda": states}
 
@@ -126,7 +132,7 @@ def restore_random_state(state: Mapping[str, Any]) -> None:
     """Restore random generators, on as many GPUs as both machines have.
 
     Args:
-        state: What `random_state` returned.
+        state: States under "cpu" and "cuda", as `random_state` returns them.
     """
     torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):

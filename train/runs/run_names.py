@@ -20,10 +20,12 @@ HYDRAS_OWN = re.compile(r"\+*hydra[./]")
 
 
 def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str = "") -> str:
-    """Name the folder of a run, such as `augment-none+seed-0@7d0a3f52` for seed=0 augment=none.
+    """Name the folder of a run by its settings.
 
-    The settings are in alphabetical order. The name ends with a hash of the settings that decide
-    the result. Characters that a file system or Hydra's command line might refuse are replaced.
+    With seed=0 and augment=none, the name is such as
+    `augment-none+seed-0@7d0a3f52`. The settings are in alphabetical order. The
+    name ends with a hash of the settings that decide the result. Characters
+    that a file system or Hydra's command line might refuse are replaced.
 
     Args:
         overrides: The overrides of the run.

@@ -266,11 +266,12 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint's network in half precision.
+    """Write the network of a checkpoint in half precision.
 
     Args:
-        path: The safetensors file. Its metadata tell the architecture and other facts.
-        state: The checkpoint.
+        path: File in the format safetensors. Its metadata hold the entries in
+            PUBLISHED_FACTS as JSON.
+        state: Checkpoint, with the weights under "model".
     """
     metadata = {}
     for key in PUBLISHED_FACTS:
@@ -283,7 +284,18 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def _load_published(path: Path) -> dict[str, Any]:
-    """Read a file that `publish` wrote, in single precision."""
+    """Read a file that `publish` wrote.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Weights in single precision under "model", and the facts in
+        PUBLISHED_FACTS that the file has.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
     weights: dict[str, Tensor] = {}
     try:
         with safe_open(path, "pt") as file:

@@ -43,7 +43,11 @@ class SharedTeacher(nn.Module):
         self._hook.remove()
 
     def _keep(self, _: nn.Module, inputs: tuple[Any, ...]) -> None:
-        """Keep the features that the last layer of the pupil gets."""
+        """Keep the input of the last layer of the pupil. torch calls this hook before the layer.
+
+        Args:
+            inputs: Arguments of the layer. The first one has the features.
+        """
         self._features = inputs[0].detach()
 
     def forward(self, images: Tensor) -> Tensor:

@@ -1,4 +1,7 @@
-"""Settings of renders that are kept aside: what training saw, as other instances in other light."""
+"""Settings of renders that are kept aside from training.
+
+They show the classes of the training as other instances in other light.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -10,11 +13,12 @@ from train.command_settings import OTHER_PATTERNS, LabSettings
 from train.data.photographs import OTHER_PREFIX
 from train.settings import ExperimentSettings, label_names, simplified
 
-# Seeds of the first instance. Training draws its seeds from far larger numbers,
-# or names lower ones.
+# Seed of the first instance of a solid. The next instances have the next seeds.
+# Training draws its seeds from far larger numbers, or names lower ones.
 FIRST_SEED = 2001
-# Number of instances of each class under study, and of each other thing.
+# Number of instances of each class under study.
 INSTANCES = 6
+# Number of instances of each other thing in OTHERS.
 OTHER_INSTANCES = 2
 # Generated things that resemble fruit.
 OTHERS = ("lemon", "peach", "ball", "apple", "pear", "sweet_pepper", "orange")
@@ -64,7 +68,16 @@ def kept_aside_settings(
 
 
 def _objects(settings: ExperimentSettings, label: str) -> list[Any]:
-    """Return generated instances of a class, or its meshes of training if there are none."""
+    """Choose the objects of a class under study.
+
+    Args:
+        settings: Settings of the run, with the meshes of the training.
+        label: The class.
+
+    Returns:
+        Settings of INSTANCES generated solids, if the class is one that can be
+        generated. Otherwise the settings of its meshes in the training.
+    """
     name = simplified(label).replace(" ", "_")
     if name in SOLIDS or name in HARD_NEGATIVES:
         return _instances(name, label, INSTANCES)
@@ -72,6 +85,12 @@ def _objects(settings: ExperimentSettings, label: str) -> list[Any]:
 
 
 def _instances(name: str, label: str, count: int) -> list[Any]:
-    """Return the settings of generated instances."""
+    """Return the settings of generated instances of a solid.
+
+    Args:
+        name: Name of the solid.
+        label: Class of the instances.
+        count: Number of instances.
+    """
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     return [{"mesh": f"solid:{name}:{seed}", "label": label} for seed in seeds]

@@ -31,44 +31,93 @@ RESOLUTION = 512
 TOTAL_AREA = 2.8
 # Leaves are ellipses that are this many times as long as wide.
 LEAF_RATIO = 3
-# Random characters of a line of text.
+# `_text` draws the characters of a line of text from these.
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ "
+# Number of characters of a line of text.
 LINE_LENGTH = 24
 # Distance between two lines of text, in heights of a letter.
 LINE_SPACING = 1.2
 
 
 def _solid(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light the whole image in the first color."""
+    """Light the whole image in the first color.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 everywhere.
+    """
     return patterns.solid(points)[None]
 
 
 def _gradient(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a linear ramp along x, around the center."""
+    """Draw a linear ramp along x. At the center, its value is 0.5.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): from 0 to 1 along x.
+    """
     return (points[:1] / rng.uniform(0.6, 1.6) + 0.5).clamp(0, 1)
 
 
 def _stripes(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw stripes along y."""
+    """Draw stripes along y, with a random width and position.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on stripes, 0 between.
+    """
     scaled = points / rng.uniform(0.12, 0.5)
     shift = rng.uniform()
     return patterns.stripes(scaled, shift, rng.uniform(0.3, 0.7)).double()[None]
 
 
 def _checkers(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the squares of a chessboard."""
+    """Draw the squares of a chessboard, with a random size and position.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 0 or 1.
+    """
     scaled = points / rng.uniform(0.12, 0.5)
     shift = torch.from_numpy(rng.uniform(size=2))
     return patterns.checkers(scaled, shift[:, None, None]).double()[None]
 
 
 def _half(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Light one side of a line through the object."""
+    """Light one side of a line through the object.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on this side.
+    """
     return patterns.half(points, 0.5 + rng.uniform(-0.12, 0.12)).double()[None]
 
 
 def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw random discs of one size that cover about half of the image."""
+    """Draw random discs of one size that cover about half of the image.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on the discs.
+    """
     radius = rng.uniform(0.08, 0.25)
     count = round(TOTAL_AREA / (math.pi * radius**2))
     is_lit = torch.zeros(points.shape[1:], dtype=torch.bool)
@@ -78,7 +127,15 @@ def _spots(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw rings of one width around a random point."""
+    """Draw rings of one width around a random point.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on rings, 0 between.
+    """
     center = torch.from_numpy(rng.uniform(-0.5, 0.5, 2))
     radius = (points - center[:, None, None]).norm(dim=0, keepdim=True)
     scaled = radius / rng.uniform(0.12, 0.4)
@@ -87,7 +144,15 @@ def _rings(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the light through the panes of a window. The bars and the wall around it are dark."""
+    """Draw the light through the panes of a window. The bars and the wall around it are dark.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on the panes.
+    """
     pane_counts = torch.from_numpy(rng.integers(2, 5, 2))[:, None, None]
     pane_size = torch.from_numpy(rng.uniform(0.15, 0.4, 2))[:, None, None]
     center = torch.from_numpy(rng.uniform(-0.15, 0.15, 2))[:, None, None]
@@ -99,7 +164,15 @@ def _window(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw the shadows of leaves: random ellipses that cover about half of the image."""
+    """Draw the shadows of leaves: random ellipses that cover about half of the image.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 0 on the leaves.
+    """
     length = rng.uniform(0.15, 0.35)
     is_lit = torch.ones(points.shape[1:], dtype=torch.bool)
     leaf_area = math.pi * length**2 / LEAF_RATIO
@@ -107,13 +180,22 @@ def _leaves(points: Tensor, rng: np.random.Generator) -> Tensor:
         angle = rng.uniform(0, math.pi)
         center = torch.from_numpy(rng.uniform(-1, 1, 2))
         offset = points - center[:, None, None]
+        # Coordinates along the length and along the width of the leaf.
         along, across = patterns.turned(offset, math.cos(angle), -math.sin(angle))
         is_lit &= (along / length) ** 2 + (across / length * LEAF_RATIO) ** 2 > 1
     return is_lit.double()[None]
 
 
 def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw lines of random capital letters, bright on a dark slide."""
+    """Draw lines of random capital letters, bright on a dark slide.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color, shape (1, H, W): 1 on letters.
+    """
     height = int(rng.integers(40, 120))
     slide = Image.new("L", (RESOLUTION, RESOLUTION))
     font = ImageFont.load_default(float(height))
@@ -127,7 +209,15 @@ def _text(points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def _colors(points: Tensor, rng: np.random.Generator) -> Tensor:
-    """Draw a smooth field of colors, with independent channels."""
+    """Draw a smooth field of colors, with independent channels.
+
+    Args:
+        points: Positions (x, y) in the image of the projector, shape (2, H, W).
+        rng: Random number generator.
+
+    Returns:
+        Weight of the first color for each channel, shape (3, H, W), in [0, 1].
+    """
     grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
     return _sample(grid, points, order=3).clamp(0, 1)
 
@@ -189,6 +279,7 @@ def draw_pattern(
     """
     first = torch.from_numpy(draw_color(rng))[:, None, None]
     second = torch.from_numpy(draw_color(rng))[:, None, None]
+    # For families that are not in TWO_COLORED, the second color is black.
     second = second * rng.uniform() * (family in TWO_COLORED)
     angle = rng.uniform(0, 2 * math.pi)
     centers = patterns.pixel_centers(RESOLUTION)[:, 0].double()

@@ -301,7 +301,15 @@ def _group_subjects(subjects: Sequence[Subject], labels: Sequence[str]) -> list[
 
 
 def _clear(out: Path, overwrite: bool) -> None:
-    """Remove earlier renders if this is allowed, or raise InputError if the folder is not empty."""
+    """Prepare the folder of the test set.
+
+    Args:
+        out: The folder.
+        overwrite: Whether earlier renders in the folder are removed.
+
+    Raises:
+        InputError: If the folder has files, and `overwrite` is false.
+    """
     if overwrite:
         for render in out.glob(RENDERS):
             render.unlink()

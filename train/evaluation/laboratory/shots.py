@@ -207,9 +207,16 @@ def _draw_shot(
 
 
 def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the position (3,) of a projector, relative to the point that it faces.
+    """Draw the position of a projector, relative to the point that it faces.
 
-    The azimuth of the projector is measured from the azimuth of the camera.
+    Args:
+        settings: Settings of pnb-lab. The range of azimuths is relative to the
+            azimuth of the camera.
+        azimuth: Azimuth of the camera in degrees.
+        rng: Random number generator.
+
+    Returns:
+        Position in world units, shape (3,).
     """
     projector_azimuth = azimuth + _draw_between(settings.azimuth, rng)
     elevation = _draw_between(settings.elevation, rng)
@@ -217,9 +224,15 @@ def _draw_projector(settings: LabSettings, azimuth: float, rng: np.random.Genera
 
 
 def _draw_wall(azimuth: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw the vector (3,) from the center to a wall behind the object.
+    """Draw the place of a wall behind the object, as seen from the camera.
 
-    The wall is on the side opposite to the azimuth of the camera, in degrees.
+    Args:
+        azimuth: Azimuth of the camera in degrees.
+        rng: Random number generator.
+
+    Returns:
+        Vector from the center of the object to the nearest point of the wall,
+        in world units, shape (3,). It is normal to the wall.
     """
     wall_azimuth = azimuth + 180 + rng.uniform(-MAX_WALL_TURN, MAX_WALL_TURN)
     return _from_angles(wall_azimuth, 0, rng.uniform(*WALL_DISTANCES))

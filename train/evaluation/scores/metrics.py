@@ -225,7 +225,15 @@ class Pool:
         return outcomes
 
     def _above_threshold(self, predictions: Sequence[Prediction]) -> Outcome:
-        """Return predictions and whether the log-odds of each exceed the threshold of its label."""
+        """Test which predictions are above their threshold.
+
+        Args:
+            predictions: Predictions about labels that have a threshold.
+
+        Returns:
+            The predictions. A hit is a prediction whose log-odds exceed the
+            threshold of its label.
+        """
         hits = [item.log_odds > self.thresholds[item.label] for item in predictions]
         return Outcome(predictions, hits)
 
@@ -825,7 +833,15 @@ def roc_curve(
 
 
 def _fraction_above(scores: np.ndarray, cutoffs: np.ndarray) -> np.ndarray:
-    """Compute the fraction of the scores (n,) that exceed each of the cutoffs (c,), shape (c,)."""
+    """Compute the fraction of the scores that exceed each cutoff.
+
+    Args:
+        scores: Scores, shape (n,).
+        cutoffs: Cutoffs, shape (c,).
+
+    Returns:
+        Fraction for each cutoff, in [0, 1], shape (c,).
+    """
     at_or_below = np.sort(scores).searchsorted(cutoffs, "right")
     return (len(scores) - at_or_below) / len(scores)
 

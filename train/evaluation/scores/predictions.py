@@ -183,7 +183,13 @@ class Predictor:
 
 
 def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
-    """Hash the positive classes, the fields of the photographs and the bytes of their files."""
+    """Compute the SHA-256 of the positive classes and the photographs.
+
+    Args:
+        folder: Folder of the photographs.
+        photographs: Photographs, whose fields and bytes are hashed.
+        labels: Positive classes.
+    """
     digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
         content = (folder / photograph.path).read_bytes()
@@ -289,7 +295,14 @@ def rank_classes(
 
 
 def by_label(predictions: Sequence[Prediction]) -> dict[str, list[Prediction]]:
-    """Group predictions by their positive class."""
+    """Group predictions by the positive class that they are about.
+
+    Args:
+        predictions: Predictions about one or several positive classes.
+
+    Returns:
+        Predictions by class. The order of the predictions is kept.
+    """
     groups: dict[str, list[Prediction]] = {}
     for prediction in predictions:
         groups.setdefault(prediction.label, []).append(prediction)
